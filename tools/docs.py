@@ -1,7 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
 configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
-tools/README.md and tools/reports/real/README.md: the figures in tools/results.
+tools/README.md and the READMEs of tools/reports/real and tools/reports/sensor: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -26,7 +26,7 @@ from synpick_warp.configs.files.table_lists import settings_of
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from synpick_warp.views.picks import COLUMNS, STATES
-from tools.figures import figures_tables, read_runs
+from tools.figures import figures_tables, newest_runs, pivot_table, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
@@ -34,6 +34,7 @@ FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
 VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
+SENSOR = ROOT / "tools" / "reports" / "sensor" / "README.md"
 _SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
@@ -79,8 +80,8 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
 
 def validation_reference() -> str:
     """The README of the validation with its table of rules; the rest is as committed."""
-    rows = [f"| `{item.name}` | {item.level} | {item.sentence} |" for item in load_rules().values()]
-    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level | what holds |", "|---|---|---|", *rows])
+    rows = [f"| `{item.name}` | {item.level} | {item.unit} | {item.sentence} |" for item in load_rules().values()]
+    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level | unit | what holds |", "|---|---|---|---|", *rows])
 
 
 def formats_reference() -> str:
@@ -111,6 +112,16 @@ def figures_reference() -> str:
     return _RESULTS.sub(lambda found: f"{found[1]}{tables[found[2]]}\n{found[3]}", FIGURES.read_text(encoding="utf-8"))
 
 
+def sensor_reference() -> str:
+    """The README of the report on depth sensors with its tables of figures; the rest is as committed."""
+    runs = newest_runs(read_runs())
+
+    def fill(found: re.Match[str]) -> str:
+        return f"{found[1]}{pivot_table(runs[f'sensor_{found[2]}.json'])}\n{found[3]}"
+
+    return _RESULTS.sub(fill, SENSOR.read_text(encoding="utf-8"))
+
+
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures, if there are results; the rest is as committed."""
     tables = figures_tables(read_runs())
@@ -128,6 +139,7 @@ REFERENCES: dict[Path, Callable[[], str]] = {
     VALIDATION: validation_reference,
     FIGURES: figures_reference,
     PHOTOGRAPHS: photographs_reference,
+    SENSOR: sensor_reference,
 }
 """File -> its content with generated tables."""
 

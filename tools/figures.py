@@ -125,6 +125,17 @@ def _table(runs: Mapping[str, Run]) -> str:
     return "\n".join([*lines, *([f"\n{'; '.join(f'({number}) {note}' for note, number in notes.items())}."] if notes else [])])
 
 
+def pivot_table(run: Run) -> str:
+    """Markdown table of a run: a line for each name, a column for each part, with units; of `shown` rows alone, if there are."""
+    rows = [row for row in run.rows if not run.shown or row.name in run.shown]
+    parts = list(dict.fromkeys(row.part for row in rows))
+    values = {(row.name, row.part): f"{row.value:.2f}" for row in rows}
+    lines = [f"| | unit | {' | '.join(parts)} |", "|---" * (len(parts) + 2) + "|"]
+    for name, unit in {row.name: row.unit for row in rows}.items():
+        lines.append(f"| {name} | {unit} | {' | '.join(values.get((name, part), '') for part in parts)} |")
+    return "\n".join([*lines, "", f"Measured {run.date} by `{run.command}`."])
+
+
 def _show(row: Row) -> str:
     """Name and value of a row in Markdown."""
     unit = {"1/s": "/s", "1/h": "/h", "%": " %", "": ""}.get(row.unit, f" {row.unit}")

@@ -9,7 +9,8 @@ import pytest
 
 from synpick_warp.configs.cell.sensors import DepthSensor
 from tools.reports.real_frames import RealFrame
-from tools.reports.sensor.alignment import align
+from tools.reports.sensor.alignment import align, robust_deviation
+from tools.reports.sensor.cross_validation import GRAZING, cross_validate, fit_angle, predict_deviation
 from tools.reports.sensor.measure import Samples, correlation, fit_noise, ring_holes
 from tools.reports.sensor.pictures import draw_comparison
 from tools.reports.sensor.scene import RealScenes, annotated_poses, fit_plane
@@ -59,6 +60,17 @@ def test_noise_is_divided_into_axial_and_lateral():
     lateral = rng.normal(size=60000) * 1e3 * depth * np.tan(np.radians(angle)) * 0.8 / 1000.0
     samples = Samples(axial + lateral, depth, angle, np.full(60000, 9.0), np.zeros(60000), np.ones(60000))
     assert fit_noise(samples, 1000.0) == pytest.approx((2.0, 0.8), rel=0.1)
+    assert predict_deviation(samples, 1000.0, 2.0, 0.8) == pytest.approx(robust_deviation(samples.scaled), rel=0.03)
+
+
+def test_the_grazing_angle_is_interpolated():
+    rates = [10.0 - step for step in range(len(GRAZING))]
+    assert fit_angle(rates, 8.5) == pytest.approx((GRAZING[1] + GRAZING[2]) / 2.0)
+    assert fit_angle(rates, 99.0) == GRAZING[0]
+
+
+def test_one_sequence_has_no_cross_validation(scene):
+    assert cross_validate(scene[0], [annotated_poses(scene[0].frames[0])], IDEAL) == []
 
 
 def test_holes_and_pictures_of_equal_depth_are_equal(scene):

@@ -88,6 +88,16 @@ def test_a_sample_of_views_is_rendered(good, capsys):
 
 
 WRONG = [("--fast", "--poses"), ("--poses", "--sample", 3), ("--sample", -1), ("--limit", -1), ("--threads", 9999)]
+WRONG += [("--tolerance", value) for value in ("15", "0,3", "15,nan", "15,3,1", "a,b")]
+
+
+def test_deviations_are_a_table_and_records(good, capsys):
+    code, lines, _ = run(capsys, good, "--fast", "--tolerance", "15,3")
+    assert code == 0
+    assert lines[0].split() == ["deviation", "object", "instances", "median", "95", "%", "largest"]
+    assert lines[1].split()[:2] == ["visible-fraction", "all"]
+    record = json.loads(run(capsys, good, "--fast", "--tolerance", "15,3", "--json")[1][0])["deviation"]
+    assert (record["rule"], record["obj_id"], record["unit"], record["largest"]) == ("visible-fraction", None, "px", 0.0)
 
 
 @pytest.mark.parametrize("options", WRONG)

@@ -1,10 +1,11 @@
 """Reader of annotated frames of a real RGB-D camera (YCB-Video's, by way of `oprb/ycbvideo`), and their BOP data set, for measuring only.
 
-    python -m tools.reports.real_frames FRAMES MODELS OUT
+    python -m tools.reports.real_frames FRAMES MODELS OUT [--json FILE]
 
 writes OUT as a BOP data set of one split, `test`: a scene for each sequence, depth in 0.1 mm, `mask_visib` from the class masks (each class
 is there once), `mask` rendered from pose and model, poses in the frames of the models. `cam_K` has 0.5 px added to the principal point:
-pixel centres are at + 0.5 in data sets of this project, at whole numbers in those frames.
+pixel centres are at + 0.5 in data sets of this project, at whole numbers in those frames. `--json` writes what `validate --tolerance`
+measures in it.
 """
 
 from __future__ import annotations
@@ -21,14 +22,18 @@ from typing import Any
 import cv2
 import numpy as np
 
+from synpick_warp.apps.validation.deviations import distributions
+from synpick_warp.apps.validation.registry import Tolerance
 from synpick_warp.apps.validation.rendering import ObjectRenderer
+from synpick_warp.apps.validation.run import Options, Summary, validate
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.system.inputs.image_files import decode_image
 from synpick_warp.system.inputs.json import decode_json
-from tools.options import fail
+from tools.figures import describe_run, write_run
+from tools.options import Row, fail
 
 SPLIT = "test"
 """Split of the data set: BOP's name of measured images."""
@@ -36,6 +41,8 @@ DEPTH_SCALE = 0.1
 """Depth of one count in the frames [mm]."""
 CENTER = 0.5
 """Centre of the first pixel in our coordinates, where the frames have 0 [px]."""
+TOLERANCE = Tolerance(15.0, 3.0)
+"""Of annotation [mm, px]: BOP's tolerance of visibility; masks of people."""
 _MILLIMETRES = 1e3
 """In a metre."""
 _PARTS = {"color": "rgb", "depth": "depth"}
@@ -262,15 +269,35 @@ def render_silhouette(renderer: ObjectRenderer, frame: RealFrame, index: int) ->
     return np.isfinite(render_depth(renderer, frame, index))
 
 
+def measure_deviations(folder: Path) -> tuple[list[Row], int]:
+    """Distribution of the deviations that `validate` measures in a data set, by rule over all objects, medians by object; and the number of
+    violations.
+    """
+    summary = Summary()
+    violations = list(validate(folder, Options(sample=None, tolerance=TOLERANCE), summary))
+    rows: list[Row] = []
+    for found in distributions(summary.deviations):
+        if found.obj_id is not None:
+            rows.append(Row(found.rule, found.median, found.unit, part=f"object {found.obj_id}"))
+            continue
+        sizes = {"median": found.median, "95 %": found.percentile_95, "largest": found.largest}
+        rows += [Row(found.rule, value, found.unit, part=part) for part, value in sizes.items()]
+    return rows, len(violations)
+
+
 def main() -> int:
     """Write the data set."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("frames", type=Path, help="folder of SSSS_FFFFFF-{color,depth,label}.png and -poses.json")
     parser.add_argument("models", type=Path, help="folder of BOP models")
     parser.add_argument("out", type=Path, help="folder to write, which does not exist")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the deviations of its annotation as JSON")
     options = parser.parse_args()
     try:
         print(f"data set: {write_data_set(options.frames, options.models, options.out)}")
+        if options.json is not None:
+            rows, violations = measure_deviations(options.out)
+            write_run(options.json, describe_run("tools.reports.real_frames", [], rows, tolerance=TOLERANCE, violations=violations))
     except SynpickError as error:
         return fail("reports.real_frames", error)
     return 0

@@ -16,6 +16,7 @@ from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
+    from synpick_warp.apps.validation.registry import Tolerance
     from synpick_warp.apps.validation.rendering import ObjectRenderer, Patch
 
 EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
@@ -77,27 +78,30 @@ class Instance:
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of two masks: pixels of one only, IoU, and whether their outlines explain the difference."""
+    """Agreement of two masks: pixels of one only, IoU, whether their outlines explain the difference, and mean distance of the outlines."""
 
     differing: int
     """Pixels of one only."""
     iou: float
     good: bool
-    """Whether the difference is explained by their outlines."""
+    """Whether the difference is explained by their outlines, or within the tolerance."""
+    distance: float
+    """Mean distance of the outlines [px]: differing pixels per pixel of the longer outline."""
 
 
 class RenderedView:
     """A view with its re-rendered instances: those with a model, and with a mask or silhouette that is large enough."""
 
-    def __init__(self, view: ViewSubject, renderer: ObjectRenderer) -> None:
-        self.view, self.renderer, self.place = view, renderer, view.place
+    def __init__(self, view: ViewSubject, renderer: ObjectRenderer, given: Tolerance | None = None) -> None:
+        self.view, self.renderer, self.place, self.given = view, renderer, view.place, given
 
     @property
     def tolerance(self) -> float:
         """Difference of depth up to which two depths count as equal [mm], at least one and a half counts."""
         scale = self.view.camera.depth_scale if self.view.camera is not None else UNSET
         count = scale if isinstance(scale, float | int) else 0.0
-        return max(EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH, 1.5 * count)
+        bound = EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH
+        return max(bound if self.given is None else self.given.mm, 1.5 * count)
 
     @property
     def exact_masks(self) -> bool:
@@ -197,13 +201,17 @@ class RenderedView:
         return found if found is not None and found.size == self.view.size else None
 
 
-def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False) -> Fit:
-    """Compare two masks (h, w); `exact`: with the narrower bounds for data sets of this program."""
+def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False, within: float | None = None) -> Fit:
+    """Compare two masks (h, w); `exact`: with the narrower bounds for data sets of this program; `within`: with outlines at most that far
+    apart [px] instead.
+    """
     differing = int(np.count_nonzero(one ^ other))
     union = int(np.count_nonzero(one | other))
     outline = max(_outline(one), _outline(other))
     area, line = (EXACT_AREA, EXACT_OUTLINE) if exact else (AREA, OUTLINE)
-    return Fit(differing, 1.0 - differing / max(union, 1), differing <= area * union + line * outline + 4)
+    distance = differing / max(outline, 1)
+    good = differing <= area * union + line * outline + 4 if within is None else distance <= within
+    return Fit(differing, 1.0 - differing / max(union, 1), good, distance)
 
 
 def _outline(mask: np.ndarray) -> int:

@@ -6,6 +6,7 @@ third is named.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -49,6 +50,10 @@ class Kind(StrEnum):
     VISIBLE = "visible mask"
 
 
+MEASURED = (Kind.SHIFT, Kind.POSE, Kind.MASK, Kind.VISIBLE, Kind.DEPTH)
+"""Kinds that have a size for each instance."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Contradiction between a rendered view and its files: kind, instance (None: the whole image), and text."""
@@ -66,6 +71,15 @@ class DiagnosedView(RenderedView):
     def findings(self) -> list[Finding]:
         """All contradictions between rendering and files; found once for all rules."""
         return diagnose(self)
+
+    @cached_property
+    def deviations(self) -> dict[Kind, list[tuple[int, float]]]:
+        """(ground-truth index, deviation) of each compared instance by kind: visible masks [px], masks [px], depth [mm], pose [mm]."""
+        found: dict[Kind, list[tuple[int, float]]] = {kind: [] for kind in MEASURED}
+        for item in self.instances:
+            for kind, value in _measure(item, self.tolerance):
+                found[kind].append((item.index, value))
+        return found
 
 
 def diagnose(rendered: RenderedView) -> list[Finding]:
@@ -108,9 +122,12 @@ def _reference(item: Instance, tolerance: float) -> tuple[np.ndarray, np.ndarray
 def _outline_fits(item: Instance, rendered: RenderedView) -> bool:
     """Whether mask and silhouette agree. Without amodal masks it is enough that visible pixels lie in the silhouette."""
     mask, silhouette = _reference(item, rendered.tolerance)
+    within = None if rendered.given is None else rendered.given.px
     if item.mask is not None:
-        return fit_masks(mask, silhouette, exact=rendered.exact_masks).good
-    return fit_masks(mask & item.silhouette, mask).good and (item.depth is None or fit_masks(mask, silhouette).iou > 1.0 - AGREEING)
+        return fit_masks(mask, silhouette, exact=rendered.exact_masks, within=within).good
+    return fit_masks(mask & item.silhouette, mask, within=within).good and (
+        item.depth is None or fit_masks(mask, silhouette).iou > 1.0 - AGREEING
+    )
 
 
 def _check_depth(rendered: RenderedView, instances: list[Instance]) -> tuple[list[Finding], float | None]:
@@ -263,7 +280,7 @@ def _check_instance(item: Instance, rendered: RenderedView) -> list[Finding]:
     if item.depth is None or item.visible is None:
         return []
     tolerance, place = rendered.tolerance, f"image {rendered.view.image}, instance {item.index}"
-    if item.mask is not None and rendered.view.scene.exact:
+    if item.mask is not None and rendered.view.scene.exact and rendered.given is None:
         expected = item.visible_part(tolerance)
         shift = _find_shift(item.visible, expected) if not fit_masks(item.visible, expected).good else None
         if shift is not None and _pose_agrees(item, item.visible, tolerance):
@@ -277,6 +294,22 @@ def _check_instance(item: Instance, rendered: RenderedView) -> list[Finding]:
             return [Finding(Kind.DEPTH, item.index, f"{place}: depth differs from the model by more than {tolerance:g} mm in {beyond:.0%}")]
     part = item.visible_part(tolerance) & (item.depth > 0.0) & (np.abs(item.depth - item.rendered) <= tolerance)
     missing = int(np.count_nonzero(part & ~item.visible))
-    if missing > max(20, LEFT_OUT * np.count_nonzero(part)):
+    if rendered.given is None and missing > max(20, LEFT_OUT * np.count_nonzero(part)):
         return [Finding(Kind.VISIBLE, item.index, f"{place}: mask_visib leaves out {missing} px at which depth shows the object")]
     return []
+
+
+def _measure(item: Instance, tolerance: float) -> Iterator[tuple[Kind, float]]:
+    """Deviations of an instance: how far its mask is shifted, and outlines are apart on average [px]; of depth inside the visible mask from
+    the model the median [mm], along the optical axis, and what a fraction BEYOND of its pixels exceeds [mm].
+    """
+    if item.mask is not None:
+        yield Kind.MASK, fit_masks(item.mask, item.silhouette).distance
+    if item.visible is not None:
+        expected = item.visible_part(tolerance)
+        yield Kind.VISIBLE, fit_masks(item.visible, expected).distance
+        yield Kind.SHIFT, float(np.hypot(*(_find_shift(item.visible, expected) or (0, 0)))) if item.visible.any() else 0.0
+    errors = item.rendered[:0] if item.depth is None else (item.depth - item.rendered)[item.seen]
+    if errors.size >= 20:
+        yield Kind.POSE, abs(float(np.median(errors)))
+        yield Kind.DEPTH, float(np.quantile(np.abs(errors), 1.0 - BEYOND))

@@ -13,9 +13,8 @@ from synpick_warp.errors import SynpickError
 
 MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "graph", "poses", "trials")
 """Modules in `validation.rules`, in the order of their rules."""
-Findings = Iterator[tuple[str, str]]
-"""What a check yields: (file, what is wrong) for each violation."""
-_Check = TypeVar("_Check", bound=Callable[[Any], Findings])
+UNITS = ("mm", "px")
+"""Units of deviations."""
 
 
 class Level(enum.StrEnum):
@@ -23,6 +22,35 @@ class Level(enum.StrEnum):
 
     ERROR = "error"
     WARNING = "warning"
+
+
+class Tolerance(NamedTuple):
+    """Annotation tolerance of a measured data set: largest deviations that are no errors."""
+
+    mm: float
+    """Of depth from the model at its pose."""
+    px: float
+    """Of outlines, boxes and pixel counts; counts are divided by the length of the outline."""
+
+
+class Deviation(NamedTuple):
+    """Deviation of an annotated instance from its rendering, or from another annotation of it, in the unit of the rule."""
+
+    file: str
+    text: str
+    """What is wrong, if it is."""
+    obj_id: int
+    value: float
+    """In the unit of the rule; 0: none."""
+    wrong: bool = False
+    """Whether it is a violation where no tolerance is given."""
+    named: bool = False
+    """Whether another finding of the rule is about the same instance, so that this one is counted, but no violation."""
+
+
+Findings = Iterator[tuple[str, str] | Deviation]
+"""What a check yields: (file, what is wrong) for each violation; the deviation of each instance, also of right ones."""
+_Check = TypeVar("_Check", bound=Callable[[Any], Findings])
 
 
 class Violation(NamedTuple):
@@ -51,13 +79,15 @@ class Rule:
     cure: str
     """How to mend a violation."""
     check: Callable[[Any], Findings]
+    unit: str = ""
+    """Unit of the deviations, mm or px; empty: the rule is logical, and no tolerance applies."""
 
 
 RULES: dict[str, Rule] = {}
 """Declared rules by name, in the order of imports; see `load_rules`."""
 
 
-def rule(subject: type, name: str, cure: str, level: Level = Level.ERROR) -> Callable[[_Check], _Check]:
+def rule(subject: type, name: str, cure: str, level: Level = Level.ERROR, unit: str = "") -> Callable[[_Check], _Check]:
     """Declare the decorated function as the check of a rule, whose sentence is its docstring.
 
     Args:
@@ -65,11 +95,12 @@ def rule(subject: type, name: str, cure: str, level: Level = Level.ERROR) -> Cal
         name: Name of the rule: words joined by hyphens.
         cure: How to mend a violation.
         level: Level of its violations.
+        unit: Unit of its deviations; empty: it has none.
     """
 
     def declare(check: _Check) -> _Check:
         assert name not in RULES, name
-        RULES[name] = Rule(name, subject, level, " ".join((check.__doc__ or "").split()), cure, check)
+        RULES[name] = Rule(name, subject, level, " ".join((check.__doc__ or "").split()), cure, check, unit)
         return check
 
     return declare
@@ -84,13 +115,27 @@ def load_rules() -> dict[str, Rule]:
     return dict(sorted(RULES.items(), key=lambda item: names.index(item[1].check.__module__)))
 
 
-def apply_rules(subject: object) -> Iterator[Violation]:
-    """Check a subject by all rules for its type; yields violations. A rule that meets unreadable data ends with a violation about it."""
+def apply_rules(
+    subject: object, tolerance: Tolerance | None = None, deviations: list[tuple[str, int, float]] | None = None
+) -> Iterator[Violation]:
+    """Check a subject by all rules for its type; yields violations. A rule that meets unreadable data ends with a violation about it.
+
+    Args:
+        subject: What is checked.
+        tolerance: Deviations up to it are no violations; None: each rule has its own bound.
+        deviations: With a tolerance, (rule, obj_id, value) of each deviation is appended.
+    """
     for item in load_rules().values():
         if item.subject is not type(subject):
             continue
         try:
-            for file, text in item.check(subject):
-                yield Violation(item.level, file, item.name, text)
+            for found in item.check(subject):
+                if isinstance(found, Deviation):
+                    if tolerance is not None and deviations is not None:
+                        deviations.append((item.name, found.obj_id, found.value))
+                    exceeds = found.wrong if tolerance is None else not found.named and found.value > getattr(tolerance, item.unit)
+                    if not exceeds:
+                        continue
+                yield Violation(item.level, found[0], item.name, found[1])
         except SynpickError as error:
             yield Violation(Level.ERROR, getattr(subject, "place", "."), item.name, f"cannot be checked: {error}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.apps.validation.model_files import ModelsFolder
-from synpick_warp.apps.validation.registry import Level, Violation, apply_rules
+from synpick_warp.apps.validation.registry import Level, Tolerance, Violation, apply_rules
 from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
 from synpick_warp.apps.validation.subjects import TreeSubject
 from synpick_warp.apps.validation.target_lists import TargetLists
@@ -34,18 +35,20 @@ VIEWS_PER_PROCESS = 100
 
 @dataclass(frozen=True)
 class Options:
-    """What is checked: number of views that are rendered again (None: all), whether images are read, number of processes."""
+    """What is checked: number of views that are rendered again (None: all), whether images are read, number of processes, tolerance."""
 
     sample: int | None = DEFAULT_SAMPLE
     """Views that are rendered again, spread over all views; None: all."""
     images: bool = True
     """Whether images are read; otherwise only files, annotations, models and lists are checked."""
     threads: int = field(default_factory=count_cores)
+    tolerance: Tolerance | None = None
+    """Of measured data sets; None: each rule has its own bound, and no deviations are collected."""
 
 
 @dataclass
 class Summary:
-    """Totals of a validation: scenes, views checked, views rendered again, models, errors, warnings."""
+    """Totals of a validation: scenes, views checked, views rendered again, models, errors, warnings, deviations."""
 
     scenes: int = 0
     views: int = 0
@@ -55,6 +58,8 @@ class Summary:
     models: int = 0
     errors: int = 0
     warnings: int = 0
+    deviations: dict[tuple[str, int], array[float]] = field(default_factory=dict)
+    """Deviations of instances by rule and obj_id, in the unit of the rule."""
 
 
 def validate(folder: Path, options: Options, summary: Summary, report: Report = lambda unit, done, total: None) -> Iterator[Violation]:
@@ -82,9 +87,11 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     models = list(_plan_models(layout, summary))
     tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes), *_plan_picks(layout)]
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
-    for checked in map_ordered(WorkerProgram(partial(State, layout.root), "process that validates"), tasks, processes):
+    for checked in map_ordered(WorkerProgram(partial(State, layout.root, options.tolerance), "process that validates"), tasks, processes):
         summary.views += checked.views
         summary.rendered += checked.rendered
+        for rule, obj_id, value in checked.deviations:
+            summary.deviations.setdefault((rule, obj_id), array("d")).append(value)
         report("views" if options.images else "scenes", summary.views, total)
         for violation in checked.violations:
             yield _finish(violation, layout, summary)

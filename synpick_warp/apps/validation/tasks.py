@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject
-from synpick_warp.apps.validation.registry import Violation, apply_rules
+from synpick_warp.apps.validation.registry import Tolerance, Violation, apply_rules
 from synpick_warp.apps.validation.rules.rig import RigSubject
 from synpick_warp.apps.validation.scene_files import open_scene
 from synpick_warp.apps.validation.subjects import SceneSubject, ViewSubject
@@ -17,20 +18,22 @@ from synpick_warp.dataset.bop.layout import Layout, SceneRef
 
 
 class Checked(NamedTuple):
-    """Result of a task: violations, views whose images were checked, views that were rendered again."""
+    """Result of a task: violations, views whose images were checked, views that were rendered again, deviations."""
 
     violations: list[Violation]
     views: int = 0
     """Views whose images were checked."""
     rendered: int = 0
     """Views that were rendered again."""
+    deviations: Sequence[tuple[str, int, float]] = ()
+    """(rule, obj_id, value) of each, with a tolerance."""
 
 
 class State:
-    """State that a process keeps between tasks: layout, scene that was read last, renderer."""
+    """State that a process keeps between tasks: layout, tolerance, scene that was read last, renderer."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, tolerance: Tolerance | None = None) -> None:
+        self.folder, self.tolerance = folder, tolerance
         self._scene: tuple[tuple[SceneRef, int], SceneSubject] | None = None
         self._models: tuple[str, ModelsFolder] | None = None
 
@@ -101,21 +104,22 @@ class CheckScene:
         """See `Task`."""
         scene = state.scene(self.ref, self.targets)
         violations: list[Violation] = []
+        deviations: list[tuple[str, int, float]] = []
         if self.first == 0:
-            violations += apply_rules(scene)
+            violations += apply_rules(scene, state.tolerance, deviations)
         if not self.images:
-            return Checked(violations)
+            return Checked(violations, deviations=deviations)
         images = scene.images[self.first : self.last]
         rendered = 0
         for image in images:
             view = ViewSubject(scene, image)
-            violations += apply_rules(view)
+            violations += apply_rules(view, state.tolerance, deviations)
             if image in self.poses and view.truths:
                 from synpick_warp.apps.validation.diagnosis import DiagnosedView
 
                 rendered += 1
-                violations += apply_rules(DiagnosedView(view, state.renderer))
-        return Checked(violations, len(images), rendered)
+                violations += apply_rules(DiagnosedView(view, state.renderer, state.tolerance), state.tolerance, deviations)
+        return Checked(violations, len(images), rendered, deviations)
 
 
 @dataclass(frozen=True)

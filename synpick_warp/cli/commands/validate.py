@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -37,6 +37,14 @@ def validate(
     poses: Annotated[bool, Parameter(negative=(), help="Render every view again.")] = False,
     fast: Annotated[bool, Parameter(negative=(), help="Only files, annotations, models and target lists; no image is read.")] = False,
     json: Annotated[bool, Parameter(negative=(), help="Print JSON Lines: one object per violation, and one with the totals.")] = False,
+    tolerance: Annotated[
+        str | None,
+        Parameter(
+            name="--tolerance",
+            help="MM,PX: the data set is measured. Deviations of depth up to MM millimetres, and of outlines, boxes and counts up to PX "
+            "pixels, are no errors; their distribution is printed by rule and object. Logical rules stay strict.",
+        ),
+    ] = None,
     limit: Annotated[WholeNumber, Parameter(help="Violations that are printed of each rule; 0: all. --json prints all.")] = 20,
     threads: Annotated[WholeNumber, Parameter(help="Number of processes; 0: one per core.")] = 0,
     rules: Annotated[bool, Parameter(negative=(), help="List all rules instead.")] = False,
@@ -50,7 +58,7 @@ def validate(
     if rules:
         _print_rules(as_json=json)
         return 0
-    options = _make_options(sample, threads, poses=poses, fast=fast)
+    options = _make_options(sample, threads, tolerance, poses=poses, fast=fast)
     if limit < 0:
         raise ConfigError(f"--limit is {limit}; allowed: 0 for all, or more")
     folder = find_data_set(folder, "synpick-warp validate DIR", has_scenes)
@@ -70,12 +78,13 @@ def validate(
     return EXIT_VIOLATIONS if summary.errors else 0
 
 
-def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) -> Options:
+def _make_options(sample: int | None, threads: int, tolerance: str | None, *, poses: bool, fast: bool) -> Options:
     """Make the options of the validation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed, or two options exclude each other.
     """
+    from synpick_warp.apps.validation.deviations import parse_tolerance
     from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, Options
 
     if fast and (poses or sample):
@@ -84,8 +93,9 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
         raise ConfigError("--poses renders every view; drop it, or --sample")
     check_range("--sample", sample or 0, 0, _MAX_SAMPLE)
     check_range("--threads", threads, 0, MAX_THREADS)
-    given = {"threads": threads} if threads else {}
-    return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, **given)
+    given: dict[str, Any] = {"threads": threads} if threads else {}
+    bounds = None if tolerance is None else parse_tolerance(tolerance)
+    return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, tolerance=bounds, **given)
 
 
 def _describe(violation: Violation) -> str:
@@ -115,18 +125,28 @@ def _print_rules(*, as_json: bool) -> None:
     from synpick_warp.apps.validation.registry import load_rules
 
     for item in load_rules().values():
-        record = {"rule": item.name, "level": item.level, "sentence": item.sentence, "cure": item.cure}
+        record = {"rule": item.name, "level": item.level, "unit": item.unit, "sentence": item.sentence, "cure": item.cure}
         print(_dump(record) if as_json else f"{item.name} ({item.level}): {item.sentence}")
 
 
 def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bool) -> None:
-    """Print how many violations were held back by rule (limit 0: none), and the totals; or the totals as JSON."""
+    """Print how many violations were held back by rule (limit 0: none), distributions of deviations, and the totals; or these as JSON."""
+    from synpick_warp.apps.validation.deviations import distributions
+
+    found = distributions(summary.deviations)
     if as_json:
-        print(_dump({"totals": vars(summary)}))
+        for item in found:
+            print(_dump({"deviation": item._asdict()}))
+        print(_dump({"totals": {name: value for name, value in vars(summary).items() if name != "deviations"}}))
         return
     for name, count in counts.items():
         if limit and count > limit:
             print(f"{name}: {count - limit:,} more; --limit 0 prints all")
+    if found:
+        print(f"{'deviation':<17} {'object':>6} {'instances':>9} {'median':>8} {'95 %':>8} {'largest':>8}")
+    for item in found:
+        name, numbers = item.obj_id or "all", f"{item.median:8.2f} {item.percentile_95:8.2f} {item.largest:8.2f}"
+        print(f"{item.rule:<17} {name:>6} {item.instances:>9} {numbers} {item.unit}")
     checked = f"{summary.scenes:,} scenes, {summary.models:,} models, {summary.views:,} views, {summary.rendered:,} of them rendered again"
     print(f"{checked}: {summary.errors:,} errors, {summary.warnings:,} warnings")
     sys.stdout.flush()

@@ -1,9 +1,10 @@
-"""Simulated depth of a sensor preset beside that of the real camera, as a table by sequence, and pictures.
+"""Simulated depth of a sensor preset beside that of the real camera, as a table by sequence, cross-validation, and pictures.
 
     python -m tools.reports.sensor --real FRAMES --models MODELS [--pictures DIR]
 
 Each instance is first aligned to measured depth, as annotated poses are off by 1 to 2 mm, which would count as bias; objects whose
-annotation is exact (`--exact`) show the bias before it. Noise is fitted to each sequence, and holds if the other sequence confirms it.
+annotation is exact (`--exact`) show the bias before it. A second table has the cross-validation: noise and grazing angle are fitted to one
+sequence, and deviation and holes of the other are predicted, in both directions.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from tools.figures import describe_run, write_run
 from tools.options import Row, configure, fail, make_parser, of_part
 from tools.reports.real_frames import RealFrame, read_frames
 from tools.reports.sensor.alignment import align
+from tools.reports.sensor.cross_validation import cross_validate
 from tools.reports.sensor.measure import collect, statistics
 from tools.reports.sensor.pictures import write_pictures
 from tools.reports.sensor.scene import RealScenes, Rendered, annotated_poses
@@ -50,20 +52,17 @@ def annotation_bias(frames: Sequence[RealFrame], rendered: Rendered, exact: Sequ
     ]
 
 
-def print_comparison(console: Console, rows: Sequence[Row]) -> None:
-    """Table with a line for each statistic, and a pair of columns for each sequence."""
-    sequences = sorted({row.part.split()[0] for row in rows if row.part.endswith((MEASURED, SIMULATED))})
-    columns = [f"{sequence} {source}" for sequence in sequences for source in (MEASURED, SIMULATED)]
+def print_table(console: Console, rows: Sequence[Row]) -> None:
+    """Print a table with a line for each figure, and a column for each part."""
+    columns = list(dict.fromkeys(row.part for row in rows))
     table = Table("", "unit", *columns)
     values = {(row.name, row.part): row for row in rows}
-    for name in dict.fromkeys(row.name for row in rows if row.part in columns):
+    for name in dict.fromkeys(row.name for row in rows):
         found = [values.get((name, column)) for column in columns]
         unit = next(row.unit for row in found if row is not None)
         table.add_row(name, unit, *("" if row is None or np.isnan(row.value) else f"{row.value:.2f}" for row in found))
-    console.print(table)
-    for row in rows:
-        if row.part == "annotation":
-            console.print(f"{row.name}: {row.value:.2f} {row.unit}", highlight=False)
+    if columns:
+        console.print(table)
 
 
 def make_options() -> argparse.ArgumentParser:
@@ -86,14 +85,16 @@ def main() -> int:
         scenes = RealScenes(frames, options.objects)
         poses = [annotated_poses(frame) for frame in frames]
         bias = annotation_bias(frames, scenes.render(poses, DepthSensor(shadows=False)), options.exact)
-        rendered = scenes.render(align(scenes, poses), sensor, options.seed)
-        rows = [*compare(frames, rendered), *bias]
+        aligned = align(scenes, poses)
+        rendered = scenes.render(aligned, sensor, options.seed)
+        tables = [compare(frames, rendered), cross_validate(scenes, aligned, sensor, options.seed), bias]
         if options.pictures is not None:
             write_pictures(options.pictures, frames, rendered)
     except SynpickError as error:
         return fail("reports.sensor", error)
-    print_comparison(console, rows)
-    write_run(options.json, describe_run("tools.reports.sensor", [], rows))
+    for rows in tables:
+        print_table(console, rows)
+    write_run(options.json, describe_run("tools.reports.sensor", [], [row for rows in tables for row in rows]))
     return 0
 
 

@@ -124,6 +124,11 @@ def correlation(frames: Sequence[RealFrame], rendered: Rendered, counts: Sequenc
     return {lag: products[lag] / max(1, pairs[lag]) / variance for lag in LAGS}
 
 
+def lever_of(angle: np.ndarray, depth: np.ndarray, focal: float) -> np.ndarray:
+    """Depth error at 1 m of a lateral error of one pixel [mm/px]: tan θ / (f z)."""
+    return _MILLIMETRES * np.tan(np.radians(angle)) / (focal * depth)
+
+
 def fit_noise(samples: Samples, focal: float) -> tuple[float, float]:
     """Fit axial and lateral noise: variance at 1 m s² + (l tan θ / (f z))², over cells of object and angle of incidence, by robust least
     squares.
@@ -142,7 +147,7 @@ def fit_noise(samples: Samples, focal: float) -> tuple[float, float]:
         for low in range(0, 78, _CELL)
         if len((part := inner.select((inner.object_id == index) & (inner.angle >= low) & (inner.angle < low + _CELL))).off) >= _FEWEST
     ]
-    lever = np.array([np.median(_MILLIMETRES * np.tan(np.radians(part.angle)) / (focal * part.depth)) for part in cells])
+    lever = np.array([np.median(lever_of(part.angle, part.depth, focal)) for part in cells])
     found, weight = np.array([robust_deviation(part.scaled) for part in cells]), np.sqrt([len(part.off) for part in cells])
     fit = least_squares(
         lambda guess: weight * (np.hypot(guess[0], guess[1] * lever) - found), (1.5, 1.0), loss="soft_l1", f_scale=float(np.median(weight))

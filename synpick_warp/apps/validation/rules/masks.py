@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
+import cv2
 import numpy as np
 
 from synpick_warp.apps.validation.pictures import Mask
-from synpick_warp.apps.validation.registry import Findings, rule
-from synpick_warp.apps.validation.rules.info import EMPTY
+from synpick_warp.apps.validation.registry import Deviation, Findings, rule
+from synpick_warp.apps.validation.rules.info import EMPTY, box_sides
 from synpick_warp.apps.validation.schemas import Info
 from synpick_warp.apps.validation.subjects import ViewSubject
 
@@ -45,15 +46,27 @@ def check_type(view: ViewSubject) -> Findings:
                 yield mask.file, "values besides 0 and 255"
 
 
-@rule(ViewSubject, "mask-inside-mask", "cut mask_visib from mask; check that both have the same index")
+@rule(ViewSubject, "mask-inside-mask", "cut mask_visib from mask; check that both have the same index", unit="px")
 def check_inside(view: ViewSubject) -> Findings:
     """mask_visib is a part of mask."""
     amodal = dict(_all_masks(view, "mask"))
     for index, visible in _all_masks(view, "mask_visib"):
         if index in amodal and visible.box is not None:
-            outside = np.count_nonzero(visible.crop & ~amodal[index].window(*visible.box))
-            if outside:
-                yield visible.file, f"{outside} of {visible.count} visible pixels are outside of the silhouette in mask"
+            outside = visible.crop & ~amodal[index].window(*visible.box)
+            count = int(np.count_nonzero(outside))
+            text = f"{count} of {visible.count} visible pixels are outside of the silhouette in mask"
+            value = _farthest(visible, amodal[index]) if count else 0.0
+            yield Deviation(visible.file, text, view.truths[index].obj_id, value, count > 0)
+
+
+def _farthest(visible: Mask, amodal: Mask) -> float:
+    """Directed Hausdorff distance of a visible mask to an amodal one [px]: of the pixel that is farthest from it."""
+    width, height = visible.size
+    if amodal.box is None:
+        return float(np.hypot(width, height))
+    beside = (~amodal.window(0, 0, width, height)).astype(np.uint8)
+    away = cv2.distanceTransform(beside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float(away[visible.window(0, 0, width, height)].max())
 
 
 @rule(ViewSubject, "mask-overlap", "give each pixel to the nearest instance")
@@ -110,29 +123,36 @@ def check_amodal_count(view: ViewSubject) -> Findings:
             yield _file(view), f"image {view.image}, instance {index}: px_count_all is {info.px_count_all}, {mask.file} has {mask.count}"
 
 
-@rule(ViewSubject, "visible-box", "compute the box from the mask; COCO's boxes have + 1, these do not")
+@rule(ViewSubject, "visible-box", "compute the box from the mask; COCO's boxes have + 1, these do not", unit="px")
 def check_visible_box(view: ViewSubject) -> Findings:
     """bbox_visib is the tight box of mask_visib: x_min, y_min, x_max - x_min, y_max - y_min, without + 1."""
     for index, mask, info in _pairs(view, "mask_visib"):
-        if mask.box is not None and info.bbox_visib != EMPTY and info.bbox_visib != bop_box(mask.box):
-            yield _file(view), f"image {view.image}, instance {index}: bbox_visib is {_describe(info.bbox_visib, mask.box)}"
+        if mask.box is not None and info.bbox_visib != EMPTY:
+            text = f"image {view.image}, instance {index}: bbox_visib is {_describe(info.bbox_visib, mask.box)}"
+            value = _farthest_side(info.bbox_visib, mask.box, range(4))
+            yield Deviation(_file(view), text, view.truths[index].obj_id, value, value > 0)
 
 
-@rule(ViewSubject, "amodal-box", "compute the box from the whole silhouette; COCO's boxes have + 1, these do not")
+@rule(ViewSubject, "amodal-box", "compute the box from the whole silhouette; COCO's boxes have + 1, these do not", unit="px")
 def check_amodal_box(view: ViewSubject) -> Findings:
     """bbox_obj is the tight box of the whole silhouette, without + 1; beyond the image where the silhouette is."""
     for index, mask, info in _pairs(view, "mask"):
         if mask.box is None or info.bbox_obj == EMPTY:
             continue
         box, wrong = info.bbox_obj, wrong_sides(info.bbox_obj, mask)
-        if wrong and not _touched_sides(mask):
-            yield _file(view), f"image {view.image}, instance {index}: bbox_obj is {_describe(box, mask.box)}"
-        elif wrong:
-            yield _file(view), f"image {view.image}, instance {index}: bbox_obj {box}, cut at the border, is not the box of {mask.file}"
+        cut = f"bbox_obj {box}, cut at the border, is not the box of {mask.file}"
+        text = f"image {view.image}, instance {index}: {cut if _touched_sides(mask) else f'bbox_obj is {_describe(box, mask.box)}'}"
+        yield Deviation(_file(view), text, view.truths[index].obj_id, _farthest_side(box, mask.box, wrong), bool(wrong))
+
+
+def _farthest_side(box: list[int], seen: tuple[int, int, int, int], sides: Iterable[int]) -> float:
+    """Largest distance of a box in BOP's convention from that of a mask at some sides, as in `box_sides` [px]; 0 at none."""
+    stated, found = box_sides(box), box_sides(bop_box(seen))
+    return float(max((abs(stated[side] - found[side]) for side in sides), default=0))
 
 
 def wrong_sides(box: list[int], mask: Mask) -> list[int]:
-    """Sides, as in `_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
+    """Sides, as in `box_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
 
     A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
     only if its box stays within the image on the others: around a corner of the image it may reach farther than inside.
@@ -143,8 +163,8 @@ def wrong_sides(box: list[int], mask: Mask) -> list[int]:
     """
     if mask.box is None:
         return []
-    stated, seen, touched = _sides(box), _sides(bop_box(mask.box)), _touched_sides(mask)
-    image = _sides([0, 0, mask.size[0] - 1, mask.size[1] - 1])
+    stated, seen, touched = box_sides(box), box_sides(bop_box(mask.box)), _touched_sides(mask)
+    image = box_sides([0, 0, mask.size[0] - 1, mask.size[1] - 1])
     beyond = {side for side in range(4) if touched and stated[side] > image[side]}
     known = [side for side in range(4) if touched | beyond <= {(side + 2) % 4}]
     return [side for side in range(4) if stated[side] < seen[side] or (side in known and stated[side] != seen[side])]
@@ -155,13 +175,8 @@ def bop_box(box: tuple[int, int, int, int]) -> list[int]:
     return [box[0], box[1], box[2] - 1, box[3] - 1]
 
 
-def _sides(box: list[int]) -> tuple[int, int, int, int]:
-    """Extents of a box to the left, top, right and bottom, each the larger the farther the box reaches: -x, -y, x + width, y + height."""
-    return -box[0], -box[1], box[0] + box[2], box[1] + box[3]
-
-
 def _touched_sides(mask: Mask) -> set[int]:
-    """Borders of the image that a silhouette reaches, as in `_sides`; all, if it is empty and may lie outside."""
+    """Borders of the image that a silhouette reaches, as in `box_sides`; all, if it is empty and may lie outside."""
     if mask.box is None:
         return {0, 1, 2, 3}
     left, top, width, height = mask.box

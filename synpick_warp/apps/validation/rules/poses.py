@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-from synpick_warp.apps.validation.diagnosis import DiagnosedView, Kind
-from synpick_warp.apps.validation.registry import Findings, rule
+from synpick_warp.apps.validation.diagnosis import MEASURED, DiagnosedView, Kind
+from synpick_warp.apps.validation.registry import Deviation, Findings, rule
+
+_UNITS = {kind: "mm" if kind in (Kind.POSE, Kind.DEPTH) else "px" for kind in MEASURED}
+"""Unit of the deviations of each kind that has them."""
 
 
 def _declare(name: str, sentence: str, cure: str, *kinds: Kind) -> None:
-    """Declare a rule that yields the findings of some kinds: shifted or wrong masks with the mask's file; scale, ray length and depth with
-    the depth image; others with scene_gt.json."""
+    """Declare a rule that yields the findings of some kinds, and with a tolerance the deviations of the first."""
+    unit = _UNITS.get(kinds[0], "")
 
     def check(rendered: DiagnosedView) -> Findings:
-        view = rendered.view
-        for finding in rendered.findings:
-            if finding.kind not in kinds:
-                continue
-            if finding.kind in (Kind.SHIFT, Kind.SHIFT_VISIBLE, Kind.MASK, Kind.VISIBLE):
-                visible = finding.kind in (Kind.VISIBLE, Kind.SHIFT_VISIBLE) or "mask" not in view.masks
-                yield view.scene.files.file("mask_visib" if visible else "mask", view.image, finding.index), finding.text
-            elif finding.kind in (Kind.SCALE, Kind.RAY, Kind.DEPTH):
-                yield view.scene.files.file("depth", view.image), finding.text
-            else:
-                yield view.scene.record("gt").where(view.image), finding.text
+        findings = [finding for finding in rendered.findings if finding.kind in kinds]
+        for finding in findings:
+            yield _file(rendered, finding.kind, finding.index), finding.text
+        for index, value in rendered.deviations[kinds[0]] if unit and rendered.given is not None else ():
+            text = f"image {rendered.view.image}, instance {index}: {kinds[0]} deviates by {value:.3g} {unit}"
+            named = any(finding.index in (None, index) for finding in findings)
+            obj_id = rendered.view.truths[index].obj_id
+            yield Deviation(_file(rendered, kinds[0], index), text, obj_id, value, named=named)
 
     check.__doc__ = sentence
-    rule(DiagnosedView, name, cure)(check)
+    rule(DiagnosedView, name, cure, unit=unit)(check)
+
+
+def _file(rendered: DiagnosedView, kind: Kind, index: int | None) -> str:
+    """File of a finding: of shifted or wrong masks the mask; of scale, ray length and depth the depth image; of others scene_gt.json."""
+    view = rendered.view
+    if kind in (Kind.SHIFT, Kind.SHIFT_VISIBLE, Kind.MASK, Kind.VISIBLE):
+        visible = kind in (Kind.VISIBLE, Kind.SHIFT_VISIBLE) or "mask" not in view.masks
+        return view.scene.files.file("mask_visib" if visible else "mask", view.image, index)
+    if kind in (Kind.SCALE, Kind.RAY, Kind.DEPTH):
+        return view.scene.files.file("depth", view.image)
+    return view.scene.record("gt").where(view.image)
 
 
 _declare(
