@@ -230,7 +230,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
-        "passes": (4.0, "how often a view is trained on"),
+        "passes": (4.0, "how often a view is trained on; windows count by their area"),
         "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),

@@ -38,7 +38,7 @@ class Recipe:
     views: int
     """Views of the stream."""
     passes: float
-    """How often a view is trained on, on average."""
+    """How often a view is trained on, on average; windows count by their area."""
     batch: int
     width: int
     """Channels of the network's first level."""
@@ -78,7 +78,7 @@ class Trained:
     """In all."""
     views: int
     samples: int
-    """Views trained on, repeats counted."""
+    """Views or windows trained on, repeats counted."""
 
 
 def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, window: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -160,7 +160,8 @@ class _Trainer:
         self.loss = torch.compile(segmentation_loss) if recipe.compiled else segmentation_loss
         self.weights = torch.ones(classes, device=device)
         self.weights[0] = recipe.background
-        self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
+        area = (1 - WHOLE) * recipe.window**2 + WHOLE
+        self.total = max(1, round(recipe.views * recipe.passes / (recipe.batch * area)))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
         """Time before the first step, in which the stream filled the pool [s]."""
@@ -205,7 +206,7 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
         batches.close()
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
-        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * recipe.passes / recipe.batch:
+        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * trainer.total / recipe.views:
             more = pool.fill(batches, min(pool.seen + recipe.batch, recipe.views))
         trainer.step(pool)
     batches.close()
