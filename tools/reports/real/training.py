@@ -156,8 +156,8 @@ class _Trainer:
         self.network = NETWORKS[recipe.network](classes, recipe.width).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
-        self.logits = torch.compile(self.network) if recipe.compiled else self.network
-        self.loss = torch.compile(segmentation_loss) if recipe.compiled else segmentation_loss
+        self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network
+        self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
         self.weights = torch.ones(classes, device=device)
         self.weights[0] = recipe.background
         area = (1 - WHOLE) * recipe.window**2 + WHOLE
