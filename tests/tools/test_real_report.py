@@ -14,11 +14,14 @@ torch = pytest.importorskip("torch", exc_type=ImportError)
 scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
 from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
+from synpick_warp.errors import SynpickError  # noqa: E402
 from tools.reports.real import ablation, interval  # noqa: E402
 from tools.reports.real.__main__ import PRESET  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
-from tools.reports.real.training import Recipe, train, warp_views  # noqa: E402
-from tools.reports.real.views import Pool  # noqa: E402
+from tools.reports.real.networks import NETWORKS  # noqa: E402
+from tools.reports.real.training import Recipe, segmentation_loss, train, warp_views  # noqa: E402
+from tools.reports.real.tuning import changed  # noqa: E402
+from tools.reports.real.views import Pool, Source  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
 
@@ -62,6 +65,50 @@ def test_augmentation_moves_labels_with_the_image():
     assert (labels != classes).float().mean() > 0.02
 
 
+def test_windows_are_parts_of_the_view_at_its_scale():
+    plain = dataclasses.replace(RECIPE, scale=1.0)
+    # Each pixel holds its column, so that windows show where they are and how large.
+    columns = torch.arange(64).expand(6, 48, 64)
+    images, labels = warp_views((columns[:, None] / 64.0).expand(-1, 3, -1, -1), columns, plain, 0.5)
+    assert images.shape == (6, 3, 24, 32)
+    assert labels.shape == (6, 24, 32)
+    assert (labels[:, :, 1:] - labels[:, :, :-1] == 1).all()
+    assert labels[:, 0, 0].unique().numel() > 1
+    assert (images[:, 0] * 64 - labels).abs().max() <= 1.0
+
+
+def test_the_loss_of_known_logits():
+    classes = torch.tensor([[[0, 0, 1, 2]]])
+    weights = torch.ones(4)
+    exact = 50.0 * torch.nn.functional.one_hot(classes, 4).permute(0, 3, 1, 2).float()
+    assert float(segmentation_loss(exact, classes, weights, 1.0)) == pytest.approx(0.0, abs=1e-6)
+    even = torch.zeros(1, 4, 1, 4)
+    # Each object has one pixel, of which a quarter is predicted, as of the three others: Dice 2 x 1/4 / (1 + 1).
+    entropy = float(segmentation_loss(even, classes, weights, 0.0))
+    assert entropy == pytest.approx(np.log(4.0))
+    assert float(segmentation_loss(even, classes, weights, 2.0)) - entropy == pytest.approx(2 * 0.75)
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_networks_have_logits_of_the_images_size(name):
+    assert NETWORKS[name](5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
+
+
+def test_sources_come_in_turns_until_each_ends(monkeypatch):
+    monkeypatch.setattr(Source, "_own", lambda self: iter(Closable(self.config)))
+    mixed = Source([1, 2, 3], range(1), 1, beside=Source([7], range(1), 1))
+    assert list(mixed.batches()) == [1, 7, 2, 3]
+
+
+def test_a_trial_changes_what_it_names():
+    assert changed(RECIPE, "base") == RECIPE
+    made = changed(RECIPE, "dice=1,network=residual,width=4")
+    assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
+    for text in ("dice", "dice=x", "depth=1"):
+        with pytest.raises(SynpickError):
+            changed(RECIPE, text)
+
+
 def test_a_pool_replaces_views_once_it_is_full():
     pool = Pool(4, 0)
     batches = iter([(torch.full((3, 3, 2, 2), index, dtype=torch.uint8), torch.full((3, 2, 2), index)) for index in range(6)])
@@ -71,6 +118,13 @@ def test_a_pool_replaces_views_once_it_is_full():
     assert pool.count == 4
     assert pool.seen > 4
     assert pool.draw(9)[0].shape == (9, 3, 2, 2)
+
+
+class Closable(list):
+    """Batches as of a generator."""
+
+    def __iter__(self):
+        yield from super().__iter__()
 
 
 class Drawn:
@@ -97,16 +151,28 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", window=0.5, dice=1.0)
     trained, _ = train(Drawn(most=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
-    assert trained.samples == 16
+    # Ten steps of four, of which eight are of a quarter of the pixels: 16 views' worth.
+    assert trained.samples == 40
 
 
 @pytest.mark.parametrize("name", ablation.LEVERS)
 def test_each_lever_changes_the_preset(name):
     changes = dict(parse_assignment(text) for text in ablation.LEVERS[name])
     assert load_config(PRESET, changes) != load_config(PRESET, {})
+
+
+def test_the_first_row_trains_for_less_rather_than_not_at_all():
+    run = next(ablation.plan(8000, 24_000))
+    start = ablation.SLACK * ablation.START
+    assert run.fit(start + run.limit, ablation.START).limit == run.limit
+    assert run.fit(start + run.limit - 7, ablation.START).limit == pytest.approx(run.limit - 7)
+    assert run.fit(start + run.least - 1, ablation.START) is None
+    other = ablation.Run("other", 8000)
+    assert other.fit(start + other.training, ablation.START) is None
+    assert other.fit(start + ablation.SLACK * other.training + 1, ablation.START) is not None
 
 
 def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, capsys):
@@ -117,9 +183,10 @@ def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, caps
     assert len(lines) == len(jobs)
     assert lines[-1].endswith("(left out)")
     for seed, value in enumerate((0.4, 0.6)):
-        entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", *ablation.METRICS), value)
+        entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", "limit", *ablation.METRICS), value)
         (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}}))
     made = ablation.collect(tmp_path, jobs)
     assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
     assert made["rows"][0]["name"] == "all levers: mIoU"
+    assert made["rows"][0]["unit"].endswith("shortest time limit 0 s")
     assert made["more"]["seeds"]["all levers"]["mean_iou"] == [0.4, 0.6]

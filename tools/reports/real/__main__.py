@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ try:
     import torch  # pyright: ignore[reportMissingImports]
 
     from tools.reports.real.detector import average_precision, boxes_of, detect, train_detector
+    from tools.reports.real.networks import NETWORKS
     from tools.reports.real.scores import Scores, draw_overlay, predict, score, score_pool
     from tools.reports.real.training import Recipe, Trained, train
     from tools.reports.real.views import Pool, Source, hold_out
@@ -41,6 +43,10 @@ FEW_WORLDS = 64
 """Maximum number of worlds for held-out views."""
 PRESET = "tabletop-train"
 """Default preset of the stream."""
+BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
+"""Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
+BESIDE_STRIDE = 3
+"""Every so many frames of such an episode one is taken."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
@@ -54,41 +60,64 @@ class Outcome:
     synthetic: Scores
     overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
-    precision: float
+    precision: float = float("nan")
     """AP at an IoU of 0.5 of the detector; NaN: none was trained."""
 
 
-def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], device: Any) -> Outcome:
-    """Train and score with one seed.
+def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], device: Any) -> Iterator[Outcome]:
+    """Train and score with one seed; with --detector, the outcome comes again with its precision.
 
     Raises:
         SynpickError: A setting is wrong, or models or lights cannot be used.
     """
-    fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
-    fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
-    config = configure(options, fixed)
-    source = Source(config, TRAINING, options.stride, options.shrink)
-    recipe = Recipe(**{name: getattr(options, name) for name in Recipe.__dataclass_fields__})
+    source, held_source = sources(options, seed, device)
     target = torch.device(device.alias)
-    few = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS)))
-    held = hold_out(replace(source, config=few, episodes=HELD_OUT), options.held_out)
-    trained, pool = train(source, recipe, 1 + MODELS, target, seed)
+    held = hold_out(held_source, options.held_out)
+    trained, pool = train(source, recipe_of(options), 1 + MODELS, target, seed)
+    outcome = measure(trained, frames, held, target)
+    yield outcome
+    if options.detector:
+        height, width = held.tensors()[0].shape[2:]
+        yield replace(outcome, precision=_detector(options, pool, frames, (int(width), int(height)), target))
+
+
+def recipe_of(options: argparse.Namespace) -> Recipe:
+    """Hyper-parameters of a command line."""
+    return Recipe(**{name: getattr(options, name) for name in Recipe.__dataclass_fields__})
+
+
+def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) -> Outcome:
+    """Scores of a network on real frames, and on held-out views."""
     height, width = held.tensors()[0].shape[2:]
-    size = int(width), int(height)
-    found = [predict(trained.network, frame.color, size, target) for frame in frames]
+    found = [predict(trained.network, frame.color, (int(width), int(height)), device) for frame in frames]
     real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
-    precision = _detector(options, pool, frames, size, target)
-    return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay, precision)
+    return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
+
+
+def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source, Source]:
+    """Sources of training views, and of held-out views: those of --config alone.
+
+    Raises:
+        ConfigError: A setting is wrong.
+    """
+    fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
+    fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
+    config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
+    source = Source(config, TRAINING, options.stride, options.shrink)
+    held = replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT)
+    if not options.beside:
+        return source, held
+    other = argparse.Namespace(**vars(options) | {"config": options.beside, "set": []})
+    beside = Source(configure(other, fixed | BESIDE | {"bake.worlds": few}), TRAINING, BESIDE_STRIDE, options.shrink)
+    return replace(source, beside=beside), held
 
 
 def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
-    """AP at an IoU of 0.5 of a detector on real frames; NaN without --detector, or without torchvision, which is printed."""
-    if not options.detector:
-        return float("nan")
+    """AP at an IoU of 0.5 of a detector on real frames; NaN without torchvision, which is printed."""
     network = train_detector(pool, 1 + MODELS, device, options.detector)
     if network is None:
-        print("detector: torchvision is not installed; left out")
+        print("detector: torchvision is not installed or does not load; left out")
         return float("nan")
     return average_precision([detect(network, frame.color, size, device) for frame in frames], [boxes_of(frame.label) for frame in frames])
 
@@ -113,7 +142,7 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
         row("training, in all", [one.trained.seconds for one in outcomes], "s"),
         row("of it the stream", [one.trained.stream_seconds for one in outcomes], "s"),
         row("views", [float(one.trained.views) for one in outcomes]),
-        row("cross entropy at the end", [one.trained.losses[-1] for one in outcomes]),
+        row("loss at the end", [one.trained.losses[-1] for one in outcomes]),
     ]
     first = outcomes[0].real
     rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in first.iou]
@@ -122,7 +151,7 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    options = parse(arguments)
+    options = make_options().parse_args(arguments)
     try:
         frames = read_frames(options.real)
         device = pick_device(options.device)
@@ -132,12 +161,14 @@ def main(arguments: list[str] | None = None) -> int:
         # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
         with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
             for seed in range(options.first_seed, options.first_seed + options.seeds):
-                outcome = run_seed(options, seed, frames, device)
-                outcomes.append(outcome)
-                print(_line(seed, outcome), flush=True)
+                results = run_seed(options, seed, frames, device)
+                outcomes.append(next(results))
+                print(_line(seed, outcomes[-1]), flush=True)
                 _write(options, outcomes)
                 if options.pictures is not None:
-                    draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcome.overlay, 1 + MODELS)
+                    draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcomes[-1].overlay, 1 + MODELS)
+                for outcomes[-1] in results:
+                    _write(options, outcomes)
     except SynpickError as error:
         return fail("reports.real", error)
     print_rows(Console(), "", "photographs", rows_of(outcomes))
@@ -149,7 +180,7 @@ def _line(seed: int, outcome: Outcome) -> str:
     trained, real = outcome.trained, outcome.real
     return (
         f"seed {seed}: {trained.views} views, {trained.samples} samples, {trained.seconds:.1f} s (stream {trained.stream_seconds:.1f}); "
-        f"cross entropy {trained.losses[0]:.3f} to {trained.losses[-1]:.3f}; mIoU {real.mean_iou:.3f} (synthetic "
+        f"loss {trained.losses[0]:.3f} to {trained.losses[-1]:.3f}; mIoU {real.mean_iou:.3f} (synthetic "
         f"{outcome.synthetic.mean_iou:.3f}), found {100 * real.found:.0f} %, background {100 * real.background:.1f} %"
     )
 
@@ -170,6 +201,7 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
             "stream_seconds": one.trained.stream_seconds,
             "views": one.trained.views,
             "samples": one.trained.samples,
+            "limit": options.seconds,
             "ap50": one.precision if np.isfinite(one.precision) else None,
         }
         for one in outcomes
@@ -179,9 +211,9 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
     part.replace(options.json)
 
 
-def parse(arguments: list[str] | None) -> argparse.Namespace:
-    """Parse the command line."""
-    parser = make_parser(__doc__, "config", "device", "models", "lights", "seed", "set", "json", config=PRESET)
+def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
+    """Parser of the command line, described by `text`."""
+    parser = make_parser(text, "config", "device", "models", "lights", "seed", "set", "json", config=PRESET)
     parser.add_argument("--real", type=Path, required=True, help="folder of annotated frames, as tools.reports.real_frames reads them")
     counts = {
         "views": (24_000, "views of the stream"),
@@ -198,20 +230,26 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
-        "passes": (4.0, "how often a view is trained on"),
+        "passes": (4.0, "how often a view is trained on; windows count by their area"),
         "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
         "jitter": (0.3, "strength of photometric augmentation; 0: none"),
-        "background": (1.0, "weight of the background in the loss"),
+        "background": (1.0, "weight of the background in the cross entropy"),
+        "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
+        "rate": (2e-3, "largest learning rate"),
+        "window": (1.0, "side of the windows of views that most of the training is on, as a fraction of the view's"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(f"--{name}", type=float, default=default, help=f"{text} (default: {default:g})")
+    parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
+    parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
+    parser.add_argument("--beside", default="", metavar="PRESET", help="train on views of this preset too, half and half")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")
-    return parser.parse_args(arguments)
+    return parser
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
 Each run is a process of `tools.reports.real` with one seed. Runs start by priority on the next free GPU, those of a first seed before those
-of a second. A run that would not end by the deadline is left out, which is printed; runs with results in --out are not repeated. Results
-are collected after each run. Without --out, the plan is printed: runs, expected seconds, and when they would end. Synthetic scores are on
-held-out views of each row's own settings, so that rows compare by their scores on photographs alone.
+of a second. A run that would not end by the deadline is left out, which is printed; but rows with most views train for less time, down to a
+minimum, which the results say. What runs take beside their training is measured on those that ended. Runs with results in --out are not
+repeated. Results are collected after each run. Without --out, the plan is printed: runs, expected seconds, and when they would end.
+Synthetic scores are on held-out views of each row's own settings, so that rows compare by their scores on photographs alone.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -13,11 +14,13 @@ from __future__ import annotations
 import argparse
 import heapq
 import json
+import math
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,18 +30,16 @@ from tools.figures import describe_run
 from tools.options import Row, make_parser, positive_count, write_json
 from tools.reports.real import interval
 
-START = 40.0
-"""Imports, kernels from the cache, models and lights, two streams' first piles [s]."""
-STREAM_RATE = 500.0
-"""Views/s of still piles at 320x240 with 512 worlds: 8 views a pile, some 35 ticks to settle; the renderer alone makes 1,500."""
+START = 60.0
+"""Time of a run beside its training [s]: imports, cached kernels, models and lights, held-out views, scores. 50 to 55 on an H200 host."""
+STREAM_RATE = 230.0
+"""Views/s of still piles at 320x240 with 512 worlds, the first piles counted: 8 views a pile, some 35 ticks to settle. On an H200."""
 REFERENCE_RATE = 30.0
 """Views/s of mode reference at 320x240 and 64 paths."""
-TRAIN_RATE = 700.0
-"""Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H100: 0.17 TFLOP a sample."""
+TRAIN_RATE = 600.0
+"""Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H200: 0.17 TFLOP a sample."""
 DETECTOR = 60.0
 """Training of the detector [s]."""
-HELD_OUT = 400
-"""Synthetic views to measure on."""
 SLACK = 1.15
 """Safety factor on expected times: a run starts only if so much time is left."""
 METRICS = {
@@ -51,6 +52,10 @@ METRICS = {
 """Scores that are collected, by key of a seed's results: label, unit and factor."""
 PASSES = 6.0
 """Epochs: how often each view is trained on."""
+MAIN_PASSES = 16.0
+"""Epochs of the first row, which its time limit ends before."""
+MIN_LIMIT = 150.0
+"""Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
 """Samples that runs with few views train on: as many as the others."""
 
@@ -81,25 +86,31 @@ class Run:
     rate: float = STREAM_RATE
     limit: float = 280.0
     """Time limit of a training with its stream [s]."""
-    more: float = 0.0
-    """Further time, as of a detector [s]."""
+    least: float = math.inf
+    """Limit down to which it may be shortened where less time is left [s]; infinite: it may not."""
+    detector: float = 0.0
+    """Time to train a detector, where it is left [s]."""
 
     @property
-    def seconds(self) -> float:
-        """Expected time of one seed [s]."""
-        return START + min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE) + HELD_OUT / self.rate + self.more
+    def training(self) -> float:
+        """Expected time of a training with its stream [s]."""
+        return min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
-    @property
-    def most_seconds(self) -> float:
-        """Time that must be left for one seed to start [s]."""
-        return min(SLACK * self.seconds, SLACK * START + self.limit + HELD_OUT / self.rate + self.more)
+    def fit(self, left: float, start: float) -> Run | None:
+        """This run with the limit and detector that the time `left` [s] allows, `start` of it beside training; None: too little."""
+        room = left - SLACK * start
+        if room < min(self.limit, SLACK * self.training, self.least):
+            return None
+        limit = min(self.limit, room)
+        return replace(self, limit=limit, detector=self.detector if room - limit > self.detector else 0.0)
 
     def command(self, options: argparse.Namespace, seed: int, gpu: int, stem: str) -> list[str]:
         """Command line of one seed."""
+        own_detector = ["--detector", f"{self.detector:g}"] if self.detector else []
         shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
         own = ["--views", str(self.views), "--passes", f"{self.passes:g}", "--seconds", f"{self.limit:g}", "--seeds", "1"]
         files = ["--first-seed", str(seed), "--json", f"{stem}.json", "--name", Path(stem).name, "--pictures", str(Path(stem).parent)]
-        return [sys.executable, "-m", "tools.reports.real", *shared, *own, *files, *self.arguments, *options.pass_on]
+        return [sys.executable, "-m", "tools.reports.real", *shared, *own, *files, *own_detector, *options.pass_on, *self.arguments]
 
 
 def _settings(*assignments: str) -> tuple[str, ...]:
@@ -109,28 +120,29 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 
 def plan(views: int, main_views: int) -> Iterator[Run]:
     """All rows in the order of priority."""
+    detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
-    yield Run("all levers", main_views, ("--detector", str(DETECTOR)), passes=4.0, more=DETECTOR)
-    yield Run("all levers, ablation's number of views", views)
+    yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
     yield Run("tote, not randomized", views, ("--config", "synpick", *tote))
     yield Run("tote, randomized", views, ("--config", "randomized", *tote))
+    yield Run("all levers, ablation's number of views", views)
     for name, settings in LEVERS.items():
         yield Run(f"without {name}", views, _settings(*settings))
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0"))
     yield Run("without photometric augmentation", views, ("--jitter", "0"))
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0)
+    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0, least=300.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
-    yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "60"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
+    yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "16"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: the first rows with all seeds, the others by seed; rows whose name begins so before all."""
-    first = [(run, seed) for run in rows[:2] for seed in range(run.seeds)]
-    rest = [(run, seed) for seed in range(3) for run in rows[2:] if seed < run.seeds]
+    """Runs in the order in which they start: the first row with all seeds, the others by seed; rows whose name begins so before all."""
+    first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
+    rest = [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
     return sorted(first + rest, key=lambda job: not (preferred and job[0].name.startswith(preferred)))
 
 
@@ -139,10 +151,10 @@ def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
     free = [0.0] * gpus
     for run, seed in jobs:
         start = heapq.heappop(free)
-        ends = start + run.seconds
-        late = " (left out)" if start + run.most_seconds > deadline else ""
-        heapq.heappush(free, start if late else ends)
-        print(f"{start:6.0f} to {ends:6.0f} s  {run.seconds:4.0f} s  seed {seed}  {run.name}{late}")
+        fits = run.fit(deadline - start, START)
+        ends = start + START + (fits or run).training + (fits.detector if fits else 0.0)
+        heapq.heappush(free, ends if fits else start)
+        print(f"{start:6.0f} to {ends:6.0f} s  {ends - start:4.0f} s  seed {seed}  {run.name}{'' if fits else ' (left out)'}")
 
 
 def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> int:
@@ -163,7 +175,8 @@ def _execute(
     options: argparse.Namespace,
 ) -> int:
     """Loop of `execute` over the runs that wait and, by GPU, those that run."""
-    started, failed = time.monotonic(), 0
+    started, failed, start = time.monotonic(), 0, START
+    begun = dict[int, float]()
     while waiting or running:
         left = options.deadline - (time.monotonic() - started)
         for gpu, (process, run, seed, log) in list(running.items()):
@@ -172,6 +185,7 @@ def _execute(
             if process.poll() is not None:
                 log.close()
                 failed += process.returncode != 0
+                start = max(start, time.monotonic() - begun[gpu] - spent(options.out / f"{stem_of(run, seed)}.json") - run.detector)
                 print(
                     f"{time.monotonic() - started:6.0f} s  gpu {gpu}  seed {seed}  {run.name}: exit code {process.returncode}", flush=True
                 )
@@ -181,15 +195,22 @@ def _execute(
             if not waiting:
                 break
             run, seed = waiting.pop(0)
-            if run.most_seconds > left:
-                print(f"left out: seed {seed} of {run.name} needs {run.seconds:.0f} s, {left:.0f} s are left", flush=True)
+            fits = run.fit(left, start)
+            if fits is None:
+                print(f"left out: seed {seed} of {run.name} needs {start + run.training:.0f} s, {left:.0f} s are left", flush=True)
                 continue
+            run, begun[gpu] = fits, time.monotonic()
             stem = str(options.out / stem_of(run, seed))
             log = open(f"{stem}.log", "wb")  # noqa: SIM115
             process = subprocess.Popen(run.command(options, seed, gpu, stem), stdout=log, stderr=subprocess.STDOUT)
             running[gpu] = (process, run, seed, log)
         time.sleep(0.5)
     return failed
+
+
+def spent(path: Path) -> float:
+    """Time of a training with its stream, by its results [s]; infinite without."""
+    return json.loads(path.read_text())["more"]["seeds"][0]["seconds"] if path.exists() else math.inf
 
 
 def stem_of(run: Run, seed: int) -> str:
@@ -207,12 +228,16 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
         seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
         if not seeds:
             continue
+        limit = min(seed["limit"] for seed in seeds)
+        shorter = f"shortest time limit {limit:.0f} s" if limit < run.limit - 1.0 else ""
         for metric, (label, unit, factor) in METRICS.items():
             values = [factor * seed[metric] for seed in seeds if seed.get(metric) is not None]
             if values:
-                words = " ".join(word for word in (unit, interval(values)) if word)
+                words = " ".join(word for word in (unit, interval(values), shorter) if word)
                 rows.append(Row(f"{run.name}: {label}", round(float(np.mean(values)), 4), words, part=run.name))
-        times[run.name] = {name: [seed[name] for seed in seeds] for name in ("views", "samples", "seconds", "stream_seconds", *METRICS)}
+        times[run.name] = {
+            name: [seed[name] for seed in seeds] for name in ("views", "samples", "seconds", "stream_seconds", "limit", *METRICS)
+        }
     return describe_run("tools.reports.real.ablation", (), rows, seeds=times)
 
 

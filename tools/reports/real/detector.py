@@ -37,10 +37,10 @@ def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
-    """Train Faster R-CNN on the views of a pool for so many seconds; None without torchvision."""
+    """Train Faster R-CNN on the views of a pool for so many seconds; None without a torchvision that loads."""
     try:
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
-    except ImportError:
+    except (ImportError, OSError, RuntimeError):  # RuntimeError: torchvision was built for another PyTorch.
         return None
     views, classified = pool.tensors()
     height, width = views.shape[2:]

@@ -1,7 +1,8 @@
-"""Training of the U-Net of `tools.examples.train_online` (Ronneberger et al., MICCAI 2015) from a pool of views, with augmentation.
+"""Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice (Milletari et al., 3DV 2016).
 
 AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
-borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw.
+borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may be on windows
+of the views, random crops at full scale, of which a GPU takes more in the same time.
 """
 
 from __future__ import annotations
@@ -14,7 +15,8 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from tools.examples.train_online import LEARNING_RATE, WARM_UP, Network
+from tools.examples.train_online import LEARNING_RATE, MIN_SIDE, WARM_UP
+from tools.reports.real.networks import NETWORKS
 from tools.reports.real.views import Pool, Source
 
 LUMA = (0.299, 0.587, 0.114)
@@ -25,6 +27,8 @@ MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
 FILLING = 0.5
 """Largest fraction of the time limit that passes before the first step, while the stream fills the pool."""
+WHOLE = 0.2
+"""Last fraction of the schedule, which is on whole views also where the rest is on windows: batch statistics become those of views."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class Recipe:
     views: int
     """Views of the stream."""
     passes: float
-    """How often a view is trained on, on average."""
+    """How often a view is trained on, on average; windows count by their area."""
     batch: int
     width: int
     """Channels of the network's first level."""
@@ -49,7 +53,17 @@ class Recipe:
     jitter: float = 0.3
     """Strength of photometric changes; 0: none."""
     background: float = 1.0
-    """Class weight of the background in the loss."""
+    """Class weight of the background in the cross entropy."""
+    dice: float = 0.0
+    """Weight of the Dice loss beside the cross entropy."""
+    rate: float = LEARNING_RATE
+    """Largest learning rate."""
+    window: float = 1.0
+    """Side of the windows that are trained on, as a fraction of the view's."""
+    network: str = "unet"
+    """Key of NETWORKS."""
+    compiled: bool = False
+    """Whether PyTorch compiles network and loss (some 30 s, cached on disk)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,18 +78,24 @@ class Trained:
     """In all."""
     views: int
     samples: int
-    """Views trained on, repeats counted."""
+    """Views or windows trained on, repeats counted."""
 
 
-def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders."""
-    count, height, width = classes.shape
+def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, window: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders.
+
+    With a `window` below 1, windows of so many times the view's sides are cut at random places; sides are multiples of MIN_SIDE [px].
+    """
+    count, *sides = classes.shape
+    height, width = (side if window == 1 else max(MIN_SIDE, round(side * window / MIN_SIDE) * MIN_SIDE) for side in sides)
     draw = torch.rand(4, count, device=images.device) * 2 - 1
-    factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation)
-    cosine, sine = factor * angle.cos(), factor * angle.sin()
-    room = (factor - 1).abs()
-    aspect = height / width
-    rows = [torch.stack([cosine, -sine * aspect, room * draw[2]], 1), torch.stack([sine / aspect, cosine, room * draw[3]], 1)]
+    factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation if recipe.scale > 1 else 0.0)
+    aspect = sides[0] / sides[1]
+    across, down = factor * (width / sides[1]), factor * (height / sides[0])
+    rows = [
+        torch.stack([across * angle.cos(), -down * angle.sin() * aspect, (across - 1).abs() * draw[2]], 1),
+        torch.stack([across * angle.sin() / aspect, down * angle.cos(), (down - 1).abs() * draw[3]], 1),
+    ]
     grid = functional.affine_grid(torch.stack(rows, 1), [count, 1, height, width], align_corners=False)
     images = functional.grid_sample(images, grid, "bilinear", "reflection", align_corners=False)
     labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
@@ -101,14 +121,30 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     return (images + level * torch.randn_like(images)).clamp(0, 1)
 
 
-def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Augmented views as the network takes them: float32 in -0.5..0.5."""
+def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, window: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Augmented views, or windows of them, as the network takes them: float32 in -0.5..0.5."""
     values = images.float() / 255
-    if recipe.scale > 1:
-        values, classes = warp_views(values, classes, recipe)
+    if recipe.scale > 1 or window < 1:
+        values, classes = warp_views(values, classes, recipe, window)
     if recipe.jitter:
         values = jitter_views(values, recipe.jitter)
     return values - 0.5, classes
+
+
+def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, weights: torch.Tensor, dice: float) -> torch.Tensor:
+    """Cross entropy of logits (B, C, H, W) with class weights (C), and `dice` times the Dice loss: over the pixels of the batch, averaged
+    over the objects that occur in it. `classes` (B, H, W) int64; class 0 is the background."""
+    # A view where channels are last in memory; softmax then reads rows.
+    rows, truth = logits.permute(0, 2, 3, 1).flatten(0, 2).float(), classes.flatten()
+    loss = functional.cross_entropy(rows, truth, weights)
+    if dice:
+        shares = rows.softmax(1)
+        exact = torch.zeros_like(shares).scatter_(1, truth[:, None], 1.0)
+        sizes = exact.sum(0)
+        similar = 2 * (shares * exact).sum(0) / (shares.sum(0) + sizes).clamp(min=1.0)
+        occurs = (sizes > 0).float()[1:]
+        loss = loss + dice * (((1 - similar[1:]) * occurs).sum() / occurs.sum().clamp(min=1.0))
+    return loss
 
 
 class _Trainer:
@@ -117,11 +153,15 @@ class _Trainer:
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
-        self.network = Network(classes, recipe.width).to(device, memory_format=torch.channels_last)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), LEARNING_RATE)
+        self.network = NETWORKS[recipe.network](classes, recipe.width).to(device, memory_format=torch.channels_last)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
+        torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
+        self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network
+        self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
         self.weights = torch.ones(classes, device=device)
         self.weights[0] = recipe.background
-        self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
+        area = (1 - WHOLE) * recipe.window**2 + WHOLE
+        self.total = max(1, round(recipe.views * recipe.passes / (recipe.batch * area)))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
         """Time before the first step, in which the stream filled the pool [s]."""
@@ -136,12 +176,13 @@ class _Trainer:
         """Train on a batch."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
-        self.optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(factor, LEAST_RATE)
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe)
+        self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
+        window = self.recipe.window if done < 1 - WHOLE else 1.0
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, window)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self.network(images)
-        loss = functional.cross_entropy(logits.float(), classes, self.weights)
+            logits = self.logits(images)
+        loss = self.loss(logits, classes, self.weights, self.recipe.dice)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
@@ -149,13 +190,15 @@ class _Trainer:
         self.losses.append(loss.detach())
 
 
-def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int) -> tuple[Trained, Pool]:
+def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int, pool: Pool | None = None) -> tuple[Trained, Pool]:
     """Train a network on views of a stream. The pool is filled first, for at most half of the time limit; the rest comes while training.
+
+    A `pool` that is given goes on to be filled: one of `recipe.views` views or more is trained on as it is.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
-    pool, trainer = Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
+    pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches()
     pool.fill(batches, pool.capacity, FILLING * recipe.seconds)
     more = pool.seen < recipe.views
@@ -163,7 +206,7 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
         batches.close()
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
-        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * recipe.passes / recipe.batch:
+        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * trainer.total / recipe.views:
             more = pool.fill(batches, min(pool.seen + recipe.batch, recipe.views))
         trainer.step(pool)
     batches.close()
