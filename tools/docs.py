@@ -127,7 +127,7 @@ def photographs_reference() -> str:
     tables = figures_tables(read_runs())
 
     def fill(found: re.Match[str]) -> str:
-        table = tables.get(found[2])
+        table = tables.get(found[2], "").replace("](results/", "](../../results/")
         return f"{found[1]}## Figures\n\n{table}\n{found[3]}" if table else f"{found[1]}{found[3]}"
 
     return _RESULTS.sub(fill, PHOTOGRAPHS.read_text(encoding="utf-8"))
