@@ -7,7 +7,7 @@ from pathlib import Path
 
 from synpick_warp.cloud.bundles import join_bundles, split_bundles, unpack_bundle
 from synpick_warp.cloud.delivery import send_file
-from synpick_warp.cloud.ledger import DONE, FINISHED, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
+from synpick_warp.cloud.ledger import DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import (
@@ -68,7 +68,7 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
     Raises:
         DatasetError: A batched mark is damaged.
         OutputError: The temporary folder cannot be written.
-        StoreError: An object was deleted that the indices are made of, or the store does not answer.
+        StoreError: An object was deleted that the indices are made of, another plan was finalized at once, or the store does not answer.
     """
     if ledger.finished():
         return 0
@@ -86,15 +86,27 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
         raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
-    store = ledger.store
-    if ledger.finished():  # Another bake of these episodes, or of more, has ended meanwhile.
-        return 0
+    if not ledger.finished():  # Else another bake of these episodes, or of more, has ended meanwhile.
+        _put_indices(ledger, work)
+    return 0
+
+
+def _put_indices(ledger: Ledger, work: Path) -> None:
+    """Upload the indices. The announcement of the plan is the first write and the last read: who finds another's may have mixed with it.
+
+    Raises:
+        StoreError: Another plan was finalized at once.
+    """
+    store, plan = ledger.store, spell_spans(ledger.plan).encode()
+    store.put(FINISHING, plan)
     for name, digest in read_checksums(work, INDICES).items():
         send_file(store, work / name, name, digest)
     for suffix in (".sha256", ".json"):
         store.put(f"{INDICES}{suffix}", (work / f"{INDICES}{suffix}").read_bytes())
-    store.put(FINISHED, spell_spans(ledger.plan).encode())
-    return 0
+    store.put(FINISHED, plan)
+    if store.get(FINISHING) != plan:
+        store.delete(FINISHED)
+        raise StoreError(f"another bake finalized {store.url} for other episodes at the same time; when it has ended, run the larger again")
 
 
 def _gather(ledger: Ledger, work: Path) -> None:

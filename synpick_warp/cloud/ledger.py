@@ -29,7 +29,8 @@ BLOCK = 1000
 """Indices that a block, and so a batched mark, spans: as many as a page of a listing has keys."""
 MARK_SPANS = 8
 """Most ranges of episodes that a batched mark has: its name fits into the 255 characters of a file system."""
-DONE, INDEX, FINISHED = f"{CONTROL}/done", f"{CONTROL}/index", f"{CONTROL}/finished"
+DONE, INDEX = f"{CONTROL}/done", f"{CONTROL}/index"
+FINISHING, FINISHED = f"{CONTROL}/finishing", f"{CONTROL}/finished"
 _SPAN = "[0-9]{6,12}-[0-9]{6,12}"
 _MARK = re.compile(rf"{re.escape(DONE)}/([0-9]{{6,9}})_({_SPAN}(?:_{_SPAN})*)")
 _SPANS = re.compile(rf"{_SPAN}(?:_{_SPAN})*")
