@@ -200,7 +200,7 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
         finish.finalize_store(small, places[1])
 
     monkeypatch.setattr(finish, "send_file", send)
-    with pytest.raises(StoreError, match="another bake finalized memory://.* for other episodes"):
+    with pytest.raises(StoreError, match=r"another bake finalized memory://.* for other episodes"):
         finish.finalize_store(large, places[0])
     run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
     assert stored(memory) == local
