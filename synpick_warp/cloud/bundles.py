@@ -11,7 +11,7 @@ import re
 import struct
 import tarfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -111,23 +111,24 @@ def join_bundles(bundles: Iterable[bytes], target: BinaryIO) -> None:
         target.write(data)
 
 
-def split_bundles(blocks: Iterable[bytes], count: int, source: str) -> Iterator[bytes]:
-    """Split a block's content into index files, lazily.
+def split_bundles(blocks: Iterable[bytes], episodes: Sequence[int], source: str) -> Iterator[tuple[int, bytes]]:
+    """Split a block's content into index files, lazily, each after its episode.
 
     Args:
         blocks: The content, in pieces of any size.
-        count: Number of index files that it must have.
+        episodes: Episodes whose index files it must have, in this order.
         source: Its object, for messages.
 
     Raises:
         DatasetError: It is truncated, or has another number.
     """
-    held = bytearray()
+    held, count = bytearray(), 0
     for block in blocks:
         held += block
         while len(held) >= _LENGTH.size and len(held) >= (end := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
-            count -= 1
-            yield bytes(held[_LENGTH.size : end])
+            if count < len(episodes):
+                yield episodes[count], bytes(held[_LENGTH.size : end])
+            count += 1
             del held[:end]
-    if held or count:
+    if held or count != len(episodes):
         raise DatasetError(f"{source} is damaged: it is cut off, or has another number of episodes; delete it, and resume the bake")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from synpick_warp.cloud.bundles import join_bundles, split_bundles, unpack_bundle
 from synpick_warp.cloud.delivery import send_file
-from synpick_warp.cloud.ledger import FINISHED, INDEX, Ledger
+from synpick_warp.cloud.ledger import DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import (
@@ -29,7 +29,7 @@ from synpick_warp.system.folders import make_folder
 
 
 def close_blocks(ledger: Ledger, folder: Path) -> int:
-    """Compact complete blocks: writes the batched mark of each block whose episodes all have done marks.
+    """Compact complete blocks: writes batched marks of each block whose episodes all have done marks, of those that are in none.
 
     Args:
         ledger: Ledger of the data set.
@@ -42,15 +42,16 @@ def close_blocks(ledger: Ledger, folder: Path) -> int:
         FileNotFoundError: An index file was deleted.
     """
     missing = 0
-    for block in ledger.open_blocks():
-        planned = ledger.planned(block)
-        if left := len(set(planned) - ledger.done(block)):
+    for block, unmarked in ledger.open_blocks():
+        if left := len(set(unmarked) - ledger.done(block)):
             missing += left
             continue
-        path = folder / "block"
-        with path.open("wb") as file:
-            join_bundles((ledger.store.get(f"{INDEX}/{episode:06d}.tar.gz") for episode in planned), file)
-        ledger.store.put_file(ledger.mark_key(block), path)
+        path, spans = folder / "block", merge_spans(range(episode, episode + 1) for episode in unmarked)
+        for start in range(0, len(spans), MARK_SPANS):
+            marked = spans[start : start + MARK_SPANS]
+            with path.open("wb") as file:
+                join_bundles((ledger.store.get(f"{INDEX}/{episode:06d}.tar.gz") for span in marked for episode in span), file)
+            ledger.store.put_file(f"{DONE}/{block:06d}_{spell_spans(marked)}", path)
     return missing
 
 
@@ -67,10 +68,9 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
     Raises:
         DatasetError: A batched mark is damaged.
         OutputError: The temporary folder cannot be written.
-        StoreError: An object was deleted that the indices are made of, or the store does not answer.
+        StoreError: An object was deleted that the indices are made of, another plan was finalized at once, or the store does not answer.
     """
-    planned = ledger.layout.planned
-    if ledger.finished() >= planned:
+    if ledger.finished():
         return 0
     try:
         if missing := close_blocks(ledger, folder):
@@ -86,15 +86,27 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
         raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
-    store = ledger.store
-    if ledger.finished() > planned:  # A bake of more episodes has ended meanwhile.
-        return 0
+    if not ledger.finished():  # Else another bake of these episodes, or of more, has ended meanwhile.
+        _put_indices(ledger, work)
+    return 0
+
+
+def _put_indices(ledger: Ledger, work: Path) -> None:
+    """Upload the indices. The announcement of the plan is the first write and the last read: who finds another's may have mixed with it.
+
+    Raises:
+        StoreError: Another plan was finalized at once.
+    """
+    store, plan = ledger.store, spell_spans(ledger.plan).encode()
+    store.put(FINISHING, plan)
     for name, digest in read_checksums(work, INDICES).items():
         send_file(store, work / name, name, digest)
     for suffix in (".sha256", ".json"):
         store.put(f"{INDICES}{suffix}", (work / f"{INDICES}{suffix}").read_bytes())
-    store.put(FINISHED, str(planned).encode())
-    return 0
+    store.put(FINISHED, plan)
+    if store.get(FINISHING) != plan:
+        store.delete(FINISHED)
+        raise StoreError(f"another bake finalized {store.url} for other episodes at the same time; when it has ended, run the larger again")
 
 
 def _gather(ledger: Ledger, work: Path) -> None:
@@ -115,9 +127,21 @@ def _gather(ledger: Ledger, work: Path) -> None:
 
 
 def _bundles(ledger: Ledger) -> Iterator[tuple[str, bytes]]:
-    """Yield the index files of all episodes, each after the URL of the batched mark that it is from."""
+    """Yield the index files of all planned episodes, each after the URL of the batched mark that it is from.
+
+    Raises:
+        StoreError: A planned episode is in no batched mark.
+    """
+    marks = ledger.marks()
     for block in ledger.blocks():
-        key = ledger.mark_key(block)
-        source = f"{ledger.store.url}/{key}"
-        for bundle in split_bundles(ledger.store.blocks(key), len(ledger.planned(block)), source):
-            yield source, bundle
+        wanted = set(ledger.planned(block))
+        for key, spans in marks.get(block, {}).items():
+            source, episodes = f"{ledger.store.url}/{key}", [episode for span in spans for episode in span]
+            if wanted.isdisjoint(episodes):
+                continue
+            for episode, bundle in split_bundles(ledger.store.blocks(key), episodes, source):
+                if episode in wanted:
+                    wanted.remove(episode)
+                    yield source, bundle
+        if wanted:
+            raise StoreError(f"{ledger.store.url} has no batched mark of episode {min(wanted)}; the same command resumes")

@@ -27,10 +27,37 @@ from synpick_warp.system.stores.opening import CONTROL, Probe, open_store
 
 BLOCK = 1000
 """Indices that a block, and so a batched mark, spans: as many as a page of a listing has keys."""
-DONE, INDEX, FINISHED = f"{CONTROL}/done", f"{CONTROL}/index", f"{CONTROL}/finished"
-_MARK = re.compile(rf"{re.escape(DONE)}/([0-9]{{6,9}})-([0-9]{{1,4}})")
+MARK_SPANS = 8
+"""Most ranges of episodes that a batched mark has: its name fits into the 255 characters of a file system."""
+DONE, INDEX = f"{CONTROL}/done", f"{CONTROL}/index"
+FINISHING, FINISHED = f"{CONTROL}/finishing", f"{CONTROL}/finished"
+_SPAN = "[0-9]{6,12}-[0-9]{6,12}"
+_MARK = re.compile(rf"{re.escape(DONE)}/([0-9]{{6,9}})_({_SPAN}(?:_{_SPAN})*)")
+_SPANS = re.compile(rf"{_SPAN}(?:_{_SPAN})*")
 _ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6,12}})\.json")
 _ADVICE = "resume with the same, or name another prefix with --out"
+
+
+def merge_spans(ranges: Iterable[range]) -> list[range]:
+    """Union of ranges of step 1: disjoint and ascending, none empty, none adjacent to the next."""
+    merged: list[range] = []
+    for each in sorted(filter(None, ranges), key=lambda span: span.start):
+        if merged and each.start <= merged[-1].stop:
+            merged[-1] = range(merged[-1].start, max(merged[-1].stop, each.stop))
+        else:
+            merged.append(each)
+    return merged
+
+
+def spell_spans(spans: Iterable[range]) -> str:
+    """Text of ranges of episodes by their first and last: "000000-000499_000600-000999"."""
+    return "_".join(f"{span.start:06d}-{span.stop - 1:06d}" for span in spans)
+
+
+def _parse_spans(text: str) -> list[range]:
+    """Inverse of `spell_spans`."""
+    pairs = (each.split("-") for each in text.split("_"))
+    return [range(int(first), int(last) + 1) for first, last in pairs]
 
 
 class Ledger:
@@ -104,23 +131,22 @@ class Ledger:
                     last = block
                     yield block
 
-    def open_blocks(self) -> Iterator[int]:
-        """Yield the blocks that have no batched mark of as many episodes as are planned, ascending."""
+    def open_blocks(self) -> Iterator[tuple[int, list[int]]]:
+        """Yield the blocks that have planned episodes in none of their batched marks, ascending, with these episodes, sorted."""
         marks = self.marks()
-        return (block for block in self.blocks() if marks.get(block) != len(self.planned(block)))
+        for block in self.blocks():
+            if left := sorted(set(self.planned(block)).difference(*(span for spans in marks.get(block, {}).values() for span in spans))):
+                yield block, left
 
-    def marks(self) -> Mapping[int, int]:
-        """List the batched marks: block -> most episodes of its marks. Empty ones, of an interrupted write, do not count."""
-        found: dict[int, int] = {}
+    def marks(self) -> Mapping[int, Mapping[str, list[range]]]:
+        """List the batched marks: block -> key -> ranges of episodes. Empty ones, of an interrupted write, do not count."""
+        found: dict[int, dict[str, list[range]]] = {}
         for key, size in self.store.list(DONE):
             if size and (match := _MARK.fullmatch(key)):
-                block, count = int(match[1]), int(match[2])
-                found[block] = max(count, found.get(block, 0))
+                block, spans = int(match[1]), _parse_spans(match[2])
+                if all(block * BLOCK <= span.start < span.stop <= (block + 1) * BLOCK for span in spans):
+                    found.setdefault(block, {})[key] = spans
         return found
-
-    def mark_key(self, block: int) -> str:
-        """Key of a block's batched mark, with the number of its planned episodes."""
-        return f"{DONE}/{block:06d}-{len(self.planned(block))}"
 
     def done(self, block: int) -> set[int]:
         """List the episodes of a block that have a done mark. Empty marks, of an interrupted write, do not count."""
@@ -139,9 +165,9 @@ class Ledger:
 
     def remaining(self, ranges: Sequence[range]) -> Iterator[list[int]]:
         """Yield the episodes of these ranges that have no done mark, one sorted list per block, without empty lists."""
-        for block in self.open_blocks():
-            wanted = self.planned(block, ranges)
-            if wanted and (left := sorted(set(wanted) - self.done(block))):
+        for block, unmarked in self.open_blocks():
+            wanted = set(unmarked).intersection(self.planned(block, ranges))
+            if wanted and (left := sorted(wanted - self.done(block))):
                 yield left
 
     # ---- what is written once ----
@@ -178,10 +204,16 @@ class Ledger:
         self.store.put(f"{place}.sha256", checksums)
         self.store.put(f"{place}.json", entry)
 
-    def finished(self) -> int:
-        """Number of episodes that the indices cover; 0: there are no indices."""
+    @property
+    def plan(self) -> list[range]:
+        """Union of the planned episodes."""
+        return merge_spans(self.layout.plan())
+
+    def finished(self) -> bool:
+        """Whether the indices cover all planned episodes."""
         try:
-            text = self.store.get(FINISHED)
+            text = self.store.get(FINISHED).decode(errors="replace")
         except FileNotFoundError:
-            return 0
-        return int(text) if text.isdigit() and len(text) <= 12 else 0
+            return False
+        covered = _parse_spans(text) if _SPANS.fullmatch(text) else []
+        return all(any(span.start <= each.start and each.stop <= span.stop for span in covered) for each in self.plan)

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import importlib
 import json
+import os
 import re
 import shutil
 import tempfile
@@ -190,15 +191,15 @@ def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
 
 
 class StoreCache:
-    """LRU cache of a data set's episodes in a temporary folder, which also has its records, constants and indices. Not for several threads
-    or processes."""
+    """LRU cache of a data set's episodes in a temporary folder, which also has its records, constants and indices. For one thread of the
+    process that made it, which alone deletes the folder."""
 
     def __init__(self, url: str, limit: int = CACHE_BYTES) -> None:
         """Download all but the episodes. Arguments and errors as `open_store_set`."""
-        place = tempfile.mkdtemp(prefix="synpick-read-")
-        weakref.finalize(self, shutil.rmtree, place, ignore_errors=True)
+        self.process, place = os.getpid(), tempfile.mkdtemp(prefix="synpick-read-")
+        weakref.finalize(self, _remove_own, place, self.process)
         self.folder = Path(place) / (url.rpartition("/")[2] or "set")
-        self.copier, self._limit = Copier(url, self.folder), limit  # Refuses URLs whose last part would lead elsewhere.
+        self.copier, self.limit = Copier(url, self.folder), limit  # Refuses URLs whose last part would lead elsewhere.
         self.folder.mkdir()
         self._held: OrderedDict[int, int] = OrderedDict()
         """Cached episodes with their sizes [B], least recently used first."""
@@ -228,10 +229,16 @@ class StoreCache:
         if missing is not None:
             raise DatasetError(f"{self.copier.store.url}/{missing} is missing")
         self._held[episode] = sum((self.folder / name).stat().st_size for name in names)
-        while len(self._held) > 1 and sum(self._held.values()) > self._limit:
+        while len(self._held) > 1 and sum(self._held.values()) > self.limit:
             old, _ = self._held.popitem(last=False)
             for name in (*read_checksums(self.folder, episode_entry(old)), *(f"{episode_entry(old)}{end}" for end in (".json", ".sha256"))):
                 (self.folder / name).unlink(missing_ok=True)
+
+
+def _remove_own(place: str, process: int) -> None:
+    """Delete the folder of a cache, but in a fork of its process."""
+    if os.getpid() == process:
+        shutil.rmtree(place, ignore_errors=True)
 
 
 class StoreDataSet(DataSet):
@@ -240,7 +247,20 @@ class StoreDataSet(DataSet):
 
     def __init__(self, cache: StoreCache, episodes: range | None = None) -> None:
         super().__init__(cache.folder, episodes)
-        self._cache = cache
+        self._made = cache
+
+    @property
+    def _cache(self) -> StoreCache:
+        """Cache of this process; after a fork a new one, since the other's folder, locks and connections are the parent's."""
+        if self._made.process != os.getpid():
+            url, limit, only = self._made.copier.store.url, self._made.limit, self._only
+            self.__dict__.clear()
+            StoreDataSet.__init__(self, StoreCache(url, limit), only)
+        return self._made
+
+    def __reduce__(self) -> tuple[Callable[..., DataSet], tuple[Any, ...]]:
+        """Pickle as an order to open the set again, such as for the spawned workers of a DataLoader."""
+        return open_store_set, (self._made.copier.store.url, self._made.limit, self._only)
 
     @cached_property
     def splits(self) -> dict[str, DataSet]:
@@ -267,18 +287,19 @@ class StoreDataSet(DataSet):
         return frozenset(row["episode"] for row in rows if not row["frames"])
 
 
-def open_store_set(url: str, limit: int = CACHE_BYTES) -> DataSet:
+def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = None) -> DataSet:
     """Open a data set in a store: downloads its records, constants and indices.
 
     Args:
         url: Its prefix.
         limit: Size of the cache of episodes [B]; the last one is kept whatever its size.
+        episodes: Indices of the episodes to show; None: all.
 
     Raises:
         DatasetError: The prefix has no data set.
         StoreError: The store cannot be read.
     """
-    return StoreDataSet(StoreCache(url, limit))
+    return StoreDataSet(StoreCache(url, limit), episodes)
 
 
 def list_shards(url: str) -> list[str]:

@@ -74,7 +74,7 @@ def bake_into_store(
             for episodes in _chunks(ledger, ranges):
                 if _take(summary, baking(episodes)):
                     return summary
-        elif ledger.finished() < ledger.layout.planned and _bake_claims(ledger, claims, ranges, baking, summary, progress):
+        elif not ledger.finished() and _bake_claims(ledger, claims, ranges, baking, summary, progress):
             return summary
         if not summary.total:
             progress.note("all episodes are done")
@@ -127,8 +127,7 @@ def _bake_claims(
 
 def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
     """Finalize under a lease, one worker at a time; the others wait, and take over if it dies. Returns as `finalize_store`."""
-    planned = ledger.layout.planned
-    while ledger.finished() < planned:
+    while not ledger.finished():
         claim = claims.take(f"{CLAIMS}/indices")
         if claim is not None:
             try:

@@ -183,6 +183,29 @@ def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypat
     assert stored(memory) == local
 
 
+def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local, tmp_path, monkeypatch):
+    """The smaller plan is finalized while the larger uploads its indices; whoever comes next repairs it."""
+    store, places = open_store(memory), [tmp_path / "large", tmp_path / "small"]
+    large, small = (Ledger(store, tiny(count), Probe(0.0, False)) for count in (EPISODES, 2))
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "finalize_store", lambda *_: 0)
+        run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+    real = finish.send_file
+    for each in places:
+        each.mkdir()
+
+    def send(*arguments):
+        real(*arguments)
+        monkeypatch.setattr(finish, "send_file", real)
+        finish.finalize_store(small, places[1])
+
+    monkeypatch.setattr(finish, "send_file", send)
+    with pytest.raises(StoreError, match=r"another bake finalized memory://.* for other episodes"):
+        finish.finalize_store(large, places[0])
+    run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+    assert stored(memory) == local
+
+
 def test_stores_without_conditional_writes_are_recognised(tmp_path):
     pytest.importorskip("obstore")
     said = mistake("bake", "--config", "smoke", "--out", f"file://{tmp_path}/set", "--claim", "--device", "cpu")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import pickle
 import tempfile
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import open_store
 from tests.builders import mistake, run
 from tests.cloud.conftest import files
+
+FORK = multiprocessing.get_context("fork")
 
 
 @pytest.fixture
@@ -51,6 +55,32 @@ def test_views_are_those_on_disk_and_the_cache_is_bounded(sets, place):
     with pytest.raises(KeyError):
         stored[99]
     assert synpick_warp.open(url).planned == local.planned
+
+
+def test_forked_workers_have_caches_of_their_own(picked_set, place):
+    """Over fsspec; a store of obstore says that it cannot, and is opened again by a worker that is started otherwise."""
+    opened = [reading.open_store_set(f"{scheme}://{picked_set}", limit=1) for scheme in ("local", "file")]
+    told = FORK.SimpleQueue()
+
+    def work():
+        there = opened[0][1]
+        told.put((there.row, there.folder))
+        with pytest.raises(StoreError, match="start workers by spawn or forkserver"):
+            opened[1][1]
+        told.put("told")
+        opened.clear()
+
+    before = opened[0][0]
+    worker = FORK.Process(target=work, daemon=True)
+    worker.start()
+    worker.join(30)
+    worker.kill()
+    row, folder = told.get() if worker.exitcode == 0 else (None, None)
+    assert row == opened[0][1].row
+    assert folder != before.folder
+    assert list(opened[0].folder.glob("manifest.json"))
+    assert told.get() == "told"
+    assert list(pickle.loads(pickle.dumps(opened[1]))) == list(opened[1])
 
 
 @pytest.mark.parametrize(

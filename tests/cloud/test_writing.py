@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
-from synpick_warp.configs.schema import FORMATS
+from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
@@ -60,7 +62,7 @@ def test_shares_are_joined_by_whoever_ends_last(memory, local):
 
 def test_a_set_grows(memory, local):
     bake(memory, tiny(2))
-    assert open_store(memory).get(FINISHED) == b"2"
+    assert open_store(memory).get(FINISHED) == b"000000-000001"
     assert bake(memory).total == EPISODES - 2
     assert stored(memory) == local
     bake(memory, tiny(2))  # Fewer than are there: nothing is left to do.
@@ -94,6 +96,22 @@ def test_a_worker_may_die_at_any_request(memory, local, monkeypatch, seed):
     assert stored(memory) == local
 
 
+def test_two_plans_of_as_many_episodes_are_told_apart(memory, tmp_path):
+    """Their numbers of episodes are equal, in all and by block; neither finishes the other, and marks are joined by episodes."""
+
+    def split(train: int, val: int):
+        return replace(tiny(), splits=(Split("train", train, 0), Split("val", val, 5)))
+
+    bake(memory, split(2, 1))
+    assert bake(memory, split(1, 2)).total == 1
+    assert [key for key, _ in open_store(memory).list(".store/done")] == [
+        ".store/done/000000_000000-000001_000005-000005",
+        ".store/done/000000_000006-000006",
+    ]
+    rows = stored(memory)["episodes.jsonl"].decode().splitlines()
+    assert [json.loads(row)["episode"] for row in rows] == [0, 5, 6]
+
+
 def test_blocks_are_listed_alone(memory, monkeypatch):
     """A resume holds one block, and lists the marks of open ones only."""
     store, config = open_store(memory), tiny(3_500)
@@ -101,9 +119,9 @@ def test_blocks_are_listed_alone(memory, monkeypatch):
     for episode in range(3_400):
         store.put(f"manifest/{episode:06d}.json", b"{}")
         store.put(f"manifest/{episode:06d}.sha256", b"")
-    for block in (0, 2):
-        store.put(f".store/done/{block:06d}-1000", b"index files")
-    store.put(".store/done/000001-1000", b"")  # Interrupted.
+    for spans in ("000000_000000-000599", "000000_000500-000999", "000002_002000-002999", "000001_001000-001998", "000003_003400-004000"):
+        store.put(f".store/done/{spans}", b"index files")  # The last is of another block, too.
+    store.put(".store/done/000001_001000-001999", b"")  # Interrupted.
     listed = []
     monkeypatch.setattr(Ledger, "done", lambda self, block, done=Ledger.done: listed.append(block) or done(self, block))
     assert list(ledger.remaining([range(3_500)])) == [list(range(3_400, 3_500))]

@@ -6,6 +6,7 @@ It has conditional writes: create if absent, and compare-and-swap by ETag (Googl
 from __future__ import annotations
 
 import datetime
+import functools
 import importlib
 import os
 from collections.abc import Callable, Iterator
@@ -85,6 +86,10 @@ class ObjectStore:
 
     def _try(self, request: Callable[[], _Result], what: str) -> _Result:
         """Retry a request while its errors are transient; others become StoreError, but for failed conditions and missing objects."""
+
+        if _process() != os.getpid():
+            advice = "start workers by spawn or forkserver, such as by multiprocessing_context of a DataLoader"
+            raise StoreError(f"cannot {what}: obstore has no threads in the fork of a process that used it; {advice}")
 
         def attempt() -> _Result:
             try:
@@ -191,6 +196,12 @@ class ObjectStore:
             return self._try(lambda: bytes(found.bytes()), f"read {self.url}/{key}"), _tag(found.meta)
         except FileNotFoundError:
             return None
+
+
+@functools.cache
+def _process() -> int:
+    """Process that sent the first request, which started the threads of obstore; its forks have none, and would wait forever."""
+    return os.getpid()
 
 
 def _check_credentials(url: str) -> None:
