@@ -85,7 +85,9 @@ class Ledger:
         try:
             data = self.store.get(MANIFEST_FILE)
         except FileNotFoundError:
-            first = next(self.store.list("", f"{CONTROL}/~"), None)
+            first = next(self.store.list(""), None)
+            if first is not None and first[0].startswith(f"{CONTROL}/"):
+                first = next(self.store.list("", f"{CONTROL}/~"), None)
             if first is not None:
                 raise OutputError(
                     f"{url} is not empty: it has {first[0]} and no manifest; name a new prefix, or a data set to resume"

@@ -116,6 +116,32 @@ def test_errors_of_any_library_become_store_errors(monkeypatch, error, said):
         store.put("key", b"data")
 
 
+def test_a_transient_error_that_mentions_credentials_is_repeated(memory, monkeypatch):
+    monkeypatch.setattr("synpick_warp.system.stores.base.FIRST_PAUSE", 0.0)
+    store, faults = open_store(memory), ["status code: 503: token credentials", "error sending request for url (s3/credentials/a)"]
+    real = store._obs.put
+
+    def put(*arguments, **given):
+        if faults:
+            raise store._errors.GenericError(faults.pop())
+        return real(*arguments, **given)
+
+    monkeypatch.setattr(store, "_obs", SimpleNamespace(put=put))
+    store.put("key", b"data")
+    assert faults == []
+
+
+def test_an_object_that_is_replaced_while_it_is_read_is_told(memory, monkeypatch):
+    monkeypatch.setattr(object_store, "BLOCK_BYTES", 2)
+    store = open_store(memory)
+    store.put("key", b"old!")
+    blocks = store.blocks("key")
+    assert next(blocks) == b"ol"
+    store.put("key", b"new!")
+    with pytest.raises(StoreError, match="key was replaced while it was read"):
+        next(blocks)
+
+
 def test_a_generation_is_compared_where_the_store_tells_one(memory, monkeypatch):
     """Google Cloud Storage compares it, in place of the ETag."""
     store, modes = open_store(memory), []

@@ -136,6 +136,10 @@ def test_another_set_or_other_settings_are_refused(memory):
     with pytest.raises(OutputError, match=r"not empty: it has thesis\.txt"):
         bake(memory)
     store.delete("thesis.txt")
+    store.put("-draft.txt", b"sorts before the control objects")
+    with pytest.raises(OutputError, match=r"not empty: it has -draft\.txt"):
+        bake(memory)
+    store.delete("-draft.txt")
     bake(memory)
     before = stored(memory)
     with pytest.raises(ConfigError, match=r"started with other settings: bake\.seed is 8"):
@@ -202,8 +206,9 @@ def _fail(fault: str, *methods: str):
         (_fail("", ""), "nowhere://a/b", "nowhere"),
         (_fail("", ""), "memory://a/..", "has a part . or .."),
         (_fail("", ""), "file:///proc/none", "cannot be opened"),
+        (_fail("", ""), "file:///tmp/typo-of/a-folder", "typo-of is no folder; make it"),
     ],
-    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme", "dots", "folder"],
+    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme", "dots", "folder", "parent"],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
     prepare(server, monkeypatch)

@@ -58,7 +58,9 @@ class Store(Protocol):
         ...
 
     def blocks(self, key: str) -> Iterator[bytes]:
-        """Stream an object in blocks of at most BLOCK_BYTES, one range request each; raises FileNotFoundError."""
+        """Stream an object in blocks of at most BLOCK_BYTES, one range request each; raises FileNotFoundError.
+
+        Object stores raise StoreError if the object is replaced meanwhile."""
         ...
 
     def stat(self, key: str) -> Stat | None:

@@ -46,7 +46,9 @@ _PASSING = (
     "IncompleteBody",
     "error decoding",
 )
-"""Signs of transient errors in their text, in upper or lower case."""
+"""Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
+_LASTING = ("status code: 401", "status code: 403", "status code: 404", "169.254.169.254")
+"""Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
 
 _Result = TypeVar("_Result")
 _memories: dict[str, Any] = {}
@@ -98,13 +100,13 @@ class ObjectStore:
                 raise
             except (self._errors.BaseError, OSError, NotImplementedError) as error:
                 text = str(error)
+                if any(sign.lower() in text.lower() for sign in _PASSING) and not any(sign in text for sign in _LASTING):
+                    raise TransientError(_first_line(error)) from None
                 advice = next((said for signs, said in _ADVICE if any(sign in text for sign in signs)), "")
                 if advice:
                     raise StoreError(f"cannot {what}: {advice}") from None
                 if isinstance(error, FileNotFoundError):
                     raise
-                if any(sign.lower() in text.lower() for sign in _PASSING):
-                    raise TransientError(_first_line(error)) from None
                 raise StoreError(f"cannot {what}: {_first_line(error)}") from None
 
         return persist(attempt, what)
@@ -130,14 +132,17 @@ class ObjectStore:
 
     def blocks(self, key: str) -> Iterator[bytes]:
         """See `Store`."""
-        stat = self.stat(key)
-        if stat is None:
-            raise FileNotFoundError(f"{self.url}/{key}")
-        for start in range(0, stat.size, BLOCK_BYTES):
-            end = min(start + BLOCK_BYTES, stat.size)
-            yield self._try(
-                lambda first=start, last=end: bytes(self._obs.get_range(self._store, key, start=first, end=last)), f"read {self.url}/{key}"
-            )
+        what = f"read {self.url}/{key}"
+        meta = self._try(lambda: self._obs.head(self._store, key), what)
+
+        def read(start: int) -> bytes:
+            found = self._obs.get(self._store, key, options={"range": (start, min(start + BLOCK_BYTES, meta["size"]))})
+            if found.meta["e_tag"] != meta["e_tag"]:
+                raise StoreError(f"{self.url}/{key} was replaced while it was read; read it again")
+            return bytes(found.bytes())
+
+        for start in range(0, meta["size"], BLOCK_BYTES):
+            yield self._try(lambda first=start: read(first), what)
 
     def stat(self, key: str) -> Stat | None:
         """See `Store`."""

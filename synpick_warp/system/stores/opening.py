@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import uuid
+from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.errors import StoreError
@@ -33,13 +34,16 @@ def open_store(url: str) -> Store:
     """Open the object store of a URL. Object stores are sent no request; file systems of fsspec may connect, and file:// makes its folder.
 
     Raises:
-        StoreError: A package or credentials are missing, or the URL names no bucket, has a part "." or "..", or an unknown scheme.
+        StoreError: A package or credentials are missing, or the URL names no bucket, has a part "." or "..", an unknown scheme, or with
+            file:// no folder to be in.
     """
     scheme, _, rest = url.partition("://")
     if not {".", ".."}.isdisjoint(rest.split("/")):
         raise StoreError(f"{url} has a part . or ..; name a prefix without")
     if not rest.strip("/"):
         raise StoreError(f"{url} names no bucket; name one with a prefix, such as s3://bucket/prefix")
+    if scheme == "file" and not Path(rest).parent.is_dir():
+        raise StoreError(f"{url} cannot be opened: {Path(rest).parent} is no folder; make it")
     return ObjectStore(url) if scheme in OBJECT_STORES else FileSystemStore(url)
 
 
