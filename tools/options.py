@@ -50,6 +50,21 @@ def finite_seconds(text: str) -> float:
     return seconds
 
 
+def number_in(low: float, high: float = math.inf) -> Callable[[str], float]:
+    """Argument type of an option: a finite number from low to high."""
+
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high or value == math.inf:
+            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low:g} to {high:g}")
+        return value
+
+    return parse
+
+
 def image_resolution(text: str) -> list[int | str]:
     """Argument type of an option: WIDTHxHEIGHT. Parts that are not numbers are reported by the check of `cameras.resolution`."""
     return [int(part) if part.isdecimal() else part for part in text.split("x")]

@@ -105,6 +105,7 @@ def _put_indices(ledger: Ledger, work: Path) -> None:
         store.put(f"{INDICES}{suffix}", (work / f"{INDICES}{suffix}").read_bytes())
     store.put(FINISHED, plan)
     if store.get(FINISHING) != plan:
+        store.put(FINISHING, b"")  # The other one fails too, if it has not read this object yet; else `finished` goes after its write.
         store.delete(FINISHED)
         raise StoreError(f"another bake finalized {store.url} for other episodes at the same time; when it has ended, run the larger again")
 

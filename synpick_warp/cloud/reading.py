@@ -253,9 +253,9 @@ class StoreDataSet(DataSet):
     def _cache(self) -> StoreCache:
         """Cache of this process; after a fork a new one, since the other's folder, locks and connections are the parent's."""
         if self._made.process != os.getpid():
-            url, limit, only = self._made.copier.store.url, self._made.limit, self._only
+            cache, only = StoreCache(self._made.copier.store.url, self._made.limit), self._only
             self.__dict__.clear()
-            StoreDataSet.__init__(self, StoreCache(url, limit), only)
+            StoreDataSet.__init__(self, cache, only)
         return self._made
 
     def __reduce__(self) -> tuple[Callable[..., DataSet], tuple[Any, ...]]:

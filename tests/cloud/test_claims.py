@@ -202,6 +202,7 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
     monkeypatch.setattr(finish, "send_file", send)
     with pytest.raises(StoreError, match=r"another bake finalized memory://.* for other episodes"):
         finish.finalize_store(large, places[0])
+    assert store.get(finish.FINISHING) == b""  # So the other would fail, too, if it still ran.
     run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
     assert stored(memory) == local
 

@@ -104,7 +104,7 @@ def test_a_trial_changes_what_it_names():
     assert changed(RECIPE, "base") == RECIPE
     made = changed(RECIPE, "dice=1,network=residual,width=4")
     assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
-    for text in ("dice", "dice=x", "depth=1"):
+    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "window=0", "batch=0", "network=foo", "views=3", "depth=1"):
         with pytest.raises(SynpickError):
             changed(RECIPE, text)
 

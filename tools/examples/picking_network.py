@@ -184,7 +184,7 @@ def save_picker(path: Path, network: Network, width: int, size: tuple[int, int],
 
 
 class Ensemble(torch.nn.Module):
-    """Ensemble of networks: the mean of their logits. The largest predictions, which are chosen, owe less to the errors of one."""
+    """Ensemble of networks: the mean of their logits. Picks are at the largest prediction, which is often the error of one network."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         super().__init__()

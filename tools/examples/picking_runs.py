@@ -75,7 +75,7 @@ class DenseChoice:
 
     def __call__(self, environment: PickingEnvironment, sight: Sight, barred: torch.Tensor | None) -> torch.Tensor:
         """Choose pixels (B, 2)."""
-        value = self.score(sight)
+        value = self.score(sight).double()  # float32 has too few digits beside the penalties.
         if sight.target is not None:
             value = torch.where(sight.target, value, value - MISSED)
         return choose_pixels(value if barred is None else torch.where(barred, value - BARRED, value))
@@ -109,7 +109,7 @@ class AnalyticChoice:
 
 
 def act(environment: PickingEnvironment, actions: torch.Tensor) -> Step:
-    """Carry out picks at pixels (B, 2), or grasps (B, 6); these anywhere, as episodes do, since objects may lean over the bin's rim."""
+    """Carry out picks at pixels (B, 2), or grasps (B, 6), which may lie outside of the environment's bounds, as objects may."""
     choice, bounds = environment.choice, environment.bounds
     environment.choice = replace(choice, action=PIXEL if actions.shape[1] == 2 else POINT)
     environment.bounds = np.full(3, -np.inf), np.full(3, np.inf)

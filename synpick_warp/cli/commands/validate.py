@@ -41,8 +41,9 @@ def validate(
         str | None,
         Parameter(
             name="--tolerance",
-            help="MM,PX: the data set is measured. Deviations of depth up to MM millimetres, and of outlines, boxes and counts up to PX "
-            "pixels, are no errors; their distribution is printed by rule and object. Logical rules stay strict.",
+            help="MM,PX: the data set is measured. Deviations of depth up to MM millimetres, of outlines and boxes up to PX pixels, and "
+            "surplus pixels up to PX per pixel of the outline, are no errors; their distribution is printed by rule and "
+            "object. Logical rules stay strict.",
         ),
     ] = None,
     limit: Annotated[WholeNumber, Parameter(help="Violations that are printed of each rule; 0: all. --json prints all.")] = 20,

@@ -33,7 +33,7 @@ from rich.console import Console
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run
-from tools.options import Row, configure, fail, make_parser, positive_count, print_rows, write_json
+from tools.options import Row, configure, fail, make_parser, number_in, positive_count, print_rows, write_json
 from tools.reports.real import interval
 from tools.reports.real_frames import RealFrame, read_frames
 
@@ -47,6 +47,8 @@ BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
 """Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
 BESIDE_STRIDE = 3
 """Every so many frames of such an episode one is taken."""
+RANGES = {"window": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0)}
+"""Types of options that are not any number from 0 on."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
@@ -242,7 +244,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():
-        parser.add_argument(f"--{name}", type=float, default=default, help=f"{text} (default: {default:g})")
+        parser.add_argument(f"--{name}", type=RANGES.get(name, number_in(0.0)), default=default, help=f"{text} (default: {default:g})")
     parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
     parser.add_argument("--beside", default="", metavar="PRESET", help="train on views of this preset too, half and half")

@@ -53,7 +53,7 @@ METRICS = {
 PASSES = 6.0
 """Epochs: how often each view is trained on."""
 MAIN_PASSES = 16.0
-"""Epochs of the first row, which its time limit ends before."""
+"""Epochs of the first row; its time limit ends the training earlier."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
@@ -228,7 +228,7 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
         seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
         if not seeds:
             continue
-        limit = min(seed["limit"] for seed in seeds)
+        limit = min(seed.get("limit", run.limit) for seed in seeds)
         shorter = f"shortest time limit {limit:.0f} s" if limit < run.limit - 1.0 else ""
         for metric, (label, unit, factor) in METRICS.items():
             values = [factor * seed[metric] for seed in seeds if seed.get(metric) is not None]

@@ -18,7 +18,7 @@ DEPTHS = (2, 3, 4, 3)
 class ResidualNetwork(nn.Module):
     """Residual U-Net: a stem of 1/2 of the image's size, levels of 1/2 to 1/16 with `width` to 8 x `width` channels, logits of 1/2.
 
-    A pixel of its coarsest level sees some hundred pixels of the image to each side. With as many channels it takes 0.6 times the U-Net's
+    A pixel of its coarsest level sees about 210 pixels of the image to each side. With as many channels it takes 0.6 times the U-Net's
     operations, on tensors of a quarter of the size.
     """
 

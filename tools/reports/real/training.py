@@ -1,4 +1,4 @@
-"""Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice (Milletari et al., 3DV 2016).
+"""Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
 AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
 borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may be on windows
@@ -200,7 +200,7 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     """
     pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches()
-    pool.fill(batches, pool.capacity, FILLING * recipe.seconds)
+    pool.fill(batches, min(pool.capacity, recipe.views), FILLING * recipe.seconds)
     more = pool.seen < recipe.views
     if not more:
         batches.close()

@@ -3,11 +3,12 @@
 A trial names the hyper-parameters that it changes, as `dice=1,background=0.3`; `base` changes none. Photographs are scored too, into the
 trial's JSON only: they are not printed, and nothing is chosen by them. Trials with results in --out are not repeated.
 
-    python -m tools.reports.real.tuning --real REAL --models YCB --lights HDRI --views 12000 --seconds 90 --out OUT base dice=1
+    python -m tools.reports.real.tuning --real REAL --models YCB --lights HDRI --passes 1000 --seconds 90 --out OUT base dice=1
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from dataclasses import fields, replace
@@ -15,8 +16,9 @@ from pathlib import Path
 
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
-from tools.options import fail, write_json
-from tools.reports.real.__main__ import MODELS, Outcome, make_options, measure, recipe_of, sources, torch
+from tools.options import fail, number_in, positive_count, write_json
+from tools.reports.real.__main__ import MODELS, RANGES, Outcome, make_options, measure, recipe_of, sources, torch
+from tools.reports.real.networks import NETWORKS
 from tools.reports.real.training import Recipe, train
 from tools.reports.real.views import Pool, hold_out
 from tools.reports.real_frames import read_frames
@@ -25,19 +27,27 @@ SLACK = 15.0
 """Time that a trial takes beside its training, for scores and files [s]."""
 
 
+SHARED = ("views", "capacity", "seconds")
+"""Hyper-parameters that all trials share, by the options of these names."""
+
+
 def changed(recipe: Recipe, text: str) -> Recipe:
     """Recipe with the changes that a trial names.
 
     Raises:
-        ConfigError: There is no such hyper-parameter, or its value has another type.
+        ConfigError: There is no such hyper-parameter, trials share it, or its value has another type or is out of range.
     """
-    types = {one.name: type(getattr(recipe, one.name)) for one in fields(recipe)}
+    types = {one.name: type(getattr(recipe, one.name)) for one in fields(recipe) if one.name not in SHARED}
     changes: dict[str, object] = {}
     for part in [] if text == "base" else text.split(","):
         name, _, value = part.partition("=")
         try:
             changes[name] = bool(int(value)) if types[name] is bool else types[name](value)
-        except (KeyError, ValueError):
+            if name == "network" and value not in NETWORKS:
+                raise ValueError
+            if types[name] is not str:
+                (positive_count if types[name] is int else RANGES.get(name, number_in(0.0)))(value)
+        except (KeyError, ValueError, argparse.ArgumentTypeError):
             raise ConfigError(f"a trial has {part}; allowed: NAME=VALUE of {', '.join(types)}") from None
     return replace(recipe, **changes)
 
