@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -108,29 +108,24 @@ def figures_reference() -> str:
     Raises:
         KeyError: It has a table for which there are no results.
     """
-    tables = figures_tables(read_runs())
-    return _RESULTS.sub(lambda found: f"{found[1]}{tables[found[2]]}\n{found[3]}", FIGURES.read_text(encoding="utf-8"))
+    return _with_results(FIGURES, figures_tables(read_runs()))
 
 
 def sensor_reference() -> str:
     """The README of the report on depth sensors with its tables of figures; the rest is as committed."""
     runs = newest_runs(read_runs())
-
-    def fill(found: re.Match[str]) -> str:
-        return f"{found[1]}{pivot_table(runs[f'sensor_{found[2]}.json'])}\n{found[3]}"
-
-    return _RESULTS.sub(fill, SENSOR.read_text(encoding="utf-8"))
+    return _with_results(SENSOR, {name: pivot_table(runs[f"sensor_{name}.json"]) for name in ("cross_validation", "annotation")})
 
 
 def photographs_reference() -> str:
-    """The README of the report on photographs with its table of figures, if there are results; the rest is as committed."""
-    tables = figures_tables(read_runs())
+    """The README of the report on photographs with its table of figures; the rest is as committed."""
+    table = figures_tables(read_runs())["photographs"].replace("](results/", "](../../results/")
+    return _with_results(PHOTOGRAPHS, {"photographs": table})
 
-    def fill(found: re.Match[str]) -> str:
-        table = tables.get(found[2], "").replace("](results/", "](../../results/")
-        return f"{found[1]}## Figures\n\n{table}\n{found[3]}" if table else f"{found[1]}{found[3]}"
 
-    return _RESULTS.sub(fill, PHOTOGRAPHS.read_text(encoding="utf-8"))
+def _with_results(path: Path, tables: Mapping[str, str]) -> str:
+    """A README with these tables between its marks of results, by name; the rest is as committed."""
+    return _RESULTS.sub(lambda found: f"{found[1]}{tables[found[2]]}\n{found[3]}", path.read_text(encoding="utf-8"))
 
 
 REFERENCES: dict[Path, Callable[[], str]] = {

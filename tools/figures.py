@@ -126,7 +126,7 @@ def _table(runs: Mapping[str, Run]) -> str:
 
 
 def pivot_table(run: Run) -> str:
-    """Markdown table of a run: a line for each name, a column for each part, with units; of `shown` rows alone, if there are."""
+    """Pivot table of a run in Markdown: rows are names with their units, columns are parts. If the run lists `shown` names, only these."""
     rows = [row for row in run.rows if not run.shown or row.name in run.shown]
     parts = list(dict.fromkeys(row.part for row in rows))
     values = {(row.name, row.part): f"{row.value:.2f}" for row in rows}

@@ -67,7 +67,7 @@ def test_augmentation_moves_labels_with_the_image():
 
 def test_windows_are_parts_of_the_view_at_its_scale():
     plain = dataclasses.replace(RECIPE, scale=1.0)
-    # Each pixel holds its column, so that windows show where they are and how large.
+    # Each pixel holds its column, so that crops show where they are and how large.
     columns = torch.arange(64).expand(6, 48, 64)
     images, labels = warp_views((columns[:, None] / 64.0).expand(-1, 3, -1, -1), columns, plain, 0.5)
     assert images.shape == (6, 3, 24, 32)
@@ -104,7 +104,7 @@ def test_a_trial_changes_what_it_names():
     assert changed(RECIPE, "base") == RECIPE
     made = changed(RECIPE, "dice=1,network=residual,width=4")
     assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
-    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "window=0", "batch=0", "network=foo", "views=3", "depth=1"):
+    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "crop=0", "batch=0", "network=foo", "views=3", "depth=1"):
         with pytest.raises(SynpickError):
             changed(RECIPE, text)
 
@@ -128,7 +128,7 @@ class Closable(list):
 
 
 class Drawn:
-    """Source of squares, each batch after a pause."""
+    """Synthetic data source: batches of images of a bright square, each after a delay of `pause` seconds."""
 
     def __init__(self, pause: float = 0.0, most: int | None = None):
         self.pause, self.most = pause, most
@@ -151,10 +151,10 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", window=0.5, dice=1.0)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", crop=0.5, dice=1.0)
     trained, _ = train(Drawn(most=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
-    # Ten steps of four, of which eight are of a quarter of the pixels: 16 views' worth.
+    # Ten steps with batches of 4: eight steps train on crops of a quarter of the area, two on whole views: 8 * 4 / 4 + 2 * 4 = 16 views.
     assert trained.samples == 40
 
 

@@ -7,13 +7,16 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.validation.deviations import distributions
+from synpick_warp.apps.validation.diagnosis import DiagnosedView
 from synpick_warp.apps.validation.pictures import crop_mask
 from synpick_warp.apps.validation.registry import Tolerance, load_rules
 from synpick_warp.apps.validation.rules.masks import _farthest
 from synpick_warp.apps.validation.run import Options, Summary, validate
+from tests.validation.faults import masks_swapped
 from tests.validation.planting import SCENE, edit_entry
 
 TOLERANCE = Tolerance(15.0, 3.0)
+RENDERED = {item.name for item in load_rules().values() if item.subject is DiagnosedView}
 VISIBLE = f"{SCENE}/mask_visib/000001_000001.png"
 
 
@@ -68,6 +71,11 @@ GROSS = {
 def test_a_gross_fault_is_still_found(copy, rule):
     GROSS[rule](copy)
     assert rule in measure(copy)[0]
+
+
+def test_a_swap_is_reported_once(copy):
+    masks_swapped(copy)
+    assert measure(copy)[0] & RENDERED == {"instances-swapped"}
 
 
 def test_the_farthest_pixel_is_measured():

@@ -184,14 +184,15 @@ def save_picker(path: Path, network: Network, width: int, size: tuple[int, int],
 
 
 class Ensemble(torch.nn.Module):
-    """Ensemble of networks: the mean of their logits. Picks are at the largest prediction, which is often the error of one network."""
+    """Deep ensemble (Lakshminarayanan et al., NeurIPS 2017): mean logits of several networks. A picker takes the maximum of a score map,
+    which is often an overestimate of a single network."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         super().__init__()
         self.networks = torch.nn.ModuleList(networks)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Mean logits (B, channel, H, W) of inputs (B, 5, H, W)."""
+        """Compute the mean logits (B, channel, H, W) for inputs (B, 5, H, W), see `make_inputs`."""
         return torch.stack([network(inputs) for network in self.networks]).mean(dim=0)
 
 

@@ -109,7 +109,7 @@ class AnalyticChoice:
 
 
 def act(environment: PickingEnvironment, actions: torch.Tensor) -> Step:
-    """Carry out picks at pixels (B, 2), or grasps (B, 6), which may lie outside of the environment's bounds, as objects may."""
+    """Carry out picks at pixels (B, 2), or grasps (B, 6). Bounds of actions do not apply: plans may be beyond the rim."""
     choice, bounds = environment.choice, environment.bounds
     environment.choice = replace(choice, action=PIXEL if actions.shape[1] == 2 else POINT)
     environment.bounds = np.full(3, -np.inf), np.full(3, np.inf)

@@ -51,17 +51,24 @@ class Kind(StrEnum):
 
 
 MEASURED = (Kind.SHIFT, Kind.POSE, Kind.MASK, Kind.VISIBLE, Kind.DEPTH)
-"""Kinds that have a size for each instance."""
+"""Kinds for which a deviation is measured, of each instance."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Contradiction between a rendered view and its files: kind, instance (None: the whole image), and text."""
+    """Contradiction between a rendered view and its files."""
 
     kind: Kind
     index: int | None
     """Ground-truth index; None: the whole image."""
     text: str
+    """What is wrong."""
+    other: int | None = None
+    """Ground-truth index of the second instance of a swap."""
+
+    def explains(self, index: int, unit: str) -> bool:
+        """Whether it explains the deviation of an instance: it concerns the instance, or the depth of the whole image (unit mm)."""
+        return index in (self.index, self.other) or (self.index is None and unit == "mm")
 
 
 class DiagnosedView(RenderedView):
@@ -74,7 +81,7 @@ class DiagnosedView(RenderedView):
 
     @cached_property
     def deviations(self) -> dict[Kind, list[tuple[int, float]]]:
-        """(ground-truth index, deviation) of each compared instance by kind: visible masks [px], masks [px], depth [mm], pose [mm]."""
+        """Deviations by kind: (ground-truth index, deviation) of each compared instance; poses and depth in mm, masks and shifts in px."""
         found: dict[Kind, list[tuple[int, float]]] = {kind: [] for kind in MEASURED}
         for item in self.instances:
             for kind, value in _measure(item, self.tolerance):
@@ -101,9 +108,8 @@ def diagnose(rendered: RenderedView) -> list[Finding]:
             other = _find_swapped(item, [other for other in bad if other.index not in done and other is not item])
             if other is not None:
                 done |= {item.index, other.index}
-                findings.append(
-                    Finding(Kind.SWAP, item.index, f"image {rendered.view.image}: instances {item.index} and {other.index} look swapped")
-                )
+                text = f"image {rendered.view.image}: instances {item.index} and {other.index} look swapped"
+                findings.append(Finding(Kind.SWAP, item.index, text, other.index))
     findings += [_explain(item, rendered) for item in bad if item.index not in done]
     for item in instances:
         if fits[item.index]:
@@ -300,9 +306,8 @@ def _check_instance(item: Instance, rendered: RenderedView) -> list[Finding]:
 
 
 def _measure(item: Instance, tolerance: float) -> Iterator[tuple[Kind, float]]:
-    """Deviations of an instance: how far its mask is shifted, and outlines are apart on average [px]; of depth inside the visible mask from
-    the model the median [mm], along the optical axis, and what a fraction BEYOND of its pixels exceeds [mm].
-    """
+    """Measure the deviations of an instance: mean distance between the outlines of each mask and its rendering [px]; shift of the visible
+    mask [px]; of the depth error inside the visible mask the median and the quantile 1 - BEYOND, both without sign [mm]."""
     if item.mask is not None:
         yield Kind.MASK, fit_masks(item.mask, item.silhouette).distance
     if item.visible is not None:

@@ -25,12 +25,12 @@ class Level(enum.StrEnum):
 
 
 class Tolerance(NamedTuple):
-    """Annotation tolerance of a measured data set: largest deviations that are no errors."""
+    """Annotation tolerance of a measured data set: the largest deviations that are accepted."""
 
     mm: float
-    """Of depth from the model at its pose."""
+    """Largest distance between depth and the model at its pose [mm]."""
     px: float
-    """Of outlines, boxes and pixel counts; counts are divided by the length of the outline."""
+    """Largest distance of outlines and of the sides of boxes [px], and largest surplus of visible pixels per pixel of the outline."""
 
 
 class Deviation(NamedTuple):
@@ -38,18 +38,18 @@ class Deviation(NamedTuple):
 
     file: str
     text: str
-    """What is wrong, if it is."""
+    """Description, for the case that it is a violation."""
     obj_id: int
     value: float
-    """In the unit of the rule; 0: none."""
+    """Deviation in the unit of the rule; 0: the annotation agrees."""
     wrong: bool = False
-    """Whether it is a violation where no tolerance is given."""
-    named: bool = False
-    """Whether another finding of the rule is about the same instance, so that this one is counted, but no violation."""
+    """Whether validation without a tolerance reports it as a violation."""
+    explained: bool = False
+    """Whether a finding explains it. It is then part of the distribution, but not reported as a violation."""
 
 
 Findings = Iterator[tuple[str, str] | Deviation]
-"""What a check yields: (file, what is wrong) for each violation; the deviation of each instance, also of right ones."""
+"""Results of a check: (file, description) of each violation, and the deviation of each instance that was compared, also if it is right."""
 _Check = TypeVar("_Check", bound=Callable[[Any], Findings])
 
 
@@ -80,7 +80,7 @@ class Rule:
     """How to mend a violation."""
     check: Callable[[Any], Findings]
     unit: str = ""
-    """Unit of the deviations, mm or px; empty: the rule is logical, and no tolerance applies."""
+    """Unit of the deviations, mm or px; empty: the rule is logical and has no tolerance."""
 
 
 RULES: dict[str, Rule] = {}
@@ -122,8 +122,8 @@ def apply_rules(
 
     Args:
         subject: What is checked.
-        tolerance: Deviations up to it are no violations; None: each rule has its own bound.
-        deviations: With a tolerance, (rule, obj_id, value) of each deviation is appended.
+        tolerance: Deviations up to it are accepted; None: each rule has its own bound.
+        deviations: If there is a tolerance, (rule, obj_id, value) of each deviation is appended to this list.
     """
     for item in load_rules().values():
         if item.subject is not type(subject):
@@ -133,7 +133,7 @@ def apply_rules(
                 if isinstance(found, Deviation):
                     if tolerance is not None and deviations is not None:
                         deviations.append((item.name, found.obj_id, found.value))
-                    exceeds = found.wrong if tolerance is None else not found.named and found.value > getattr(tolerance, item.unit)
+                    exceeds = found.wrong if tolerance is None else not found.explained and found.value > getattr(tolerance, item.unit)
                     if not exceeds:
                         continue
                 yield Violation(item.level, found[0], item.name, found[1])

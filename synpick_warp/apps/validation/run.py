@@ -48,7 +48,7 @@ class Options:
 
 @dataclass
 class Summary:
-    """Totals of a validation: scenes, views checked, views rendered again, models, errors, warnings, deviations."""
+    """Totals of a validation: numbers of what was checked and of violations, and the measured deviations."""
 
     scenes: int = 0
     views: int = 0

@@ -18,7 +18,7 @@ from synpick_warp.dataset.bop.layout import Layout, SceneRef
 
 
 class Checked(NamedTuple):
-    """Result of a task: violations, views whose images were checked, views that were rendered again, deviations."""
+    """Result of a validation task, which checks a scene or a part of its views."""
 
     violations: list[Violation]
     views: int = 0
@@ -26,7 +26,7 @@ class Checked(NamedTuple):
     rendered: int = 0
     """Views that were rendered again."""
     deviations: Sequence[tuple[str, int, float]] = ()
-    """(rule, obj_id, value) of each, with a tolerance."""
+    """(rule, obj_id, value) of each deviation; empty without a tolerance."""
 
 
 class State:

@@ -1,7 +1,7 @@
-"""Sim-to-real semantic segmentation: train on a stream alone, score on annotated photographs (mIoU, instances found, background).
+"""Sim-to-real semantic segmentation: trains on synthetic views only, evaluates on annotated photographs (mIoU, recall, background).
 
-Each seed has piles, pictures and a network of its own; values are means over seeds with 95 % intervals. Held-out synthetic views are scored
-beside them, which shows the domain gap. Needs PyTorch; the defaults are for a GPU.
+Each seed has its own piles, pictures and network; values are means over seeds with 95 % intervals. Held-out synthetic views are evaluated
+too, for comparison. Needs PyTorch; the defaults are for a GPU.
 
     python -m tools.reports.real --real REAL --models YCB --lights HDRI --views 24000 --seeds 3 --json real.json --pictures OUT
 """
@@ -46,16 +46,16 @@ PRESET = "tabletop-train"
 BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
 """Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
 BESIDE_STRIDE = 3
-"""Every so many frames of such an episode one is taken."""
-RANGES = {"window": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0)}
-"""Types of options that are not any number from 0 on."""
+"""Every n-th frame of these episodes is taken."""
+RANGES = {"crop": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0)}
+"""Argument types of the options that are not just non-negative numbers."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Trained network of one seed with its scores."""
+    """Result of one seed: trained network, scores on photographs and on held-out synthetic views."""
 
     trained: Trained
     real: Scores
@@ -232,7 +232,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
-        "passes": (4.0, "how often a view is trained on; windows count by their area"),
+        "passes": (4.0, "number of epochs; a crop counts as the fraction of the view that it covers"),
         "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
@@ -240,7 +240,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "background": (1.0, "weight of the background in the cross entropy"),
         "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
         "rate": (2e-3, "largest learning rate"),
-        "window": (1.0, "side of the windows of views that most of the training is on, as a fraction of the view's"),
+        "crop": (1.0, "side of random crops, as a fraction of the view's; the last fifth of the training is on whole views"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():

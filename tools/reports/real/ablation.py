@@ -1,10 +1,11 @@
 """Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
-Each run is a process of `tools.reports.real` with one seed. Runs start by priority on the next free GPU, those of a first seed before those
-of a second. A run that would not end by the deadline is left out, which is printed; but rows with most views train for less time, down to a
-minimum, which the results say. What runs take beside their training is measured on those that ended. Runs with results in --out are not
-repeated. Results are collected after each run. Without --out, the plan is printed: runs, expected seconds, and when they would end.
-Synthetic scores are on held-out views of each row's own settings, so that rows compare by their scores on photographs alone.
+Each run is a process of `tools.reports.real` with one seed. Runs start in order of priority on the next free GPU, the first seed of all
+rows before the second. A run that cannot end by the deadline is skipped and printed as "left out". The rows with the most views are
+shortened instead, down to a minimum time; the results then name the time. The start-up time of runs is estimated from those that have
+ended. Runs with results in --out are not repeated, and the summary is written after each run. Without --out, only the schedule is
+printed. Synthetic scores are measured on held-out views of each row's own settings, so rows are comparable by their scores on photographs
+only.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from tools.figures import describe_run
-from tools.options import Row, make_parser, positive_count, write_json
+from tools.options import Row, finite_seconds, make_parser, positive_count, write_json
 from tools.reports.real import interval
 
 START = 60.0
@@ -51,13 +52,13 @@ METRICS = {
 }
 """Scores that are collected, by key of a seed's results: label, unit and factor."""
 PASSES = 6.0
-"""Epochs: how often each view is trained on."""
+"""Number of epochs."""
 MAIN_PASSES = 16.0
-"""Epochs of the first row; its time limit ends the training earlier."""
+"""Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
-"""Samples that runs with few views train on: as many as the others."""
+"""Number of training samples of runs with few views, equal to that of the others."""
 
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
@@ -85,19 +86,27 @@ class Run:
     passes: float = PASSES
     rate: float = STREAM_RATE
     limit: float = 280.0
-    """Time limit of a training with its stream [s]."""
+    """Time limit of rendering and training together [s]."""
     least: float = math.inf
-    """Limit down to which it may be shortened where less time is left [s]; infinite: it may not."""
+    """Shortest time limit, used if less time is left [s]; infinite: the limit is fixed."""
     detector: float = 0.0
-    """Time to train a detector, where it is left [s]."""
+    """Training time of the detector, if there is enough time left [s]; 0: no detector."""
 
     @property
     def training(self) -> float:
-        """Expected time of a training with its stream [s]."""
+        """Expected time of rendering and training together [s]."""
         return min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
     def fit(self, left: float, start: float) -> Run | None:
-        """This run with the limit and detector that the time `left` [s] allows, `start` of it beside training; None: too little."""
+        """Fit the run into the remaining time: shortened limit, and detector only if there is time for it.
+
+        Args:
+            left: Time until the deadline [s].
+            start: Start-up and scoring time of a run [s].
+
+        Returns:
+            The run; None if the time is too short.
+        """
         room = left - SLACK * start
         if room < min(self.limit, SLACK * self.training, self.least):
             return None
@@ -228,8 +237,8 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
         seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
         if not seeds:
             continue
-        limit = min(seed.get("limit", run.limit) for seed in seeds)
-        shorter = f"shortest time limit {limit:.0f} s" if limit < run.limit - 1.0 else ""
+        limit = min(seed["limit"] for seed in seeds)
+        shorter = f"shortest time limit {limit:.0f} s" if limit < min(run.limit - 1.0, SLACK * run.training) else ""
         for metric, (label, unit, factor) in METRICS.items():
             values = [factor * seed[metric] for seed in seeds if seed.get(metric) is not None]
             if values:
@@ -246,7 +255,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = make_parser(__doc__, "models", "lights")
     parser.add_argument("--real", required=True, help="folder of annotated frames")
     parser.add_argument("--gpus", type=positive_count, default=4, help="GPUs of the host (default: 4)")
-    parser.add_argument("--deadline", type=float, default=1400.0, help="seconds after which nothing runs (default: 1400)")
+    parser.add_argument("--deadline", type=finite_seconds, default=1400.0, help="seconds after which nothing runs (default: 1400)")
     parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
     parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
     parser.add_argument("--first", default="", metavar="NAME", help="rows whose name begins so start before all others")

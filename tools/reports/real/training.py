@@ -1,8 +1,8 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
 AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
-borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may be on windows
-of the views, random crops at full scale, of which a GPU takes more in the same time.
+borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may use
+random crops at full scale, of which a GPU processes more in the same time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_NORM = 5.0
 FILLING = 0.5
 """Largest fraction of the time limit that passes before the first step, while the stream fills the pool."""
 WHOLE = 0.2
-"""Last fraction of the schedule, which is on whole views also where the rest is on windows: batch statistics become those of views."""
+"""Last fraction of the schedule. It trains on whole views even if the rest trains on crops, so that batch normalization adapts to them."""
 
 
 @dataclass(frozen=True)
@@ -38,32 +38,32 @@ class Recipe:
     views: int
     """Views of the stream."""
     passes: float
-    """How often a view is trained on, on average; windows count by their area."""
+    """Number of epochs; a crop counts as the fraction of the view that it covers."""
     batch: int
     width: int
     """Channels of the network's first level."""
     seconds: float
-    """Time limit of a training with its stream [s]: the schedule ends by then."""
+    """Time limit of rendering and training together [s], by which the schedule ends."""
     capacity: int
     """Views in the pool, at most."""
     scale: float = 1.5
-    """Largest factor of the size, and 1 / it the smallest."""
+    """Largest scale factor; the smallest is its reciprocal."""
     rotation: float = 15.0
-    """Half width of the angle [°]."""
+    """Largest rotation in each direction [°]."""
     jitter: float = 0.3
-    """Strength of photometric changes; 0: none."""
+    """Strength of the photometric augmentation; 0: none."""
     background: float = 1.0
     """Class weight of the background in the cross entropy."""
     dice: float = 0.0
-    """Weight of the Dice loss beside the cross entropy."""
+    """Weight of the Dice loss, which is added to the cross entropy."""
     rate: float = LEARNING_RATE
-    """Largest learning rate."""
-    window: float = 1.0
-    """Side of the windows that are trained on, as a fraction of the view's."""
+    """Peak learning rate of the schedule."""
+    crop: float = 1.0
+    """Side of random crops, as a fraction of the view's; 1: no crops."""
     network: str = "unet"
-    """Key of NETWORKS."""
+    """Architecture: a key of NETWORKS."""
     compiled: bool = False
-    """Whether PyTorch compiles network and loss (some 30 s, cached on disk)."""
+    """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,22 +72,22 @@ class Trained:
 
     network: nn.Module
     losses: list[float]
-    """Of ten parts of the training."""
+    """Mean loss of each tenth of the training."""
     stream_seconds: float
     seconds: float
-    """In all."""
+    """Total time [s]."""
     views: int
     samples: int
-    """Views or windows trained on, repeats counted."""
+    """Views or crops trained on, repeats counted."""
 
 
-def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, window: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
+def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders.
 
-    With a `window` below 1, windows of so many times the view's sides are cut at random places; sides are multiples of MIN_SIDE [px].
+    With `crop` below 1, random crops with that fraction of the view's sides are returned; sides are multiples of MIN_SIDE [px].
     """
     count, *sides = classes.shape
-    height, width = (side if window == 1 else max(MIN_SIDE, round(side * window / MIN_SIDE) * MIN_SIDE) for side in sides)
+    height, width = (side if crop == 1 else max(MIN_SIDE, round(side * crop / MIN_SIDE) * MIN_SIDE) for side in sides)
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation if recipe.scale > 1 else 0.0)
     aspect = sides[0] / sides[1]
@@ -121,11 +121,11 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     return (images + level * torch.randn_like(images)).clamp(0, 1)
 
 
-def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, window: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Augmented views, or windows of them, as the network takes them: float32 in -0.5..0.5."""
+def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Network input (B, 3, H, W) float32 in -0.5..0.5 and classes, after augmentation and random cropping."""
     values = images.float() / 255
-    if recipe.scale > 1 or window < 1:
-        values, classes = warp_views(values, classes, recipe, window)
+    if recipe.scale > 1 or crop < 1:
+        values, classes = warp_views(values, classes, recipe, crop)
     if recipe.jitter:
         values = jitter_views(values, recipe.jitter)
     return values - 0.5, classes
@@ -160,7 +160,7 @@ class _Trainer:
         self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
         self.weights = torch.ones(classes, device=device)
         self.weights[0] = recipe.background
-        area = (1 - WHOLE) * recipe.window**2 + WHOLE
+        area = (1 - WHOLE) * recipe.crop**2 + WHOLE
         self.total = max(1, round(recipe.views * recipe.passes / (recipe.batch * area)))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
@@ -177,8 +177,8 @@ class _Trainer:
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        window = self.recipe.window if done < 1 - WHOLE else 1.0
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, window)
+        crop = self.recipe.crop if done < 1 - WHOLE else 1.0
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, crop)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.logits(images)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
-from tools.options import fail, number_in, positive_count, write_json
+from tools.options import fail, finite_seconds, number_in, positive_count, write_json
 from tools.reports.real.__main__ import MODELS, RANGES, Outcome, make_options, measure, recipe_of, sources, torch
 from tools.reports.real.networks import NETWORKS
 from tools.reports.real.training import Recipe, train
@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = make_options(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="existing folder to write to")
-    parser.add_argument("--deadline", type=float, default=500.0, help="seconds after which no trial ends (default: 500)")
+    parser.add_argument("--deadline", type=finite_seconds, default=500.0, help="seconds after which no trial ends (default: 500)")
     parser.add_argument("--prefix", default="", help="first part of the names of files, of what all trials share")
     parser.add_argument("trials", nargs="+", metavar="TRIAL", help="base, or NAME=VALUE joined by commas")
     options, started = parser.parse_args(arguments), time.perf_counter()

@@ -7,10 +7,18 @@ from synpick_warp.apps.validation.registry import Deviation, Findings, rule
 
 _UNITS = {kind: "mm" if kind in (Kind.POSE, Kind.DEPTH) else "px" for kind in MEASURED}
 """Unit of the deviations of each kind that has them."""
+_DEVIATIONS = {
+    Kind.SHIFT: "the visible mask is shifted by",
+    Kind.POSE: "the median of depth is off the model by",
+    Kind.MASK: "the outline of the mask is off the silhouette by",
+    Kind.VISIBLE: "the outline of the visible mask is off its rendering by",
+    Kind.DEPTH: "a fifth of the depth pixels are off the model by more than",
+}
+"""Sentence about the deviation of each kind, before its value."""
 
 
 def _declare(name: str, sentence: str, cure: str, *kinds: Kind) -> None:
-    """Declare a rule that yields the findings of some kinds, and with a tolerance the deviations of the first."""
+    """Declare a rule that yields the findings of some kinds, and with a tolerance the deviations of the first kind."""
     unit = _UNITS.get(kinds[0], "")
 
     def check(rendered: DiagnosedView) -> Findings:
@@ -18,10 +26,10 @@ def _declare(name: str, sentence: str, cure: str, *kinds: Kind) -> None:
         for finding in findings:
             yield _file(rendered, finding.kind, finding.index), finding.text
         for index, value in rendered.deviations[kinds[0]] if unit and rendered.given is not None else ():
-            text = f"image {rendered.view.image}, instance {index}: {kinds[0]} deviates by {value:.3g} {unit}"
-            named = any(finding.index in (None, index) for finding in findings)
-            obj_id = rendered.view.truths[index].obj_id
-            yield Deviation(_file(rendered, kinds[0], index), text, obj_id, value, named=named)
+            text = f"image {rendered.view.image}, instance {index}: {_DEVIATIONS[kinds[0]]} {value:.3g} {unit}"
+            explained = any(finding.explains(index, unit) for finding in rendered.findings)
+            file = _file(rendered, Kind.SHIFT_VISIBLE if kinds[0] is Kind.SHIFT else kinds[0], index)
+            yield Deviation(file, text, rendered.view.truths[index].obj_id, value, explained=explained)
 
     check.__doc__ = sentence
     rule(DiagnosedView, name, cure, unit=unit)(check)
