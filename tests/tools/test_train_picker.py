@@ -60,12 +60,22 @@ def test_a_network_learns_where_picks_succeed():
     assert np.mean(losses[-10:]) < 0.7 * losses[0]
     rows = train_picker.evaluate(samples, np.arange(12, 16), np.array([2]), train_picker.dense_scores(trained, CPU), CPU)
     found = {(row["picker"], row["objects"]): row for row in rows}
-    assert {group for _, group in found} == {"all", "seen", "unseen"}
+    assert {group for _, group in found} == {"all", "hidden", "seen", "unseen"}
     assert found["learned", "all"]["auc"].value > 0.8
     assert found["learned", "all"]["first"].value == 1.0
     assert abs(found["analytic", "all"]["auc"].value - 0.5) < 0.15
     assert found["oracle", "all"]["regret"] == ranking.Interval(0.0, 0.0, 0.0)
     assert found["contour", "all"]["auc"].value == pytest.approx(1.0, abs=1e-6)
+
+
+def test_the_hidden_object_is_the_least_visible_of_those_tried():
+    samples = draw_samples(4)
+    hidden = train_picker._least_visible(samples)
+    for state in range(4):
+        mine = samples.trials["state"] == state
+        areas = {obj_id: int((samples.sight.instance[state] == obj_id).sum()) for obj_id in samples.trials["obj_id"][mine]}
+        smallest = min(areas.values())
+        assert (hidden[mine] == [areas[obj_id] == smallest for obj_id in samples.trials["obj_id"][mine]]).all()
 
 
 def test_an_ensemble_is_the_mean_of_its_networks(tmp_path):

@@ -73,7 +73,8 @@ def dense_scores(network: torch.nn.Module | None, device: torch.device) -> dict[
 def evaluate(
     samples: Samples, states: np.ndarray, unseen: np.ndarray, scores: dict[str, Score], device: torch.device
 ) -> list[dict[str, Any]]:
-    """Evaluate pickers at tried pixels of states: a row for each picker and group of objects (all, seen, unseen).
+    """Evaluate pickers at tried pixels of states: a row for each picker and group of objects: all, the least visible one
+    that was tried (hidden), seen, unseen.
 
     ROC AUC and average precision (AP) are over trials, with inverse probability weights. First choice: success rate of the candidate with
     the largest score; regret: that of the state's best candidate minus it. Figures are `Interval`s by cluster bootstrap over states.
@@ -84,6 +85,7 @@ def evaluate(
     values = {name: torch.cat([score(chunk).cpu() for chunk in chunks]).numpy()[at] for name, score in scores.items()}
     values |= {ANALYTIC: trials["seal"] * trials["wrench"], OWN: (trials["share"] == Share.OWN).astype(float), ORACLE: None}
     is_unseen, groups = np.isin(trials["obj_id"], unseen), {"all": np.ones(len(at[0]), bool)}
+    groups["hidden"] = _least_visible(samples.part(states))
     if len(unseen):
         groups |= {"seen": ~is_unseen, "unseen": is_unseen}
     rows = []
@@ -94,6 +96,17 @@ def evaluate(
             figures = _measure({key: column[kept] for key, column in trials.items()}, value if value is None else value[kept])
             rows.append({"picker": name, "objects": group} | figures)
     return rows
+
+
+def _least_visible(samples: Samples) -> np.ndarray:
+    """Mask of the trials (trial) bool whose object has the smallest visible area of those tried in its state."""
+    instance, state = samples.sight.instance.numpy(), samples.trials["state"]
+    owner = instance[state, samples.trials["y"], samples.trials["x"]]
+    area = np.stack([np.bincount(image.ravel(), minlength=256) for image in instance])[state, owner].astype(float)
+    area[owner == 0] = np.inf
+    least = np.full(len(instance), np.inf)
+    np.minimum.at(least, state, area)
+    return np.isfinite(area) & (area == least[state])
 
 
 def _measure(trials: dict[str, np.ndarray], score: np.ndarray | None) -> dict[str, Any]:
