@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.statistics import ranking
+from synpick_warp.codes import Outcome
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.environment.make import make_picking
 from tests.builders import PICKING, boxes
@@ -171,8 +172,23 @@ def test_pickers_are_run_from_the_same_piles(device, task):
     assert {name: picked for name, (picked, _) in found.items()} == dict.fromkeys(pickers, piles)
     assert all(int(outcomes.sum()) == piles for _, outcomes in found.values())
     total = runs.run_until_empty(environment, contour)
-    assert total.empty == total.bins == environment.count
-    assert total.picked + int(total.outcomes[runs.Outcome.OTHER_PICKED]) * (task == "target") == 2 * total.bins <= total.attempts
+    assert total.empty == environment.count
+    assert int(total.attempts.sum()) == int(total.outcomes.sum())
+    others = int(total.outcomes[runs.Outcome.OTHER_PICKED]) * (task == "target")
+    assert int(total.picked.sum()) + others == 2 * environment.count <= int(total.attempts.sum())
+
+
+def test_attempts_of_a_bin_do_not_count_as_independent():
+    import torch
+
+    tries, outcomes = torch.full((20,), 10), torch.zeros(len(Outcome), dtype=torch.int64)
+    outcomes[0] = 200
+    for picked, wider in ((torch.tensor([10, 0] * 10), True), (torch.full((20,), 5), False)):
+        found = train_picker._show_rate({"picker": "any"}, picked, outcomes, tries)
+        low, high = scores.wilson(100, 200)
+        assert (found["low"] < low - 0.1) == (found["high"] > high + 0.1) == wider
+        assert found["picked"] == sum(found["bin_picked"]) == 100
+        assert found["attempts"] == sum(found["bin_attempts"])
 
 
 def test_a_pixel_is_picked_as_its_label_was(device):

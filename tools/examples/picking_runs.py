@@ -32,17 +32,12 @@ Choose = Callable[[PickingEnvironment, Sight, torch.Tensor | None], torch.Tensor
 
 @dataclass
 class Emptied:
-    """Counts of a bin emptying run: attempts by `Outcome`, successes, bins, emptied bins, and picks of each bin."""
+    """Counts of a bin emptying run: attempts and successes of each bin (bin) int64, emptied bins, and attempts by `Outcome`."""
 
-    outcomes: torch.Tensor = field(default_factory=lambda: torch.zeros(len(Outcome), dtype=torch.int64))
-    picked: int = 0
-    bins: int = 0
+    attempts: torch.Tensor
+    picked: torch.Tensor
     empty: int = 0
-
-    @property
-    def attempts(self) -> int:
-        """Number of attempts."""
-        return int(self.outcomes.sum())
+    outcomes: torch.Tensor = field(default_factory=lambda: torch.zeros(len(Outcome), dtype=torch.int64))
 
 
 def choose_environment(task: str, worlds: int, resolution: tuple[int, int], seed: int, max_steps: int | None = None) -> Choice:
@@ -151,7 +146,8 @@ def run_until_empty(environment: PickingEnvironment, choose: Choose, failures: i
     As in the paper, an episode also ends after `failures` attempts that catch nothing; with a target they are counted anew after a catch.
     """
     sight = observe(environment, environment.reset()[0])
-    result, failed = Emptied(bins=environment.count), torch.zeros(environment.count, dtype=torch.int64, device=sight.depth.device)
+    failed = torch.zeros(environment.count, dtype=torch.int64, device=sight.depth.device)
+    result = Emptied(failed.clone(), failed.clone())
     barred = torch.zeros_like(sight.depth, dtype=torch.bool)
     over, forgives = failed > 0, environment.choice.task == TARGET and Target().forgive
     while not bool(over.all()):
@@ -159,7 +155,8 @@ def run_until_empty(environment: PickingEnvironment, choose: Choose, failures: i
         step = act(environment, actions)
         caught = (step.info["outcome"] == Outcome.TARGET_PICKED) | (step.info["outcome"] == Outcome.OTHER_PICKED)
         result.outcomes += _count(step, ~over)
-        result.picked += int(((step.reward > 0) & ~over).sum())
+        result.attempts += ~over
+        result.picked += (step.reward > 0) & ~over
         result.empty += int((step.terminated & ~over).sum())
         barred[caught] = False
         failed = torch.where(caught, failed * (not forgives), failed + 1)

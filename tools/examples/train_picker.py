@@ -212,28 +212,37 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     results, started = [], time.perf_counter()
     for found, piles in runs.run_first_choices(environment, chosen, options.attempts):
         print(f"first choice, task {options.task}, {piles} piles of {options.objects} objects, in {time.perf_counter() - started:.0f} s")
-        results = [_show_rate({"picker": name, "run": "first choice"}, count, outcomes) for name, (count, outcomes) in found.items()]
+        results = [
+            _show_rate({"picker": name, "run": "first choice"}, torch.tensor(count), outcomes) for name, (count, outcomes) in found.items()
+        ]
         write_json(options.json, facts | {"rows": results})
     for name in chosen if options.until_empty else ():
         started = time.perf_counter()
         total = runs.run_until_empty(environment, chosen[name])
-        print(f"until empty: {total.empty} of {total.bins} bins emptied in {time.perf_counter() - started:.0f} s")
-        emptied = {"picker": name, "run": "until empty", "bins": total.bins, "emptied": total.empty}
-        results.append(_show_rate(emptied, total.picked, total.outcomes))
+        print(f"until empty: {total.empty} of {environment.count} bins emptied in {time.perf_counter() - started:.0f} s")
+        emptied = {"picker": name, "run": "until empty", "bins": environment.count, "emptied": total.empty}
+        results.append(_show_rate(emptied, total.picked, total.outcomes, total.attempts))
         write_json(options.json, facts | {"rows": results})
         environment.episodes.count[:] -= 1  # The next picker gets the same piles.
 
 
-def _show_rate(facts: dict[str, Any], picked: int, outcomes: torch.Tensor) -> dict[str, Any]:
+def _show_rate(facts: dict[str, Any], picked: torch.Tensor, outcomes: torch.Tensor, attempts: torch.Tensor | None = None) -> dict[str, Any]:
     """Print the success rate of a run with its 95 % interval and outcomes, and return them with `facts` for JSON.
 
-    The interval takes attempts as independent: first choices are; those from one bin are not, so that of a run until empty is too narrow.
+    `picked` counts the successes, of each bin if `attempts` (bin) has theirs. Wilson's interval takes attempts as independent, as first
+    choices are; attempts from one bin depend on each other, so the interval then also covers that of a cluster bootstrap over bins.
     """
-    count = int(outcomes.sum())
-    low, high = wilson(picked, count)
+    count, total = int(outcomes.sum()), int(picked.sum())
+    low, high = wilson(total, count)
+    if attempts is not None:
+        hits, tries = picked.cpu().numpy().astype(float), attempts.cpu().numpy().astype(float)
+        bins = Scored(hits, np.zeros(len(hits), bool), np.ones(len(hits)), np.arange(len(hits)))
+        clustered = estimate(bins, lambda _, weight: float(weight @ hits / (weight @ tries)))
+        low, high = min(low, clustered.low), max(high, clustered.high)
+        facts = {**facts, "bin_attempts": attempts.tolist(), "bin_picked": picked.tolist()}
     named = {outcome.name.lower(): int(number) for outcome, number in zip(Outcome, outcomes, strict=True) if number}
-    print(f"  {facts['picker']:10} {picked / max(count, 1):.4f} ({low:.4f} to {high:.4f}) of {count}: {named}")
-    return {**facts, "attempts": count, "picked": picked, "low": low, "high": high, "outcomes": named}
+    print(f"  {facts['picker']:10} {total / max(count, 1):.4f} ({low:.4f} to {high:.4f}) of {count}: {named}")
+    return {**facts, "attempts": count, "picked": total, "low": low, "high": high, "outcomes": named}
 
 
 COMMANDS = {"train": run_train, "evaluate": run_evaluate, "run": run_simulation}
