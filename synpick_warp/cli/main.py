@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import cyclopts
 from cyclopts import App, Parameter
@@ -30,6 +30,7 @@ from synpick_warp.cli.options import (
     WholeNumber,
     one_line,
     parse_devices,
+    parse_engine,
     parse_resolution,
     parse_shard,
     parse_splits,
@@ -53,6 +54,10 @@ from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.inputs.urls import as_url
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt
+
+if TYPE_CHECKING:
+    from synpick_warp.cloud.ray_engine import Crew
+    from synpick_warp.factory.episodes import BakeSummary
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -124,6 +129,15 @@ ClaimOption = Annotated[
         negative=(), help="Be one of any number of equal workers, which share the episodes of a prefix in an object store among them."
     ),
 ]
+EngineOption = Annotated[
+    str | None,
+    Parameter(
+        help="ray: claiming workers, one a GPU, or a CPU core with --device cpu, on a Ray cluster of this machine, or that of RAY_ADDRESS. "
+        "ray://HOST:PORT: by a cluster's Ray Client. pip install 'synpick-warp[ray]'."
+    ),
+]
+WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
+PriceOption = Annotated[float, Parameter(help="Price of a worker of --engine an hour: the progress shows the cost so far.")]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -149,6 +163,9 @@ def bake(
     shard: ShardOption = None,
     split: SplitOption = None,
     claim: ClaimOption = False,
+    engine: EngineOption = None,
+    workers: WorkersOption = 0,
+    price: PriceOption = 0.0,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -180,17 +197,14 @@ def bake(
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
-    if out is None:
-        from synpick_warp.dataset.commit.manifest import make_manifest
-
-        out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
-        print(choice, flush=True)
+    out = out or _choose_output(resolved)
     _check_store_options(out, claim=claim, shard=shard, profile=profile or profile_out is not None)
+    crew = parse_engine(engine, workers, price, out, devices or shard)
+    if crew is not None:
+        return _bake_on_ray(resolved, out, crew, names)
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several, claim)
-    trace = profile_out or out.with_name(f"{out.name}-profile.json")
-    check_trace_file(trace, out)
-    return _profiled(partial(_bake, resolved, out, part, names), trace)
+    return _profiled(partial(_bake, resolved, out, part, names), profile_out, out)
 
 
 @app.command
@@ -333,6 +347,15 @@ def _resolve(
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
+def _choose_output(config: Config) -> Path:
+    """Choose the folder of a bake without --out, and print which it is."""
+    from synpick_warp.dataset.commit.manifest import make_manifest
+
+    out, choice = choose_output(make_manifest(config), config.bake, config.splits)
+    print(choice, flush=True)
+    return out
+
+
 def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
     """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
     if claim and (as_url(out) is None or shard is not None):
@@ -355,8 +378,10 @@ def check_trace_file(trace: Path, out: Path) -> None:
         raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
 
 
-def _profiled(bake: Callable[[], int], trace: Path) -> int:
-    """Bake with the profiler on; print the table and write the trace."""
+def _profiled(bake: Callable[[], int], named: Path | None, out: Path) -> int:
+    """Bake with the profiler on; print the table and write the trace into the named file, or beside the data set."""
+    trace = named or out.with_name(f"{out.name}-profile.json")
+    check_trace_file(trace, out)
     from synpick_warp.cli.display import make_console, print_profile
     from synpick_warp.exporters.writing.files import output_errors
     from synpick_warp.stages.timing import record
@@ -417,6 +442,25 @@ def _bake(
     with make_progress(console) as progress:
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
+    return _judge(summary)
+
+
+def _bake_on_ray(config: Config, out: Path, crew: Crew, splits: Sequence[str]) -> int:
+    """Bake into an object store by a crew of workers; this process neither simulates nor renders."""
+    with collection_paused():
+        from synpick_warp.cli.display import make_console, make_progress, print_summary
+        from synpick_warp.cloud.ray_engine import bake_with_ray
+
+    _check_inputs(config.bake.models, config.bake.lights)
+    url, console = as_url(out) or "", make_console()
+    with make_progress(console, crew) as progress:
+        summary = bake_with_ray(config, url, progress, crew, splits)
+    print_summary(console, summary, url)
+    return _judge(summary)
+
+
+def _judge(summary: BakeSummary) -> int:
+    """Exit code of a bake."""
     if summary.stopped:
         done = f"{len(summary.episodes)} of {summary.total} episodes are complete"
         print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)

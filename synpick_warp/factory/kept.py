@@ -49,16 +49,18 @@ class KeptBaker:
                 self._factory = None
         return summary
 
-    def _build(self, config: Config, progress: Progress, episodes: Sequence[int], *needs: bool) -> Factory:
+    def _build(self, config: Config, progress: Progress, episodes: Sequence[int], *needs: bool, longest_first: bool) -> Factory:
         """Build the factory, or have the kept one begin other episodes; arguments as of `assembly.build_factory`."""
         grown = not config.bake.worlds and len(episodes) > self._most
         if self._factory is None or self._given != (config, needs) or grown:
             self._factory = None
             gc.collect()  # Frees its arrays before the memory for others is planned.
-            self._factory = build_factory(config, progress, episodes, *needs, longest_first=True)
+            self._factory = build_factory(config, progress, episodes, *needs, longest_first=longest_first)
             self._given, self._most = (config, needs), len(episodes)
             return self._factory
         factory = self._factory
-        factory.simulation.restart(order_longest_first(factory.config, factory.catalog, episodes, factory.simulation.device))
+        if longest_first:
+            episodes = order_longest_first(factory.config, factory.catalog, episodes, factory.simulation.device)
+        factory.simulation.restart(episodes)
         self._factory = replace(factory, log=factory.make_log())
         return self._factory

@@ -97,7 +97,7 @@ def bake_episodes(
     episodes: Sequence[int],
     devices: Sequence[str] = (),
     deliver: Callable[[], None] | None = None,
-    build: Callable[..., Factory] = partial(build_factory, longest_first=True),
+    build: Callable[..., Factory] = build_factory,
 ) -> BakeSummary:
     """Generate these episodes of a data set in a folder, or the remaining ones of them.
 
@@ -108,7 +108,7 @@ def bake_episodes(
         episodes: Indices, sorted.
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
-        build: Builds the stages of one device, with the first five arguments of `build_factory`.
+        build: Builds the stages of one device, as `build_factory`.
 
     Raises:
         SynpickError: As `run_bake`.
@@ -152,7 +152,7 @@ def _fill(
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            factory = build(config, progress, output.remaining, needs.physics, needs.images)
+            factory = build(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
     else:
         catalog = load_catalog(config, report=progress.note)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)

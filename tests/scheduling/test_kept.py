@@ -34,7 +34,7 @@ def test_worlds_are_built_anew_for_other_settings_more_episodes_and_after_a_fail
         return SimpleNamespace(simulation=simulation, catalog=None, config=config, make_log=lambda: None)
 
     def bake(config, out, progress, episodes, devices, deliver, build):
-        build(config, progress, episodes, False, True)
+        build(config, progress, episodes, False, True, longest_first=True)
         if ends and isinstance(end := ends.pop(), Exception):
             raise end
         return SimpleNamespace(stopped=bool(ends))
@@ -52,8 +52,8 @@ def test_worlds_are_built_anew_for_other_settings_more_episodes_and_after_a_fail
     assert [builds(4), builds(4), builds(2)] == [1, 0, 0]
     assert builds(5) == (worlds == 0)
     assert builds(2, config.with_values({"bake.seed": 1})) == 1
-    ends.append(OSError())
-    with pytest.raises(OSError):
+    ends.append(OSError("full"))
+    with pytest.raises(OSError, match="full"):
         one(built[-1], None, None, range(2))
     assert builds(2, built[-1]) == 1
     ends.extend([None, None])  # Stopped.
