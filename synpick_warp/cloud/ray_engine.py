@@ -12,6 +12,7 @@ import shutil
 import socket
 import tempfile
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -36,6 +37,8 @@ VERSIONS = ((2, 52), (3,))
 """Versions of Ray, from the first one, which has token authentication, to before the second one."""
 _POLL = 1.0
 """Interval of reports [s]."""
+_WINDOW = 60.0
+"""Time over which the rate is averaged, since workers pause between chunks [s]."""
 _SCALE = 10.0
 """Interval at which the cluster's resources are looked up [s]."""
 _ANSWER = 5.0
@@ -246,6 +249,8 @@ class _Driver:
         self._noted: set[str] = set()
         self._count, self._scaled, self._shown = 0, float("-inf"), time.monotonic()
         self._stop = StopRequest()
+        self._seen: deque[tuple[float, int]] = deque()
+        """Times, and the number of views at these."""
 
     def run(self) -> BakeSummary:
         """Bake; returns the summary. Raises SynpickError."""
@@ -351,7 +356,10 @@ class _Driver:
         self._crew.seconds += len(alive) * (now - self._shown)
         self._shown = now
         done, views = self._past[0] + sum(each.episodes for each in alive), self._past[1] + sum(each.views for each in alive)
-        rate = sum(each.rate for each in alive)
+        self._seen.append((now, views))
+        while now - self._seen[0][0] > _WINDOW:
+            self._seen.popleft()
+        rate = (views - self._seen[0][1]) / max(_POLL, now - self._seen[0][0])
         left = max(0, self._planned - self._before - done)
         self._progress.update(
             episodes_done=min(self._planned, self._before + done),

@@ -48,8 +48,6 @@ class Report:
     views: int = 0
     worlds: int = 0
     """Worlds that run an episode."""
-    rate: float = 0.0
-    """Views per second."""
     notes: list[str] = field(default_factory=list)
     chunks: list[BakeSummary] = field(default_factory=list)
     """Summaries of the chunks that have ended."""
@@ -104,7 +102,7 @@ class Reporter(SilentProgress):
         """Report counts, at most every REPORT_INTERVAL. See `Progress`."""
         before = self._ended
         self._now.episodes, self._now.views = before[0] + episodes_done, before[1] + views
-        self._now.worlds, self._now.rate = worlds_active, views_per_s
+        self._now.worlds = worlds_active
         if self._answer is not None and (stop := self._read(self._answer)) is not None:
             self._answer = None
             if stop:
