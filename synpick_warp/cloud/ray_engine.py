@@ -174,6 +174,8 @@ def _cluster(ray: Any, address: str | None, workers: int) -> Iterator[None]:
             given |= {"_temp_dir": folder, "num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
         try:
             ray.init(**given)
+            # Otherwise logs of dead nodes go through the display, whatever `log_to_driver` is.
+            importlib.import_module("ray._private.worker").print_to_stdstream = lambda *_, **__: None
         except Exception as error:  # ConnectionError, RuntimeError, ValueError and classes of Ray's, each for several reasons.
             raise DeviceError(f"Ray cannot be used at {address or 'this machine'}: {_describe(error)}") from error
         try:

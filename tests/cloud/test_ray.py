@@ -40,6 +40,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     assert list((tmp_path / "home").iterdir()) == []
     assert "died, another one takes its place" in ran.stdout
     assert "workers · cost" in ran.stdout
+    assert "(raylet)" not in ran.stdout + ran.stderr
     scripted_bake.bake(tmp_path / "local", tiny(12).with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
 
