@@ -14,7 +14,8 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from synpick_warp import __version__
@@ -39,8 +40,6 @@ _POLL = 1.0
 """Interval of reports [s]."""
 _WINDOW = 60.0
 """Time over which the rate is averaged, since workers pause between chunks [s]."""
-_SCALE = 10.0
-"""Interval at which the cluster's resources are looked up [s]."""
 _ANSWER = 5.0
 """Longest time that an address may take to accept a connection [s]."""
 _ENDING, _STOPPING = 30.0, 120.0
@@ -212,16 +211,13 @@ def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, floa
 
 @dataclass(eq=False)
 class _Place:
-    """Place of a worker in the crew: the actor that has it at present."""
+    """Place of a worker in the crew: the actor that has it at present, with a number that no other has."""
 
-    actor: Any
-    number: int
-    """Number of the actor; each has another one."""
+    number: int = 0
+    actor: Any = None
+    """Handle, without which Ray ends the actor."""
     deaths: int = 0
     """Deaths since an episode was reported from here."""
-    last: Report = field(default_factory=Report)
-    is_alive: bool = False
-    """Whether it has reported."""
 
 
 class _Driver:
@@ -239,19 +235,17 @@ class _Driver:
             device, each: Device and resources of a worker.
             counts: Episodes that are done, and all.
         """
-        self._ray, self._crew, self._progress, self._job = ray, crew, progress, job
-        self._device, self._each, (self._before, self._planned) = device, each, counts
+        self._ray, self._crew, self._progress, self._counts = ray, crew, progress, counts
+        self._resource = "GPU" if "num_gpus" in each else "CPU"
         self._board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
+        self._make = partial(ray.remote(Worker).options(**each).remote, self._board, __version__, job, device, int(each["num_cpus"]))
         self._places: list[_Place] = []
         self._flight: dict[Any, _Place] = {}
         """Calls that run, by their references."""
-        self._summary = BakeSummary()
-        self._past = [0, 0]
-        """Episodes and views of workers that have ended."""
-        self._noted: set[str] = set()
-        self._count, self._scaled, self._shown = 0, float("-inf"), time.monotonic()
-        self._stop = StopRequest()
-        self._seen: deque[tuple[float, int]] = deque()
+        self._reports: dict[int, Report] = {}
+        """Last report of each actor, also of those that have ended."""
+        self._summary, self._noted, self._stop = BakeSummary(), set[str](), StopRequest()
+        self._seen = deque([(time.monotonic(), 0)])
         """Times, and the number of views at these."""
 
     def run(self) -> BakeSummary:
@@ -260,8 +254,11 @@ class _Driver:
         with self._stop:
             while deadline is None or (self._waits() and time.monotonic() < deadline):
                 if deadline is None:
-                    self._place_workers()
-                is_over = self._take_ended(_POLL)
+                    wanted = self._crew.workers or int(self._ray.cluster_resources().get(self._resource, 0))
+                    while len(self._places) < wanted:
+                        self._places.append(_Place())
+                        self._start(self._places[-1])
+                is_over = self._take_ended()
                 if deadline is None and (is_over or self._stop.number):
                     deadline = time.monotonic() + (_STOPPING if self._stop.number else _ENDING)
                 self._collect()
@@ -269,105 +266,83 @@ class _Driver:
         self._summary.stopped, self._summary.wall_seconds = self._stop.number, time.monotonic() - started
         return self._summary
 
+    @property
+    def _alive(self) -> list[Report]:
+        """Last reports of the workers that run."""
+        return [self._reports[place.number] for place in self._flight.values() if place.number in self._reports]
+
     def _waits(self) -> bool:
         """Whether there are workers to wait for at the end: all that run, or after a request to stop those that bake."""
-        return any(place.is_alive and (place.last.busy or not self._stop.number) for place in self._flight.values())
-
-    def _place_workers(self) -> None:
-        """Add workers up to the number asked for, or that the cluster has resources for."""
-        if time.monotonic() - self._scaled < _SCALE:
-            return
-        self._scaled = time.monotonic()
-        name = "GPU" if "num_gpus" in self._each else "CPU"
-        wanted = self._crew.workers or int(self._ray.cluster_resources().get(name, 0))
-        for _ in range(len(self._places), wanted):
-            self._places.append(_Place(None, 0))
-            self._start(self._places[-1])
+        return any(report.busy or not self._stop.number for report in self._alive)
 
     def _start(self, place: _Place) -> None:
         """Have a new actor take a place; it waits for its resources by itself."""
-        self._count += 1
-        actor = self._ray.remote(Worker).options(**self._each)
-        place.number, place.last, place.is_alive = self._count, Report(), False
-        place.actor = actor.remote(place.number, self._board, __version__, self._job, self._device, int(self._each["num_cpus"]))
+        place.number = 1 + max(each.number for each in self._places)
+        place.actor = self._make(place.number)
         self._flight[place.actor.work.remote()] = place
 
-    def _take_ended(self, timeout: float) -> bool:
-        """Wait for calls to end, replace workers that have died; returns whether one ended since all is done. Raises its error."""
+    def _take_ended(self) -> bool:
+        """Wait for a call to end, for _POLL at most, and replace workers that have died.
+
+        Returns:
+            Whether one ended since all is done, or since it was to stop.
+
+        Raises:
+            DeviceError: A worker reports an error that the user can correct, or too many have died in one place.
+        """
         if not self._flight:
-            time.sleep(timeout)
-            return False
-        over, errors = False, self._ray.exceptions
-        for call in self._ray.wait(list(self._flight), num_returns=1, timeout=timeout)[0]:
+            time.sleep(_POLL)
+        for call in self._ray.wait(list(self._flight), timeout=_POLL)[0] if self._flight else ():
             place = self._flight.pop(call)
             try:
                 said = self._ray.get(call)
-            except errors.RayActorError as error:
-                self._replace(place, _describe(error))
-                continue
-            except errors.RayTaskError as error:
-                fault = DeviceError(f"worker {place.number} failed: {error.cause!r}"[:400] + "; the same command resumes")
-                fault.add_note(str(error))
-                raise fault from None
+            except self._ray.exceptions.RayActorError as error:
+                said = 0, _describe(error)
             if isinstance(said, str) and said:
                 raise DeviceError(said)
-            if said and not self._stop.number:
-                self._replace(place, f"signal {said}")
-                continue
-            over = True
-            self._retire(place)
-        return over
-
-    def _replace(self, place: _Place, reason: str) -> None:
-        """Replace a dead worker. Its claim runs out, and another worker takes the chunk. Raises DeviceError: too many have died here."""
-        self._collect()
-        place.deaths += 1
-        self._retire(place)
-        if place.deaths >= MAX_DEATHS:
-            raise DeviceError(f"{place.deaths} workers died one after the other without an episode: {reason}; the same command resumes")
-        if not self._stop.number:
+            if not said or self._stop.number:
+                return True
+            self._collect()
+            place.deaths += 1
+            if place.deaths >= MAX_DEATHS:
+                raise DeviceError(f"{MAX_DEATHS} workers died one after the other without an episode ({said}); the same command resumes")
             self._progress.note(f"worker {place.number} died, another one takes its place")
-            self._start(place)
-
-    def _retire(self, place: _Place) -> None:
-        """Add up what a worker has done that has ended."""
-        self._past[0] += place.last.episodes
-        self._past[1] += place.last.views
-        place.last, place.is_alive = Report(), False
+            self._start(place)  # The claim of the dead one runs out, and some worker takes its chunk.
+        return False
 
     def _collect(self) -> None:
         """Take the reports from the board; none come while it moves to another node."""
+        reports: dict[int, Report] = {}
         with contextlib.suppress(self._ray.exceptions.RayActorError, self._ray.exceptions.GetTimeoutError):
-            places = {place.number: place for place in self._places}
-            for number, report in self._ray.get(self._board.collect.remote(self._stop.number), timeout=_ENDING).items():
-                for note in report.notes:
-                    if note not in self._noted:
-                        self._noted.add(note)
-                        self._progress.note(note)
-                for chunk in report.chunks:
-                    self._summary.total += chunk.total
-                    self._summary.take_summary(chunk)
-                if (place := places.get(number)) is not None:
-                    place.deaths = place.deaths if report.episodes <= place.last.episodes else 0
-                    place.last, place.is_alive = report, True
+            reports = self._ray.get(self._board.collect.remote(self._stop.number), timeout=_ENDING)
+        for number, report in reports.items():
+            for note in report.notes:
+                if note not in self._noted:
+                    self._noted.add(note)
+                    self._progress.note(note)
+            for chunk in report.chunks:
+                self._summary.total += chunk.total
+                self._summary.take_summary(chunk)
+            if report.episodes > self._reports.get(number, Report()).episodes:
+                for place in self._places:
+                    place.deaths = 0 if place.number == number else place.deaths
+            self._reports[number] = report
 
     def _show(self) -> None:
-        """Report sums, remaining time and costs."""
-        alive, now = [place.last for place in self._places if place.is_alive], time.monotonic()
+        """Report sums, rate, remaining time and costs."""
+        alive, now, (before, planned) = self._alive, time.monotonic(), self._counts
         self._crew.alive = len(alive)
-        self._crew.seconds += len(alive) * (now - self._shown)
-        self._shown = now
-        done, views = self._past[0] + sum(each.episodes for each in alive), self._past[1] + sum(each.views for each in alive)
+        self._crew.seconds += len(alive) * (now - self._seen[-1][0])
+        done, views = (sum(getattr(report, name) for report in self._reports.values()) for name in ("episodes", "views"))
         self._seen.append((now, views))
         while now - self._seen[0][0] > _WINDOW:
             self._seen.popleft()
         rate = (views - self._seen[0][1]) / max(_POLL, now - self._seen[0][0])
-        left = max(0, self._planned - self._before - done)
         self._progress.update(
-            episodes_done=min(self._planned, self._before + done),
-            episodes=self._planned,
-            worlds_active=sum(each.worlds for each in alive),
+            episodes_done=min(planned, before + done),
+            episodes=planned,
+            worlds_active=sum(report.worlds for report in alive),
             views=views,
             views_per_s=rate,
-            seconds_left=left * views / done / rate if done and rate > 0.0 else None,
+            seconds_left=max(0, planned - before - done) * views / done / rate if done and rate > 0.0 else None,
         )

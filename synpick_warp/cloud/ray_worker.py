@@ -130,23 +130,23 @@ class Reporter(SilentProgress):
 class Worker:
     """Actor that bakes chunks which it claims, until all episodes of a job are done. Kernels, objects and worlds stay loaded meanwhile."""
 
-    def __init__(self, number: int, board: Any, version: str, job: bytes, device: str, cores: int) -> None:
+    def __init__(self, board: Any, version: str, job: bytes, device: str, cores: int, number: int) -> None:
         """
         Args:
-            number: Number of this worker.
             board: Handle of the `Board`.
             version: Version of the driver's synpick_warp.
             job: Pickled `Job`.
             device: Device of the bakes.
             cores: CPU cores of this worker.
+            number: Number of this worker.
         """
-        self._given = (number, board, version, job, device, cores)
+        self._given = (board, version, job, device, cores, number)
 
     def work(self) -> str | int:
         """Bake until nothing is left; returns an empty string then, an error that the user can correct, or the signal that stopped it."""
         import ray  # type: ignore[reportMissingImports]  # An actor has it.
 
-        number, board, version, data, device, cores = self._given
+        board, version, data, device, cores, number = self._given
         if version != __version__:
             return f"a Ray worker has synpick-warp {__version__}, and this command {version}; install one version everywhere"
         job: Job = pickle.loads(data)
