@@ -174,7 +174,7 @@ def _cluster(ray: Any, address: str | None, workers: int) -> Iterator[None]:
         try:
             ray.init(**given)
             # Otherwise logs of dead nodes go through the display, whatever `log_to_driver` is.
-            importlib.import_module("ray._private.worker").print_to_stdstream = lambda *_, **__: None
+            ray._private.worker.print_to_stdstream = lambda *_, **__: None
         except Exception as error:  # ConnectionError, RuntimeError, ValueError and classes of Ray's, each for several reasons.
             raise DeviceError(f"Ray cannot be used at {address or 'this machine'}: {_describe(error)}") from error
         try:
@@ -249,10 +249,14 @@ class _Driver:
         """Times, and the number of views at these."""
 
     def run(self) -> BakeSummary:
-        """Bake; returns the summary. Raises SynpickError."""
-        started, deadline = time.monotonic(), None
+        """Bake; returns the summary. At the end it waits for workers that run, after a request to stop for those that bake.
+
+        Raises:
+            SynpickError: An error that the user can correct.
+        """
+        started, deadline, last = time.monotonic(), None, set[int]()
         with self._stop:
-            while deadline is None or (self._waits() and time.monotonic() < deadline):
+            while deadline is None or (last & {place.number for place in self._flight.values()} and time.monotonic() < deadline):
                 if deadline is None:
                     wanted = self._crew.workers or int(self._ray.cluster_resources().get(self._resource, 0))
                     while len(self._places) < wanted:
@@ -261,19 +265,16 @@ class _Driver:
                 is_over = self._take_ended()
                 if deadline is None and (is_over or self._stop.number):
                     deadline = time.monotonic() + (_STOPPING if self._stop.number else _ENDING)
+                    last = {number for number, report in self._alive.items() if report.busy or not self._stop.number}
                 self._collect()
                 self._show()
         self._summary.stopped, self._summary.wall_seconds = self._stop.number, time.monotonic() - started
         return self._summary
 
     @property
-    def _alive(self) -> list[Report]:
-        """Last reports of the workers that run."""
-        return [self._reports[place.number] for place in self._flight.values() if place.number in self._reports]
-
-    def _waits(self) -> bool:
-        """Whether there are workers to wait for at the end: all that run, or after a request to stop those that bake."""
-        return any(report.busy or not self._stop.number for report in self._alive)
+    def _alive(self) -> dict[int, Report]:
+        """Last reports of the workers that run, by number."""
+        return {place.number: self._reports[place.number] for place in self._flight.values() if place.number in self._reports}
 
     def _start(self, place: _Place) -> None:
         """Have a new actor take a place; it waits for its resources by itself."""
@@ -341,7 +342,7 @@ class _Driver:
         self._progress.update(
             episodes_done=min(planned, before + done),
             episodes=planned,
-            worlds_active=sum(report.worlds for report in alive),
+            worlds_active=sum(report.worlds for report in alive.values()),
             views=views,
             views_per_s=rate,
             seconds_left=max(0, planned - before - done) * views / done / rate if done and rate > 0.0 else None,
