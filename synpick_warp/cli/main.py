@@ -58,6 +58,7 @@ from synpick_warp.system.processes.interrupt import KeptInterrupt
 if TYPE_CHECKING:
     from synpick_warp.cloud.ray_engine import Crew
     from synpick_warp.factory.episodes import BakeSummary
+    from synpick_warp.system.progress import Progress
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -178,8 +179,7 @@ def bake(
 
     Options override the file, the file overrides the preset. Ctrl-C stops after the current tick, a second Ctrl-C at once.
 
-    Exit codes: 0, all episodes were delivered; 1, some were given up; 2, an error in the options, a file or a folder; 130 and 143,
-    interrupted.
+    Exit codes: 0, all episodes were delivered; 1, some were given up; 2, an error in options, files or folders; 130 and 143, interrupted.
     """
     given = {
         "bake.worlds": worlds,
@@ -192,19 +192,20 @@ def bake(
         "bake.writers": writers,
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
-    several = parse_devices(devices, device, profile or profile_out is not None)
+    profiles = profile or profile_out is not None
+    several = parse_devices(devices, device, profiles)
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
-    out = out or _choose_output(resolved)
-    _check_store_options(out, claim=claim, shard=shard, profile=profile or profile_out is not None)
-    crew = parse_engine(engine, workers, price, out, devices or shard)
-    if crew is not None:
-        return _bake_on_ray(resolved, out, crew, names)
-    if not profile and profile_out is None:
-        return _bake(resolved, out, part, names, several, claim)
-    return _profiled(partial(_bake, resolved, out, part, names), profile_out, out)
+    if out is None:
+        from synpick_warp.dataset.commit.manifest import make_manifest
+
+        out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
+        print(choice, flush=True)
+    _check_store_options(out, claim=claim, shard=shard, profile=profiles)
+    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard))
+    return _profiled(run, profile_out, out) if profiles else run()
 
 
 @app.command
@@ -347,15 +348,6 @@ def _resolve(
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
-def _choose_output(config: Config) -> Path:
-    """Choose the folder of a bake without --out, and print which it is."""
-    from synpick_warp.dataset.commit.manifest import make_manifest
-
-    out, choice = choose_output(make_manifest(config), config.bake, config.splits)
-    print(choice, flush=True)
-    return out
-
-
 def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
     """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
     if claim and (as_url(out) is None or shard is not None):
@@ -412,9 +404,15 @@ def _check_inputs(models: str, lights: str) -> None:
 
 
 def _bake(
-    config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = (), claim: bool = False
+    config: Config,
+    out: Path,
+    shard: tuple[int, int],
+    splits: Sequence[str],
+    devices: Sequence[str],
+    claim: bool,
+    crew: Crew | None,
 ) -> int:
-    """Check device and folders, which is cheap, then bake."""
+    """Check device and folders, which is cheap, then bake: in this process and its children, or by a crew of workers."""
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
@@ -422,7 +420,7 @@ def _bake(
 
     if devices:
         pick_devices(devices)
-    else:
+    elif crew is None:
         pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
     url = as_url(out)
@@ -433,34 +431,22 @@ def _bake(
             from synpick_warp.factory.pipeline import run_bake
 
             bake = partial(run_bake, config, out)
-        else:
+        elif crew is None:
             from synpick_warp.cloud.run import bake_into_store
 
             bake = partial(bake_into_store, config, url, claim=claim)
+        else:
+            from synpick_warp.cloud.ray_engine import Job, bake_with_ray
+
+            job = Job(config, url, tuple(splits))
+
+            def bake(progress: Progress, *_: object) -> BakeSummary:
+                return bake_with_ray(job, crew, progress)
 
     console = make_console()
-    with make_progress(console) as progress:
+    with make_progress(console, crew or "") as progress:
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
-    return _judge(summary)
-
-
-def _bake_on_ray(config: Config, out: Path, crew: Crew, splits: Sequence[str]) -> int:
-    """Bake into an object store by a crew of workers; this process neither simulates nor renders."""
-    with collection_paused():
-        from synpick_warp.cli.display import make_console, make_progress, print_summary
-        from synpick_warp.cloud.ray_engine import bake_with_ray
-
-    _check_inputs(config.bake.models, config.bake.lights)
-    url, console = as_url(out) or "", make_console()
-    with make_progress(console, crew) as progress:
-        summary = bake_with_ray(config, url, progress, crew, splits)
-    print_summary(console, summary, url)
-    return _judge(summary)
-
-
-def _judge(summary: BakeSummary) -> int:
-    """Exit code of a bake."""
     if summary.stopped:
         done = f"{len(summary.episodes)} of {summary.total} episodes are complete"
         print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)

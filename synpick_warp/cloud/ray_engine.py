@@ -13,18 +13,16 @@ import socket
 import tempfile
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import LEASE, Chunks, Claims, default_chunk
+from synpick_warp.cloud.claims import Chunks, Claims, default_chunk
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_worker import Board, Job, Report, Worker
-from synpick_warp.cloud.run import Baker
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError, StoreError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import with_measures
@@ -75,20 +73,13 @@ class Crew:
         return f"{self.alive} worker{'s' * (self.alive != 1)}{cost}"
 
 
-def bake_with_ray(
-    config: Config,
-    url: str,
-    progress: Progress,
-    crew: Crew,
-    splits: Sequence[str] = (),
-    bake: Baker | None = None,
-    lease: float = LEASE,
-) -> BakeSummary:
+def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
     """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part.
 
     Args:
-        config, url, progress, splits, bake, lease: As of `run.bake_into_store`.
+        job: What to bake.
         crew: Options; receives the number of workers and their time.
+        progress: Observer.
 
     Returns:
         Summary of the chunks that ended in this run.
@@ -96,8 +87,8 @@ def bake_with_ray(
     Raises:
         SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
     """
-    config = with_measures(config, ())
-    ranges = DataLayout.of(config).plan(splits)
+    job = replace(job, config=with_measures(job.config, ()))
+    config, url, ranges = job.config, job.url, DataLayout.of(job.config).plan(job.splits)
     planned = sum(map(len, ranges))
     address = find_address(crew.engine)
     ray = import_ray(address)
@@ -110,12 +101,11 @@ def bake_with_ray(
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
-    chunks = Chunks(ledger, Claims(store, ledger.probe.offset, lease), ranges, default_chunk(config.bake.worlds, planned))
-    job = pickle.dumps(Job(config, url, tuple(splits), bake, lease))
+    chunks = Chunks(ledger, Claims(store, ledger.probe.offset, job.lease), ranges, default_chunk(config.bake.worlds, planned))
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
     with _cluster(ray, address, crew.workers):
         device, each = _resources(ray, config.bake.device, crew.workers)
-        return _Driver(ray, crew, progress, job, device, each, (chunks.count_over(), planned)).run()
+        return _Driver(ray, crew, progress, pickle.dumps(job), device, each, (chunks.count_over(), planned)).run()
 
 
 def import_ray(address: str | None) -> Any:

@@ -9,17 +9,17 @@ import contextlib
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from synpick_warp import __version__
+from synpick_warp.cloud.claims import LEASE
 from synpick_warp.cloud.run import Baker, bake_into_store
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.kept import KeptBaker
+from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.progress import SilentProgress
 
@@ -33,9 +33,9 @@ class Job:
 
     config: Config
     url: str
-    splits: tuple[str, ...]
-    bake: Baker | None
-    lease: float
+    splits: tuple[str, ...] = ()
+    bake: Baker | None = None
+    lease: float = LEASE
 
 
 @dataclass
@@ -159,18 +159,16 @@ class Worker:
         reporter = Reporter(lambda report: board.post.remote(number, report), read)
         limit_threads(cores)
         own = {"bake.device": device, "bake.writers": job.config.bake.writers or cores}
-        inner = job.bake or KeptBaker()
+        bake = job.bake or keeping_baker()
 
-        def bake(
-            config: Config, out: Path, progress: Any, episodes: Sequence[int], devices: Sequence[str], deliver: Callable[[], None]
-        ) -> BakeSummary:
+        def report(config: Any, *given: Any) -> BakeSummary:
             ended: list[BakeSummary] = []
             with reporter.chunk(ended):
-                ended.append(inner(config.with_values(own), out, progress, episodes, devices, deliver))
+                ended.append(bake(config.with_values(own), *given))
             return ended[0]
 
         try:
-            summary = bake_into_store(job.config, job.url, reporter, splits=job.splits, bake=bake, claim=True, lease=job.lease)
+            summary = bake_into_store(job.config, job.url, reporter, splits=job.splits, bake=report, claim=True, lease=job.lease)
         except SynpickError as error:
             return str(error) or type(error).__name__
         return summary.stopped or ""

@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.kept import KeptBaker
+from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.opening import open_store, probe
@@ -71,7 +71,7 @@ def bake_into_store(
     summary = BakeSummary()
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
-        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake or KeptBaker())
+        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake or keeping_baker())
         claims = Claims(store, ledger.probe.offset, lease) if claim else None
         if claims is None:
             for episodes in _chunks(ledger, ranges):

@@ -128,7 +128,7 @@ def bake_episodes(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if advice := advise_processes(config, names, len(output.remaining)):
                     progress.note(advice)
-                _fill(config, output, needs, names, summary, progress, deliver, build)
+                _fill(output, needs, names, summary, progress, deliver, build)
         except OutputError as error:
             if out.exists():
                 raise
@@ -137,7 +137,6 @@ def bake_episodes(
 
 
 def _fill(
-    config: Config,
     output: OutputFolder,
     needs: Needs,
     names: Sequence[str],
@@ -147,7 +146,8 @@ def _fill(
     build: Callable[..., Factory],
 ) -> None:
     """Generate the remaining episodes, then the indices over all, or deliver the episodes."""
-    factory, settings = None, ExportSettings.of(config)
+    config, factory = output.config, None
+    settings = ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:

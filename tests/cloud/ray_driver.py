@@ -11,7 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from synpick_warp.cli.display import make_progress
-from synpick_warp.cloud.ray_engine import Crew, bake_with_ray
+from synpick_warp.cloud.ray_engine import Crew, Job, bake_with_ray
 from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
 
@@ -31,5 +31,6 @@ if __name__ == "__main__":
     from tests.cloud import ray_driver  # Workers import it by this name.
 
     with make_progress(Console(), crew) as progress:
-        summary = bake_with_ray(config, url, progress, crew, bake=functools.partial(ray_driver.bake_or_die, marker), lease=3.0)
+        job = Job(config, url, bake=functools.partial(ray_driver.bake_or_die, marker), lease=3.0)
+        summary = bake_with_ray(job, crew, progress)
     print(f"{len(summary.episodes)} of {summary.total} episodes by {crew}")
