@@ -58,7 +58,6 @@ from synpick_warp.system.processes.interrupt import KeptInterrupt
 if TYPE_CHECKING:
     from synpick_warp.cloud.ray_engine import Crew
     from synpick_warp.factory.episodes import BakeSummary
-    from synpick_warp.system.progress import Progress
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -426,6 +425,7 @@ def _bake(
     url = as_url(out)
     if url is None:
         check_output_folder(out)
+    bake: Callable[..., BakeSummary]
     with collection_paused():
         if url is None:
             from synpick_warp.factory.pipeline import run_bake
@@ -439,9 +439,7 @@ def _bake(
             from synpick_warp.cloud.ray_engine import Job, bake_with_ray
 
             job = Job(config, url, tuple(splits))
-
-            def bake(progress: Progress, *_: object) -> BakeSummary:
-                return bake_with_ray(job, crew, progress)
+            bake = lambda progress, *_: bake_with_ray(job, crew, progress)  # noqa: E731
 
     console = make_console()
     with make_progress(console, crew or "") as progress:
