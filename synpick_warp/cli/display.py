@@ -35,15 +35,16 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
 
 
-def make_progress(console: Console) -> Progress:
-    """Choose the display: live on a terminal, plain lines elsewhere."""
-    return LiveProgress(console) if console.is_terminal else PlainProgress(console)
+def make_progress(console: Console, remark: object = "") -> Progress:
+    """Choose the display: live on a terminal, plain lines elsewhere. `remark`: its text, at any time, ends the line of counts."""
+    return LiveProgress(console, remark) if console.is_terminal else PlainProgress(console, remark)
 
 
 class LiveProgress:
     """Live progress bar: stage, episodes, worlds, views, rate, remaining time."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, remark: object = "") -> None:
+        self._remark = remark
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
         columns = (stage, BarColumn(bar_width=30), MofNCompleteColumn(), detail, TimeElapsedColumn())
         self._bar = Bar(*columns, console=console, transient=True)
@@ -64,7 +65,7 @@ class LiveProgress:
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
         """Set the bar to the episodes done, with worlds, views and time left [s] beside it. See `Progress`."""
-        detail = _detail(worlds_active, views, views_per_s, seconds_left)
+        detail = _detail(worlds_active, views, views_per_s, seconds_left, self._remark)
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
 
     def note(self, text: str) -> None:
@@ -75,8 +76,8 @@ class LiveProgress:
 class PlainProgress:
     """Plain progress lines: one per stage and note, and a rate-limited one for counts."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, console: Console, remark: object = "") -> None:
+        self._console, self._remark = console, remark
         self._started = time.monotonic()
         self._printed_at = float("-inf")
 
@@ -97,7 +98,7 @@ class PlainProgress:
         now = time.monotonic()
         if now - self._printed_at >= PLAIN_INTERVAL:
             self._printed_at = now
-            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
+            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left, self._remark)}")
 
     def note(self, text: str) -> None:
         """Print a line with the time since the start."""
@@ -235,10 +236,11 @@ def _words(code: Ending | Outcome) -> str:
     return code.name.lower().replace("_", " ")
 
 
-def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
-    """Worlds, views, rate and remaining time in one line."""
+def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None, remark: object) -> str:
+    """Worlds, views, rate, remaining time and a remark in one line."""
     left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
-    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}"
+    more = f" · {said}" if (said := str(remark)) else ""
+    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}{more}"
 
 
 def _duration(seconds: float) -> str:

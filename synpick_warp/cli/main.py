@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import cyclopts
 from cyclopts import App, Parameter
@@ -30,6 +30,7 @@ from synpick_warp.cli.options import (
     WholeNumber,
     one_line,
     parse_devices,
+    parse_engine,
     parse_resolution,
     parse_shard,
     parse_splits,
@@ -53,6 +54,10 @@ from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.inputs.urls import as_url
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt
+
+if TYPE_CHECKING:
+    from synpick_warp.cloud.ray_engine import Crew
+    from synpick_warp.factory.episodes import BakeSummary
 
 NAME = "synpick-warp"
 EXIT_MISTAKE = 2
@@ -124,6 +129,15 @@ ClaimOption = Annotated[
         negative=(), help="Be one of any number of equal workers, which share the episodes of a prefix in an object store among them."
     ),
 ]
+EngineOption = Annotated[
+    str | None,
+    Parameter(
+        help="ray: claiming workers, one a GPU, or a CPU core with --device cpu, on a Ray cluster of this machine, or that of RAY_ADDRESS. "
+        "ray://HOST:PORT: by a cluster's Ray Client. pip install 'synpick-warp[ray]'."
+    ),
+]
+WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
+PriceOption = Annotated[float, Parameter(help="Price of a worker of --engine an hour: the progress shows the cost so far.")]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -149,6 +163,9 @@ def bake(
     shard: ShardOption = None,
     split: SplitOption = None,
     claim: ClaimOption = False,
+    engine: EngineOption = None,
+    workers: WorkersOption = 0,
+    price: PriceOption = 0.0,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -161,8 +178,7 @@ def bake(
 
     Options override the file, the file overrides the preset. Ctrl-C stops after the current tick, a second Ctrl-C at once.
 
-    Exit codes: 0, all episodes were delivered; 1, some were given up; 2, an error in the options, a file or a folder; 130 and 143,
-    interrupted.
+    Exit codes: 0, all episodes were delivered; 1, some were given up; 2, an error in options, files or folders; 130 and 143, interrupted.
     """
     given = {
         "bake.worlds": worlds,
@@ -175,7 +191,8 @@ def bake(
         "bake.writers": writers,
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
-    several = parse_devices(devices, device, profile or profile_out is not None)
+    profiles = profile or profile_out is not None
+    several = parse_devices(devices, device, profiles)
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
@@ -185,12 +202,9 @@ def bake(
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
-    _check_store_options(out, claim=claim, shard=shard, profile=profile or profile_out is not None)
-    if not profile and profile_out is None:
-        return _bake(resolved, out, part, names, several, claim)
-    trace = profile_out or out.with_name(f"{out.name}-profile.json")
-    check_trace_file(trace, out)
-    return _profiled(partial(_bake, resolved, out, part, names), trace)
+    _check_store_options(out, claim=claim, shard=shard, profile=profiles)
+    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard))
+    return _profiled(run, profile_out, out) if profiles else run()
 
 
 @app.command
@@ -355,8 +369,10 @@ def check_trace_file(trace: Path, out: Path) -> None:
         raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
 
 
-def _profiled(bake: Callable[[], int], trace: Path) -> int:
-    """Bake with the profiler on; print the table and write the trace."""
+def _profiled(bake: Callable[[], int], named: Path | None, out: Path) -> int:
+    """Bake with the profiler on; print the table and write the trace into the named file, or beside the data set."""
+    trace = named or out.with_name(f"{out.name}-profile.json")
+    check_trace_file(trace, out)
     from synpick_warp.cli.display import make_console, print_profile
     from synpick_warp.exporters.writing.files import output_errors
     from synpick_warp.stages.timing import record
@@ -387,9 +403,15 @@ def _check_inputs(models: str, lights: str) -> None:
 
 
 def _bake(
-    config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = (), claim: bool = False
+    config: Config,
+    out: Path,
+    shard: tuple[int, int],
+    splits: Sequence[str],
+    devices: Sequence[str],
+    claim: bool,
+    crew: Crew | None,
 ) -> int:
-    """Check device and folders, which is cheap, then bake."""
+    """Check device and folders, which is cheap, then bake: in this process and its children, or by a crew of workers."""
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
@@ -397,24 +419,30 @@ def _bake(
 
     if devices:
         pick_devices(devices)
-    else:
+    elif crew is None:
         pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
     url = as_url(out)
     if url is None:
         check_output_folder(out)
+    bake: Callable[..., BakeSummary]
     with collection_paused():
         if url is None:
             from synpick_warp.factory.pipeline import run_bake
 
             bake = partial(run_bake, config, out)
-        else:
+        elif crew is None:
             from synpick_warp.cloud.run import bake_into_store
 
             bake = partial(bake_into_store, config, url, claim=claim)
+        else:
+            from synpick_warp.cloud.ray_engine import Job, bake_with_ray
+
+            job = Job(config, url, tuple(splits))
+            bake = lambda progress, *_: bake_with_ray(job, crew, progress)  # noqa: E731
 
     console = make_console()
-    with make_progress(console) as progress:
+    with make_progress(console, crew or "") as progress:
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
     if summary.stopped:

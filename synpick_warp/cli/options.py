@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter, Token
 
 from synpick_warp.errors import ConfigError, escape, format_value
+from synpick_warp.system.inputs.urls import as_url
+
+if TYPE_CHECKING:
+    from synpick_warp.cloud.ray_engine import Crew
 
 EXIT_INCOMPLETE = 1
 """Exit code if a data set is incomplete or damaged."""
@@ -16,6 +21,8 @@ MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
 MAX_THREADS = 1024
 """Upper bound of options such as --threads, in processes or threads."""
+MAX_CREW, MAX_PRICE = 100_000, 1e6
+"""Upper bounds of --workers and --price."""
 MAX_LINE = 2000
 """Longest message [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
@@ -100,6 +107,27 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
     if profile:
         raise ConfigError("--profile records the process of one device; name it by --device, not by --devices")
     return tuple(name.strip() for name in devices.split(","))
+
+
+def parse_engine(engine: str | None, workers: int, price: float, out: Path, beside: str | None) -> Crew | None:
+    """Parse --engine, --workers and --price; None: no engine is named. `beside`: value of an option that an engine excludes.
+
+    Raises:
+        ConfigError: An option is out of range, or does not go with the others.
+    """
+    if engine is None:
+        if workers or price:
+            raise ConfigError("--workers and --price go with --engine; name one, such as ray")
+        return None
+    if as_url(out) is None or beside is not None:
+        raise ConfigError(
+            "--engine has workers claim episodes of a prefix in an object store; name one by --out, and drop --devices and --shard"
+        )
+    check_range("--workers", workers, 0, MAX_CREW)
+    check_range("--price", price, 0.0, MAX_PRICE)
+    from synpick_warp.cloud.ray_engine import Crew
+
+    return Crew(engine, workers, price)
 
 
 def parse_shard(text: str) -> tuple[int, int]:

@@ -240,6 +240,11 @@ class Chunks:
         finally:
             chunk.claim.stop()
 
+    def count_over(self) -> int:
+        """Number of episodes in the chunks that have end marks."""
+        over = self._over()
+        return sum(end - start for number, (start, end) in enumerate(self.sizes.bounds()) if number in over)
+
     def _over(self) -> set[int]:
         """Numbers of the chunks that have end marks."""
         place = f"{self._place}/done"

@@ -18,7 +18,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.factory.kept import keeping_baker
+from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
@@ -37,9 +38,10 @@ def bake_into_store(
     shard: tuple[int, int] = (0, 1),
     splits: Sequence[str] = (),
     devices: Sequence[str] = (),
-    bake: Baker = bake_episodes,
+    bake: Baker | None = None,
     *,
     claim: bool = False,
+    lease: float = LEASE,
 ) -> BakeSummary:
     """Bake a data set into an object store: simulates, renders and uploads it, or the remaining episodes of one.
 
@@ -50,8 +52,9 @@ def bake_into_store(
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits; empty: all.
         devices: As in `pipeline.run_bake`.
-        bake: Bakes episodes into a folder.
+        bake: Bakes episodes into a folder; None: one that keeps objects, lights, worlds and kernels from chunk to chunk.
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
+        lease: Time to live of a claim without heartbeat [s].
 
     Returns:
         Summary of this run's episodes, without those that were done before, and those of chunks that were lost to other workers.
@@ -68,8 +71,8 @@ def bake_into_store(
     summary = BakeSummary()
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
-        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake)
-        claims = Claims(store, ledger.probe.offset, LEASE) if claim else None
+        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake or keeping_baker())
+        claims = Claims(store, ledger.probe.offset, lease) if claim else None
         if claims is None:
             for episodes in _chunks(ledger, ranges):
                 if _take(summary, baking(episodes)):

@@ -97,6 +97,7 @@ def bake_episodes(
     episodes: Sequence[int],
     devices: Sequence[str] = (),
     deliver: Callable[[], None] | None = None,
+    build: Callable[..., Factory] = build_factory,
 ) -> BakeSummary:
     """Generate these episodes of a data set in a folder, or the remaining ones of them.
 
@@ -107,6 +108,7 @@ def bake_episodes(
         episodes: Indices, sorted.
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
+        build: Builds the stages of one device, as `build_factory`.
 
     Raises:
         SynpickError: As `run_bake`.
@@ -126,7 +128,7 @@ def bake_episodes(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if advice := advise_processes(config, names, len(output.remaining)):
                     progress.note(advice)
-                _fill(config, output, needs, names, summary, progress, deliver)
+                _fill(output, needs, names, summary, progress, deliver, build)
         except OutputError as error:
             if out.exists():
                 raise
@@ -135,21 +137,22 @@ def bake_episodes(
 
 
 def _fill(
-    config: Config,
     output: OutputFolder,
     needs: Needs,
     names: Sequence[str],
     summary: BakeSummary,
     progress: Progress,
     deliver: Callable[[], None] | None,
+    build: Callable[..., Factory],
 ) -> None:
     """Generate the remaining episodes, then the indices over all, or deliver the episodes."""
-    factory, settings = None, ExportSettings.of(config)
+    config, factory = output.config, None
+    settings = ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
+            factory = build(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
     else:
         catalog = load_catalog(config, report=progress.note)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)

@@ -10,5 +10,5 @@ from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
 
 if __name__ == "__main__":
-    run.LEASE = float(sys.argv[3])
-    run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), bake=scripted_bake.bake_episodes, claim=True)
+    given = {"bake": scripted_bake.bake_episodes, "claim": True, "lease": float(sys.argv[3])}
+    run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), **given)

@@ -130,7 +130,6 @@ def test_the_winner_of_a_lost_lease_is_one(memory):
 
 def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, monkeypatch):
     """Its lease is stolen in the middle of its first chunk; the thief never does the chunk, so it is claimed again later."""
-    monkeypatch.setattr(run, "LEASE", 0.5)
     store, stolen, baked = open_store(memory), [], []
 
     def bake(config, out, progress, episodes, devices=(), deliver=None):
@@ -142,19 +141,18 @@ def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, mon
             time.sleep(0.4)  # Longer than a heartbeat.
         return scripted_bake.bake_episodes(config, out, progress, episodes, devices, deliver)
 
-    work(memory, bake=bake)
+    work(memory, bake=bake, lease=0.5)
     assert len(baked) == EPISODES + 1
     assert stored(memory) == local
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # Its heartbeat dies, too.
 def test_a_dead_workers_chunk_is_done_by_another(memory, local, monkeypatch):
-    monkeypatch.setattr(run, "LEASE", 0.3)
     with monkeypatch.context() as patch:
         patch.setattr(run, "open_store", lambda url: MortalStore(open_store(url), 60))
         with pytest.raises(Killed):
-            work(memory)
-    work(memory)
+            work(memory, lease=0.3)
+    work(memory, lease=0.3)
     assert stored(memory) == local
 
 

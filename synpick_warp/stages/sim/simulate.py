@@ -11,6 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.codes import Phase
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
@@ -212,6 +213,12 @@ class Simulation:
         self.physics.clear_graphs()
         if self.perception is not None:
             self.perception.clear_graphs()
+
+    def restart(self, episodes: Sequence[int]) -> None:
+        """Have the worlds, which must all be idle, run another list of episodes, in order, from the next tick on."""
+        self.episodes = wp.array(np.asarray(episodes, np.int32), dtype=wp.int32, device=self.device)
+        self.state.next_episode.zero_()
+        self.state.phase.fill_(int(Phase.EMPTY))
 
     def _arrange(self) -> None:
         """Start episodes in free worlds: objects are sampled and dropped."""

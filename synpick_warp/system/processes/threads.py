@@ -15,10 +15,13 @@ PIXELS, COPIES, LINK, SETUP = "pixels", "copies", "bake link", "setup"
 ZARR_THREADS = {"async.concurrency": 1, "threading.max_workers": 1}
 """Configuration of zarr: one worker thread, as writer processes already run in parallel. Zarr names its pool's threads only if the
 pool size is set."""
-_HARMLESS = re.compile(rf"({PIXELS}|{COPIES}|{SETUP})_\d+|{LINK}|zarr_(io|pool_\d+)|QueueFeederThread")
-"""Names of threads that never launch kernels beside the caller: those above, zarr's event loop and pool, multiprocessing's queues."""
-_HARMLESS_PACKAGES = ("rich", "tqdm")
-"""Packages whose thread classes only refresh progress bars."""
+_HARMLESS = re.compile(
+    rf"({PIXELS}|{COPIES}|{SETUP})_\d+|{LINK}|(upload|deliver)_\d+|delivery|heartbeat|zarr_(io|pool_\d+)|QueueFeederThread"
+)
+"""Names of threads that never launch kernels beside the caller: those above, those of bakes into stores, zarr's event loop and pool,
+multiprocessing's queues."""
+_HARMLESS_PACKAGES = ("rich", "tqdm", "ray")
+"""Packages whose thread classes only refresh progress bars, or collect garbage."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")

@@ -1,0 +1,59 @@
+"""Bakes that follow one another in a process without a new start: objects, lights, worlds, renderer and captured graphs are kept."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
+from synpick_warp.factory.assembly import Factory, build_factory
+from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.order import order_longest_first
+from synpick_warp.factory.pipeline import bake_episodes
+from synpick_warp.system.progress import Progress
+
+
+def keeping_baker() -> Callable[..., BakeSummary]:
+    """A function like `pipeline.bake_episodes` that keeps the stages of one device from call to call, for workers that bake chunk after
+    chunk. Several devices have processes of their own, which keep nothing."""
+    return partial(bake_episodes, build=KeptStages())
+
+
+class KeptStages:
+    """Cache of one factory, a function like `assembly.build_factory`.
+
+    The factory is built anew for other settings, if worlds are chosen by the number of episodes and these are more than before, and if the
+    last bake did not come to its end.
+    """
+
+    def __init__(self) -> None:
+        self._factory: Factory | None = None
+        self._given: tuple[Any, ...] = ()
+        """What the factory was built from: settings, needs of the formats, order of the episodes."""
+        self._most = 0
+        """Number of episodes that it was built for."""
+
+    def __call__(self, config: Config, progress: Progress, episodes: Sequence[int], *needs: bool, longest_first: bool) -> Factory:
+        """Build the factory, or have the kept one begin other episodes; arguments and errors as of `assembly.build_factory`."""
+        given, factory = (config, needs, longest_first), self._factory
+        grown = not config.bake.worlds and len(episodes) > self._most
+        if factory is None or self._given != given or grown or not _has_ended(factory):
+            self._factory = factory = None
+            gc.collect()  # Frees its arrays before the memory for others is planned.
+            self._factory = build_factory(config, progress, episodes, *needs, longest_first=longest_first)
+            self._given, self._most = given, len(episodes)
+            return self._factory
+        if longest_first:
+            episodes = order_longest_first(factory.config, factory.catalog, episodes, factory.simulation.device)
+        factory.simulation.restart(episodes)
+        return replace(factory, log=factory.make_log())
+
+
+def _has_ended(factory: Factory) -> bool:
+    """Whether the last bake in a factory has ended: all worlds are idle, no views are in flight, and no state waits for trials."""
+    waits = factory.picks is not None and factory.picks.waits
+    return not (waits or factory.stream.in_flight) and bool((factory.simulation.state.phase.numpy() == Phase.IDLE).all())
