@@ -12,7 +12,7 @@ import pytest
 
 from synpick_warp.errors import StoreError
 from synpick_warp.system.inputs.urls import as_url
-from synpick_warp.system.stores import object_store
+from synpick_warp.system.stores import base, object_store
 from synpick_warp.system.stores.file_system import FileSystemStore
 from synpick_warp.system.stores.opening import Probe, open_store, probe
 
@@ -129,6 +129,30 @@ def test_a_transient_error_that_mentions_credentials_is_repeated(memory, monkeyp
     monkeypatch.setattr(store, "_obs", SimpleNamespace(put=put))
     store.put("key", b"data")
     assert faults == []
+
+
+@pytest.mark.parametrize("failures", [2, base.TRIES])
+def test_a_listing_that_fails_is_repeated_or_an_error_and_never_short(memory, monkeypatch, failures):
+    monkeypatch.setattr(base, "FIRST_PAUSE", 0.0)
+    store = open_store(memory)
+    real = store._obs.list
+    keys = [f"many/{number:04d}" for number in range(1_001)]
+    for key in keys:
+        store.put(key, b"")
+    pages = iter([0, *[1] * failures])  # The first page is read, and the second fails.
+
+    def listing(*arguments, **given):
+        """A stream of obstore, which after its error has ended."""
+        if next(pages, 0):
+            raise store._errors.GenericError("Server returned non-2xx status code: 500")
+        yield from real(*arguments, **given)
+
+    monkeypatch.setattr(store, "_obs", SimpleNamespace(list=listing))
+    if failures < base.TRIES:
+        assert [key for key, _ in store.list("many")] == keys
+    else:
+        with pytest.raises(StoreError, match="6 attempts failed"):
+            list(store.list("many"))
 
 
 def test_an_object_that_is_replaced_while_it_is_read_is_told(memory, monkeypatch):

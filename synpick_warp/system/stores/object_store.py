@@ -18,6 +18,8 @@ from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, p
 
 TIMEOUT = 60
 """Timeout of a request [s]."""
+PAGE = 1000
+"""Keys of a page of a listing: as many as S3 answers with."""
 _INSTALL = "install it by pip install 'synpick-warp[cloud]'"
 _ADVICE = (
     (
@@ -159,13 +161,17 @@ class ObjectStore:
             found = self._try(lambda: [each for chunk in self._obs.list(self._store, folder or None) for each in chunk], f"list {self.url}")
             yield from sorted((each["path"], each["size"]) for each in found if each["path"] > after and "#" not in each["path"])
             return
+
+        def read(after: str) -> Any:
+            """First page after a key. The stream is made for each attempt: one that has failed says that it is at its end."""
+            return next(iter(self._obs.list(self._store, folder or None, offset=after or None, chunk_size=PAGE)), None)
+
         while True:
-            pages = iter(self._obs.list(self._store, folder or None, offset=last or None, chunk_size=1000))
-            page = self._try(lambda pages=pages: next(pages, None), f"list {self.url}/{folder}")
-            if not page:
-                return
+            page = self._try(lambda after=last: read(after), f"list {self.url}/{folder}") or []
             for each in page:
                 yield each["path"], each["size"]
+            if len(page) < PAGE:
+                return
             last = page[-1]["path"]
 
     def delete(self, key: str) -> None:
