@@ -14,7 +14,7 @@ from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
-from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, join_lines, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -91,6 +91,7 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         for shard in shards:
             pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
-        lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
-        write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
-        return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
+        found = sorted(parts.iterdir(), key=shard_index)
+        write_atomically(out / split / KEYS_FILE, join_lines(found, b"{", b"}\n"))
+        views = sum(part.read_bytes().count(b"\n") for part in found)
+        return SplitContent(name, split.name, views, len(shards), sum(shard.stat().st_size for shard in shards))
