@@ -18,6 +18,8 @@ from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, p
 
 TIMEOUT = 60
 """Timeout of a request [s]."""
+PART_BYTES, PARTS_AT_ONCE = 16 << 20, 4
+"""Size of the parts in which larger files are uploaded [B], each a request that counts and costs, and parts of a file at a time."""
 PAGE = 1000
 """Keys of a page of a listing: as many as S3 answers with."""
 _INSTALL = "install it by pip install 'synpick-warp[cloud]'"
@@ -119,7 +121,7 @@ class ObjectStore:
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Store`."""
-        self._write(key, lambda: self._obs.put(self._store, key, path))
+        self._write(key, lambda: self._obs.put(self._store, key, path, chunk_size=PART_BYTES, max_concurrency=PARTS_AT_ONCE))
 
     def _write(self, key: str, request: Callable[[], object]) -> None:
         """Retry a request that writes an object; what it does not find is a StoreError."""

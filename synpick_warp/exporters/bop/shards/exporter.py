@@ -13,7 +13,15 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
-from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
+from synpick_warp.exporters.bop.shards.tar_files import (
+    commit_shards,
+    find_shards,
+    known_keys,
+    list_keys,
+    shard_index,
+    write_layer,
+    write_view,
+)
 from synpick_warp.exporters.writing.files import PARTIAL, join_lines, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -89,7 +97,10 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         parts.mkdir()
         shards = sorted(shard for scene in scenes for shard in find_shards(scene, out / split))
         for shard in shards:
-            pool.submit(list_keys, (), (shard, parts), path=shard)
+            if (known := known_keys(shard)).exists():
+                known.rename(parts / shard.name)
+            else:
+                pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
         found = sorted(parts.iterdir(), key=shard_index)
         write_atomically(out / split / KEYS_FILE, join_lines(found, b"{", b"}\n"))
