@@ -480,6 +480,10 @@ class DataSet(Mapping[int, Episode]):
     def __len__(self) -> int:
         return sum(1 for _ in self)
 
+    def length(self, index: int) -> int:
+        """Number of frames of an episode."""
+        return len(self[index])
+
     def __repr__(self) -> str:
         return f"DataSet({str(self.folder)!r}, {len(self)} episodes)"
 
