@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import itertools
 import threading
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 from uuid import uuid4
 
 import pytest
 
+from synpick_warp.cloud import run
 from synpick_warp.errors import StoreError
 from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores import base, object_store
 from synpick_warp.system.stores.file_system import FileSystemStore
 from synpick_warp.system.stores.opening import Probe, open_store, probe
+from tests.builders import mistake
+from tests.cloud.conftest import tiny
+from tests.cloud.mortal import stored
+from tests.harness import scripted_bake
 
 
 @pytest.fixture(params=["memory", "file", "s3", "fsspec"])
@@ -63,6 +70,30 @@ def test_the_probe_tells_conditional_writes(store):
     assert store.replace("claim", b"four", tag) is None
     assert store.get("claim") == b"three"
     assert store.get_tagged("none") is None
+
+
+def test_a_second_server_without_compare_and_swap_is_told_and_takes_shares(tmp_path, monkeypatch, local):
+    """It creates if absent and ignores If-Match."""
+    bucket = pytest.importorskip("localbucket")
+    monkeypatch.setattr(bucket.S3Handler, "data_root", tmp_path, raising=False)
+    monkeypatch.setattr(bucket.S3Handler, "disable_nagle_algorithm", True)
+    (tmp_path / "bucket").mkdir()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), bucket.S3Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    given = {"ACCESS_KEY_ID": "key", "SECRET_ACCESS_KEY": "secret", "REGION": "us-east-1"}
+    for name, value in (given | {"ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}"}).items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    url = "s3://bucket/set"
+    store = open_store(url)
+    assert (store.create(".store/k", b"one") is None, store.create(".store/k", b"two")) == (False, None)
+    assert store.replace(".store/k", b"three", ' "another"') is not None
+    said = mistake("bake", "--config", "smoke", "--out", url, "--claim", "--device", "cpu")
+    assert "has no conditional writes, which --claim needs" in said
+    for share in range(2):
+        run.bake_into_store(tiny(), url, SilentProgress(), shard=(share, 2), bake=scripted_bake.bake_episodes)
+    assert stored(url) == local
+    server.shutdown()
+    server.server_close()
 
 
 def test_of_many_that_create_one_wins(memory):

@@ -51,7 +51,7 @@ _PASSING = (
     "error decoding",
 )
 """Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
-_LASTING = ("status code: 401", "status code: 403", "status code: 404", "169.254.169.254")
+_LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
 
 _Result = TypeVar("_Result")

@@ -13,8 +13,10 @@ from tools.figures import finish_report
 from tools.options import Row, make_parser, number_in, positive_count
 from tools.reports.store.model import Limits, Machine, Outcome, Simulation, measured_machine
 
-INDICES = {"bop": 0.085, "shards": 0.045}
-"""Time of the indices for an episode of 3 cameras and 504 frames, measured on one of 2 cores [s] (tools/results/store_indices.json)."""
+INDICES = 0.0042
+"""Time of the indices for an episode of shards, 3 cameras and 504 frames [s] (tools/results/store_indices.json)."""
+VARIANTS = ((512, 1, 0), (4096, 64, 128))
+"""Columns besides: GPUs, partitions of the prefix, episodes of a chunk (0: that of a bake)."""
 
 
 def describe(part: str, out: Outcome, machine: Machine, limits: Limits) -> Iterator[Row]:
@@ -30,7 +32,7 @@ def describe(part: str, out: Outcome, machine: Machine, limits: Limits) -> Itera
     yield Row("answers 503", 1e-6 * out.refused, "million", part=part)
     yield Row("cost: GPUs", gpus, "USD", part=part)
     yield Row("cost: requests", requests, "USD", part=part)
-    yield Row("finalization, one core", out.finalization / 3600.0, "h", part=part)
+    yield Row("finalization", out.finalization / 3600.0, "h", part=part)
 
 
 def main() -> int:
@@ -47,12 +49,13 @@ def main() -> int:
             "chunk": {"type": positive_count, "default": 0, "help": "episodes of a whole chunk (default: that of a bake)"},
         },
     ).parse_args()
-    machine, limits = measured_machine()._replace(losses=options.losses), Limits(partitions=options.partitions)
-    rows: list[Row] = []
-    for workers in options.workers:
-        simulation = Simulation(workers, options.episodes, machine, limits, chunk=options.chunk, finalization=INDICES["shards"])
-        rows += describe(f"{workers:,} GPUs", simulation.run(), machine, limits)
-    assumed = {"machine": machine._asdict(), "store": limits._asdict()}
+    machine, rows = measured_machine()._replace(losses=options.losses), list[Row]()
+    for workers, partitions, chunk in (*((workers, options.partitions, options.chunk) for workers in options.workers), *VARIANTS):
+        limits = Limits(partitions=partitions)
+        simulation = Simulation(workers, options.episodes, machine, limits, chunk=chunk, finalization=INDICES)
+        part = f"{workers:,} GPUs" + ", one partition" * (partitions == 1) + f", chunks of {chunk}" * bool(chunk)
+        rows += describe(part, simulation.run(), machine, limits)
+    assumed = {"machine": machine._asdict(), "store": Limits(partitions=options.partitions)._asdict()}
     return finish_report("tools.reports.store", options.json, pick_device("cpu"), "", "bakes into a store", rows, assumed=assumed)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,7 +19,6 @@ from synpick_warp.exporters.bop.shards.tar_files import (
     find_shards,
     known_keys,
     list_keys,
-    shard_index,
     write_layer,
     write_view,
 )
@@ -95,14 +95,15 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
-        shards = sorted(shard for scene in scenes for shard in find_shards(scene, out / split))
-        for shard in shards:
+        shards, size = 0, 0
+        for shard in (shard for scene in scenes for shard in find_shards(scene, out / split)):
+            shards, size = shards + 1, size + shard.stat().st_size
             if (known := known_keys(shard)).exists():
                 known.rename(parts / shard.name)
             else:
                 pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
-        found = sorted(parts.iterdir(), key=shard_index)
-        write_atomically(out / split / KEYS_FILE, join_lines(found, b"{", b"}\n"))
-        views = sum(part.read_bytes().count(b"\n") for part in found)
-        return SplitContent(name, split.name, views, len(shards), sum(shard.stat().st_size for shard in shards))
+        names = sorted(os.listdir(parts), key=lambda part: (len(part), part))
+        write_atomically(out / split / KEYS_FILE, join_lines((parts / part for part in names), b"{", b"}\n"))
+        views = sum((parts / part).read_bytes().count(b"\n") for part in names)
+        return SplitContent(name, split.name, views, shards, size)
