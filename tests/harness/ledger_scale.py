@@ -14,6 +14,7 @@ import sys
 import tarfile
 import tempfile
 import time
+import tracemalloc
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,14 +84,22 @@ def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
 def measure_resume(episodes: int) -> Iterator[Row]:
     """Find the remaining episodes of a set of which so many are done."""
     store, part, counts = open_with_marks(episodes, make=False), f"{episodes:,} episodes", Counter[str]()
-    real, before = store._obs.list, peak()  # type: ignore[attr-defined]
-    with mock.patch.object(store._obs, "list", lambda *given, **named: counts.update(["list"]) or real(*given, **named)):  # type: ignore[attr-defined]
+    real = store._obs.list  # type: ignore[attr-defined]
+
+    def resume() -> float:
         started = time.perf_counter()
-        left = sum(map(len, Ledger(store, tiny(episodes + LEFT, ("shards",)), Probe(0.0, True)).remaining([range(episodes + LEFT)])))
-        assert left == LEFT
-        yield Row("resume", time.perf_counter() - started, "s", part=part)
-    yield Row("resume: requests", counts["list"], part=part)
-    yield Row("resume: peak memory", peak() - before, "MB", part=part)
+        ledger = Ledger(store, tiny(episodes + LEFT, ("shards",)), Probe(0.0, True))
+        if sum(map(len, ledger.remaining([range(episodes + LEFT)]))) != LEFT:
+            raise RuntimeError("the wrong episodes are left")
+        return time.perf_counter() - started
+
+    with mock.patch.object(store._obs, "list", lambda *given, **named: counts.update(["list"]) or real(*given, **named)):  # type: ignore[attr-defined]
+        yield Row("resume", resume(), "s", part=part)
+    yield Row("resume: listings", counts["list"], part=part)
+    tracemalloc.start()
+    resume()
+    yield Row("resume: peak memory", 1e-6 * tracemalloc.get_traced_memory()[1], "MB", part=part)
+    tracemalloc.stop()
 
 
 def measure_finalization(episodes: int) -> Iterator[Row]:

@@ -13,7 +13,7 @@ from tools.figures import finish_report
 from tools.options import Row, make_parser, number_in, positive_count
 from tools.reports.store.model import Limits, Machine, Outcome, Simulation, measured_machine
 
-INDICES = 0.0042
+INDICES = 0.0040
 """Time of the indices for an episode of shards, 3 cameras and 504 frames [s] (tools/results/store_indices.json)."""
 VARIANTS = ((512, 1, 0), (4096, 64, 128))
 """Columns besides: GPUs, partitions of the prefix, episodes of a chunk (0: that of a bake)."""
@@ -53,7 +53,7 @@ def main() -> int:
     for workers, partitions, chunk in (*((workers, options.partitions, options.chunk) for workers in options.workers), *VARIANTS):
         limits = Limits(partitions=partitions)
         simulation = Simulation(workers, options.episodes, machine, limits, chunk=chunk, finalization=INDICES)
-        part = f"{workers:,} GPUs" + ", one partition" * (partitions == 1) + f", chunks of {chunk}" * bool(chunk)
+        part = f"{workers:,} GPU{'s' * (workers > 1)}" + ", one partition" * (partitions == 1) + f", chunks of {chunk}" * bool(chunk)
         rows += describe(part, simulation.run(), machine, limits)
     assumed = {"machine": machine._asdict(), "store": Limits(partitions=options.partitions)._asdict()}
     return finish_report("tools.reports.store", options.json, pick_device("cpu"), "", "bakes into a store", rows, assumed=assumed)
