@@ -1,7 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
 configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
-tools/README.md and the READMEs of tools/reports/real and tools/reports/sensor: the figures in tools/results.
+tools/README.md and the READMEs of tools/reports/real, sensor and store: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -35,6 +35,7 @@ VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
 SENSOR = ROOT / "tools" / "reports" / "sensor" / "README.md"
+STORE = ROOT / "tools" / "reports" / "store" / "README.md"
 _SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
@@ -117,6 +118,12 @@ def sensor_reference() -> str:
     return _with_results(SENSOR, {name: pivot_table(runs[f"sensor_{name}.json"]) for name in ("cross_validation", "annotation")})
 
 
+def store_reference() -> str:
+    """The README of the report on stores with its tables of figures; the rest is as committed."""
+    runs = newest_runs(read_runs())
+    return _with_results(STORE, {name: pivot_table(runs[f"store_{name}.json"]) for name in ("scale", "requests", "indices", "reading")})
+
+
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     table = figures_tables(read_runs())["photographs"].replace("](results/", "](../../results/")
@@ -135,6 +142,7 @@ REFERENCES: dict[Path, Callable[[], str]] = {
     FIGURES: figures_reference,
     PHOTOGRAPHS: photographs_reference,
     SENSOR: sensor_reference,
+    STORE: store_reference,
 }
 """File -> its content with generated tables."""
 

@@ -1,6 +1,6 @@
 """Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode, and their concatenation per block.
 
-A shard is reduced to its skeleton, the tar headers with their offsets, which unpacks to a sparse file with the same members and sizes.
+A shard is reduced to its size and its lines in the index of its split, which its worker makes: the last worker only joins them.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from typing import BinaryIO
 
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
 from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.bop.shards.tar_files import key_lines, known_keys
 from synpick_warp.system.inputs.paths import path_inside
-from synpick_warp.system.inputs.tar_files import list_members
 
-SKELETON = "skeleton/"
-"""Prefix of the names of skeletons in an index file."""
+SIZE, KEYS = "size/", "keys/"
+"""Prefixes of the names of shards in an index file, of which it has the size and the `key_lines`."""
 MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""
-_PLACE = struct.Struct("<Q")
-"""In a skeleton: size of the shard [B], then before each header its offset [B]."""
+_SIZE = struct.Struct("<Q")
+"""Size of a shard [B]."""
 _LENGTH = struct.Struct("<Q")
 """In a block: length prefix of each index file [B]."""
 
@@ -44,7 +44,8 @@ def make_bundle(folder: Path, episode: int, indexed: re.Pattern[str]) -> bytes:
         _add(archive, f"{entry}.json", (folder / f"{entry}.json").read_bytes())
         for name in filter(indexed.fullmatch, read_checksums(folder, entry)):
             if name.endswith(".tar"):
-                _add(archive, SKELETON + name, _skeleton(folder / name))
+                _add(archive, SIZE + name, _SIZE.pack((folder / name).stat().st_size))
+                _add(archive, KEYS + name, key_lines(folder / name))
             else:
                 _add(archive, name, (folder / name).read_bytes())
     return gzip.compress(packed.getvalue(), 6, mtime=0)
@@ -57,24 +58,13 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     archive.addfile(info, io.BytesIO(data))
 
 
-def _skeleton(shard: Path) -> bytes:
-    """Skeleton of a shard: size of the tar file, then offset and bytes of each header."""
-    parts = [_PLACE.pack(shard.stat().st_size)]
-    with shard.open("rb") as file:
-        for _, start, _ in list_members(shard):
-            file.seek(start - tarfile.BLOCKSIZE)
-            parts += [_PLACE.pack(start - tarfile.BLOCKSIZE), file.read(tarfile.BLOCKSIZE)]
-    return b"".join(parts)
-
-
-def _grow(skeleton: bytes, path: Path) -> None:
-    """Restore a skeleton as a sparse tar file, with holes in place of the content."""
-    step = _PLACE.size + tarfile.BLOCKSIZE
-    with path.open("wb") as file:
-        file.truncate(_PLACE.unpack_from(skeleton)[0])
-        for start in range(_PLACE.size, len(skeleton), step):
-            file.seek(_PLACE.unpack_from(skeleton, start)[0])
-            file.write(skeleton[start + _PLACE.size : start + step])
+def _restore(name: str, data: bytes, path: Path) -> None:
+    """Restore a member of an index file: a shard as a hole of its size, others as they are."""
+    if name.startswith(SIZE):
+        with path.open("wb") as file:
+            file.truncate(_SIZE.unpack(data)[0])
+    else:
+        (known_keys(path) if name.startswith(KEYS) else path).write_bytes(data)
 
 
 def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: str) -> None:
@@ -91,13 +81,13 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
             raise DatasetError(f"{source} is damaged: it is cut off or too large; delete it and its block's mark, and resume the bake")
         with tarfile.open(fileobj=io.BytesIO(plain), mode="r:") as archive:
             for info in archive:
-                name = info.name.removeprefix(SKELETON)
+                name = info.name.removeprefix(SIZE).removeprefix(KEYS)
                 content = archive.extractfile(info)
                 if content is None or not (indexed.fullmatch(name) or re.fullmatch(r"manifest/[0-9]{6,12}\.json", name)):
                     raise DatasetError(f"{source} is damaged: it has {name[:80]!r}; delete it and its block's mark, and resume the bake")
                 path = path_inside(folder, name, source, DatasetError)
                 path.parent.mkdir(parents=True, exist_ok=True)
-                _grow(content.read(), path) if info.name != name else path.write_bytes(content.read())
+                _restore(info.name, content.read(), path)
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     except (zlib.error, tarfile.TarError, struct.error, OverflowError, ValueError, RecursionError) as error:

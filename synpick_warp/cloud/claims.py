@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import os
+import random
 import socket
 import threading
 import time
@@ -29,8 +31,10 @@ BEATS = 4
 """Heartbeats per lease time."""
 MARGIN = 0.1
 """Safety margin: last part of a lease in which its owner takes it for lost."""
-MAX_WAIT = 10.0
-"""Limit of the polling interval of a worker that waits for others [s]."""
+FIRST_WAIT = 0.5
+"""Back-off of a worker that waits for others: pause before it looks again, doubled up to the interval of heartbeats [s]."""
+CHECKS = 8
+"""Leases that a worker tries to take after each listing: thousands of workers that wait then ask for less than the store answers."""
 CHUNK_WORLDS = 2
 """Default size of a whole chunk [episodes per world]: keeps all worlds busy for longer than it takes to start them."""
 AUTO_WORLDS = 256
@@ -118,6 +122,8 @@ class Claims:
             lease: Time to live of a lease without heartbeat [s].
         """
         self.store, self.offset, self.lease = store, offset, lease
+        self.seen: dict[str, float] = {}
+        """When leases of other workers will expire, as of their last look, by key [s since 1970, by the store's clock]."""
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
 
     def take(self, key: str) -> Claim | None:
@@ -131,7 +137,8 @@ class Claims:
                 return None
             if found[0] == data:  # Created by an attempt of ours whose answer was lost.
                 tag = found[1]
-            elif _read(found[0]).until > time.time() + self.offset:
+            elif (ends := _read(found[0]).until) > time.time() + self.offset:
+                self.seen[key] = ends
                 return None
             else:
                 tag = store.replace(key, data, found[1])
@@ -209,29 +216,42 @@ class Chunks:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
+        count, pause = sum(1 for _ in self.sizes.bounds()), 0.0
         while True:
-            found = False
-            over = self._over()
-            for number, (start, end) in self._order():
-                if number in over:
-                    continue
-                claim = self._claims.take(f"{self._place}/{number:06d}")
-                if claim is None:
-                    continue
-                try:
-                    episodes = self._left(start, end)
-                except BaseException:
-                    claim.stop()  # Its heartbeat would outlive the error, and keep others from the chunk.
-                    raise
-                found = True
-                if episodes:
-                    yield Chunk(number, episodes, claim)
-                else:
-                    self.done(Chunk(number, [], claim))
-            if not found:
-                if len(self._over()) >= sum(1 for _ in self.sizes.bounds()):
-                    return
-                time.sleep(min(self._claims.lease / BEATS, MAX_WAIT))
+            over, leased = self._state()
+            if len(over) >= count:
+                return
+            chunk = self._take_first([each for each in self._order() if each[0] not in over], leased)
+            if chunk is None:
+                pause = min(2.0 * pause or FIRST_WAIT, self._claims.lease / BEATS)
+                time.sleep(pause * random.uniform(0.5, 1.0))
+                continue
+            pause = 0.0
+            if chunk.episodes:
+                yield chunk
+            else:
+                self.done(chunk)
+
+    def _take_first(self, open_chunks: Sequence[tuple[int, tuple[int, int]]], leased: set[int]) -> Chunk | None:
+        """Claim the first of these chunks that is free, by its lease's absence or age; None: none is, or other workers were faster.
+
+        Args:
+            open_chunks: Number and bounds of the chunks without end mark.
+            leased: Numbers of those that had a lease when they were listed. Of those that are not known to last, CHECKS are looked at.
+        """
+        now, seen = time.time() + self._claims.offset, self._claims.seen
+        free = [each for each in open_chunks if each[0] not in leased]
+        held = [each for each in open_chunks if each[0] in leased and seen.get(self._key(each[0]), 0.0) <= now]
+        for number, (start, end) in free[:CHECKS] or random.sample(held, min(CHECKS, len(held))):
+            claim = self._claims.take(self._key(number))
+            if claim is None:
+                continue
+            try:
+                return Chunk(number, self._left(start, end), claim)
+            except BaseException:
+                claim.stop()  # Its heartbeat would outlive the error, and keep others from the chunk.
+                raise
+        return None
 
     def done(self, chunk: Chunk) -> None:
         """Write the end mark of a chunk whose episodes all have done marks, and end its claim, also after an error."""
@@ -242,22 +262,31 @@ class Chunks:
 
     def count_over(self) -> int:
         """Number of episodes in the chunks that have end marks."""
-        over = self._over()
+        over, _ = self._state()
         return sum(end - start for number, (start, end) in enumerate(self.sizes.bounds()) if number in over)
 
-    def _over(self) -> set[int]:
-        """Numbers of the chunks that have end marks."""
-        place = f"{self._place}/done"
-        names = (key.rpartition("/")[2] for key, _ in self._ledger.store.list(place))
-        return {int(name) for name in names if name.isdecimal()}
+    def _key(self, number: int) -> str:
+        """Key of a chunk's lease."""
+        return f"{self._place}/{number:06d}"
+
+    def _state(self) -> tuple[set[int], set[int]]:
+        """List the chunks that have end marks, and those that have leases, by their numbers."""
+        over, leased = set[int](), set[int]()
+        for key, _ in self._ledger.store.list(self._place):
+            folder, _, name = key.rpartition("/")
+            if name.isdecimal():
+                (leased if folder == self._place else over).add(int(name))
+        return over, leased
 
     def _order(self) -> Iterator[tuple[int, tuple[int, int]]]:
-        """Order in which this worker tries the chunks, as (number, bounds): whole ones cyclically from a hash of the worker's name, so that
-        few workers collide, then the smaller ones."""
-        bounds = list(enumerate(self.sizes.bounds()))
-        count = sum(1 for _, (start, end) in bounds if end - start == self.sizes.chunk) or len(bounds)
-        first = int(hashlib.sha256(self._claims.owner.encode()).hexdigest(), 16) % count
-        return iter([*bounds[first:count], *bounds[:first], *bounds[count:]])
+        """Order in which this worker tries the chunks, as (number, bounds): the larger before the smaller; those of a size cyclically from
+        a hash of the worker's name, so that few workers collide."""
+        first = int(hashlib.sha256(self._claims.owner.encode()).hexdigest(), 16)
+        for _, group in itertools.groupby(enumerate(self.sizes.bounds()), lambda each: each[1][1] - each[1][0]):
+            chunks = list(group)
+            turn = first % len(chunks)
+            yield from chunks[turn:]
+            yield from chunks[:turn]
 
     def _left(self, start: int, end: int) -> list[int]:
         """Episodes of a chunk that have no done mark, sorted; arguments: its bounds in the plan."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from synpick_warp.cloud.bundles import join_bundles, split_bundles, unpack_bundle
-from synpick_warp.cloud.delivery import send_file
+from synpick_warp.cloud.delivery import FILES_AT_ONCE, send_file
 from synpick_warp.cloud.ledger import DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
@@ -28,31 +30,48 @@ from synpick_warp.factory.sizes import count_writers
 from synpick_warp.system.folders import make_folder
 
 
-def close_blocks(ledger: Ledger, folder: Path) -> int:
+def close_blocks(ledger: Ledger, folder: Path, only: Sequence[int] | None = None) -> int:
     """Compact complete blocks: writes batched marks of each block whose episodes all have done marks, of those that are in none.
 
     Args:
         ledger: Ledger of the data set.
         folder: Folder for a temporary file of a block.
+        only: Blocks to look at; None: all.
 
     Returns:
-        Number of planned episodes without done mark.
+        Number of planned episodes without done mark, in these blocks.
 
     Raises:
-        FileNotFoundError: An index file was deleted.
+        OutputError: The temporary folder cannot be written.
+        StoreError: An index file was deleted.
     """
     missing = 0
-    for block, unmarked in ledger.open_blocks():
-        if left := len(set(unmarked) - ledger.done(block)):
-            missing += left
-            continue
-        path, spans = folder / "block", merge_spans(range(episode, episode + 1) for episode in unmarked)
-        for start in range(0, len(spans), MARK_SPANS):
-            marked = spans[start : start + MARK_SPANS]
-            with path.open("wb") as file:
-                join_bundles((ledger.store.get(f"{INDEX}/{episode:06d}.tar.gz") for span in marked for episode in span), file)
-            ledger.store.put_file(f"{DONE}/{block:06d}_{spell_spans(marked)}", path)
+    with _clear_errors(ledger, folder):
+        for block, unmarked in ledger.open_blocks(only):
+            if left := len(set(unmarked) - ledger.done(block)):
+                missing += left
+                continue
+            path, spans = folder / "block", merge_spans(range(episode, episode + 1) for episode in unmarked)
+            for start in range(0, len(spans), MARK_SPANS):
+                marked = spans[start : start + MARK_SPANS]
+                names = [f"{INDEX}/{episode:06d}.tar.gz" for span in marked for episode in span]
+                with path.open("wb") as file, ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:
+                    join_bundles(pool.map(ledger.store.get, names), file)
+                ledger.store.put_file(f"{DONE}/{block:06d}_{spell_spans(marked)}", path)
     return missing
+
+
+@contextlib.contextmanager
+def _clear_errors(ledger: Ledger, folder: Path) -> Iterator[None]:
+    """Convert errors of missing objects to StoreError, and those of the temporary folder to OutputError."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        said = (str(error).splitlines() or ["an object"])[0]
+        advice = "restore it, or delete the done mark of its episode, manifest/NUMBER.json, and resume the bake without --claim"
+        raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
 
 
 def finalize_store(ledger: Ledger, folder: Path) -> int:
@@ -72,20 +91,14 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
     """
     if ledger.finished():
         return 0
-    try:
-        if missing := close_blocks(ledger, folder):
-            return missing
-        work = folder / "set"
+    if missing := close_blocks(ledger, folder):
+        return missing
+    work = folder / "set"
+    with _clear_errors(ledger, folder):
         _gather(ledger, work)
         needs = Needs.of(ledger.config)
         with WriterPool(count_writers(ledger.config.bake.writers, needs.slot_bytes), needs.slot_bytes) as pool:
             finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool)
-    except FileNotFoundError as error:
-        said = (str(error).splitlines() or ["an object"])[0]
-        advice = "restore it, or delete the done mark of its episode, manifest/NUMBER.json, and resume the bake without --claim"
-        raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     if not ledger.finished():  # Else another bake of these episodes, or of more, has ended meanwhile.
         _put_indices(ledger, work)
     return 0

@@ -133,10 +133,10 @@ class Ledger:
                     last = block
                     yield block
 
-    def open_blocks(self) -> Iterator[tuple[int, list[int]]]:
-        """Yield the blocks that have planned episodes in none of their batched marks, ascending, with these episodes, sorted."""
+    def open_blocks(self, only: Iterable[int] | None = None) -> Iterator[tuple[int, list[int]]]:
+        """Yield the blocks (None: out of all) that have planned episodes in none of their batched marks, with these episodes, sorted."""
         marks = self.marks()
-        for block in self.blocks():
+        for block in self.blocks() if only is None else only:
             if left := sorted(set(self.planned(block)).difference(*(span for spans in marks.get(block, {}).values() for span in spans))):
                 yield block, left
 

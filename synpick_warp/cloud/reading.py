@@ -24,6 +24,7 @@ from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
     CONSTANTS,
     ENTRIES,
+    EPISODES_FILE,
     INDICES,
     MANIFEST_FILE,
     episode_entry,
@@ -277,14 +278,20 @@ class StoreDataSet(DataSet):
     def __iter__(self) -> Iterator[int]:
         """Iterate over the committed episodes in the order of their keys, without those known to be given up, which have no files."""
         found = (index for index in self._cache.copier.episodes() if self._only is None or index in self._only)
-        return (index for index in found if index not in self._given_up)
+        return (index for index in found if self._frames.get(index, 1))
+
+    def length(self, index: int) -> int:
+        """See `DataSet`: by the list of episodes, without a download, if it has the episode."""
+        return self._frames[index] if index in self._frames else super().length(index)
 
     @cached_property
-    def _given_up(self) -> frozenset[int]:
-        """Episodes without frames, by the list of episodes; empty while there is no such list."""
-        path = self.folder / "episodes.jsonl"
-        rows: list[dict[str, Any]] = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        return frozenset(row["episode"] for row in rows if not row["frames"])
+    def _frames(self) -> dict[int, int]:
+        """Number of frames of each episode, 0 if it was given up, by the list of episodes; empty while there is no such list."""
+        path = self.folder / EPISODES_FILE
+        if not path.exists():
+            return {}
+        with path.open() as file:
+            return {row["episode"]: row["frames"] for row in map(json.loads, file)}
 
 
 def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = None) -> DataSet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import shutil
 import tempfile
 import time
@@ -9,9 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, MAX_WAIT, Chunks, Claims, LeaseLostError, default_chunk
+from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, Chunks, Claims, LeaseLostError, default_chunk
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
-from synpick_warp.cloud.finish import finalize_store
+from synpick_warp.cloud.finish import close_blocks, finalize_store
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
@@ -137,7 +138,7 @@ def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
                 return finalize_store(ledger, place)
             finally:
                 claim.release()
-        time.sleep(min(claims.lease / BEATS, MAX_WAIT))
+        time.sleep(claims.lease / BEATS * random.uniform(0.5, 1.0))
     return 0
 
 
@@ -169,7 +170,10 @@ def _bake_chunk(
     try:
         with Delivery(ledger, folder, permit) as delivery:
             watched = WatchedProgress(progress, delivery.check)
-            return bake(ledger.config, folder, watched, episodes, devices, delivery.finish)
+            summary = bake(ledger.config, folder, watched, episodes, devices, delivery.finish)
+        if not summary.stopped:  # So that the last worker does not read the index files of all episodes, one after the other.
+            close_blocks(ledger, place, ledger.blocks_of(episodes))
+        return summary
     except (StoreError, LeaseLostError):
         raise
     except SynpickError as error:

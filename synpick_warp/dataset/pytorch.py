@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from synpick_warp.dataset.grasp_maps import candidates, find_pixels, mean_by_candidate
-from synpick_warp.dataset.reading import open_data_set
+from synpick_warp.dataset.reading import DataSet, open_data_set
 from synpick_warp.errors import DatasetError
 
 if TYPE_CHECKING:
-    from synpick_warp.dataset.reading import DataSet, Episode
+    from synpick_warp.dataset.reading import Episode
     from synpick_warp.dataset.view import View
 
 Sample = dict[str, Any]
@@ -66,7 +66,7 @@ class Views:
 
     def __init__(
         self,
-        folder: Path | str,
+        source: Path | str | DataSet,
         *,
         split: str = "",
         cameras: Sequence[int] | None = None,
@@ -77,7 +77,8 @@ class Views:
     ) -> None:
         """
         Args:
-            folder: Folder of the data set.
+            source: Folder of the data set, or an open one. `synpick_warp.open("s3://bucket/prefix")` downloads an episode when a view of
+                it is asked for; its DataLoader needs `multiprocessing_context="spawn"`.
             split: Name of a split; empty: all episodes.
             cameras: Indices of the cameras; None: all.
             stride: Every n-th frame of an episode, from the first on.
@@ -88,12 +89,12 @@ class Views:
         Raises:
             DatasetError: There is no such data set, split or camera, or a value is out of range.
         """
-        self.folder, self.fields, self.min_visibility, self.transform = Path(folder), tuple(fields), min_visibility, transform
-        whole = open_data_set(folder)
+        self.source, self.fields, self.min_visibility, self.transform = source, tuple(fields), min_visibility, transform
+        whole = self._open()
         data = whole.split(split) if split else whole
         self.cameras = tuple(range(data.camera_count) if cameras is None else cameras)
         if not set(self.cameras) <= set(range(data.camera_count)):
-            raise DatasetError(f"cameras {list(self.cameras)}: {folder} has the cameras 0 to {data.camera_count - 1}")
+            raise DatasetError(f"cameras {list(self.cameras)}: {whole.folder} has the cameras 0 to {data.camera_count - 1}")
         if stride < 1:
             raise DatasetError(f"stride {stride}: at least 1")
         self.stride = stride
@@ -101,7 +102,7 @@ class Views:
         for each in self.cameras if self.episodes else ():
             if stride % (every := data[self.episodes[0]].frames(each).step):
                 raise DatasetError(f"camera {each} has a picture every {every} frames; give a stride of {every}, or cameras without it")
-        counts = [len(self.cameras) * -(-len(data[episode]) // stride) for episode in self.episodes]
+        counts = [len(self.cameras) * -(-data.length(episode) // stride) for episode in self.episodes]
         self._ends = np.cumsum(counts, dtype=np.int64)
         self._data: DataSet | None = None
         self._opened: OrderedDict[int, Episode] = OrderedDict()
@@ -116,10 +117,14 @@ class Views:
         frame, camera = divmod(index - int(self._ends[row - 1] if row else 0), len(self.cameras))
         return self._episode(self.episodes[row]).view(frame * self.stride, self.cameras[camera])
 
+    def _open(self) -> DataSet:
+        """The data set, opened if it is named by its folder."""
+        return self.source if isinstance(self.source, DataSet) else open_data_set(self.source)
+
     def _episode(self, index: int) -> Episode:
         """An episode, opened once while it is among those used last."""
         if index not in self._opened:
-            self._data = self._data or open_data_set(self.folder)
+            self._data = self._data or self._open()
             self._opened[index] = self._data[index]
             if len(self._opened) > _OPEN_EPISODES:
                 self._opened.popitem(last=False)
@@ -144,7 +149,7 @@ class Views:
         return self.__dict__ | {"_data": None, "_opened": OrderedDict()}
 
     def __repr__(self) -> str:
-        return f"Views({str(self.folder)!r}, {len(self)} views of {len(self.episodes)} episodes)"
+        return f"Views({str(self.source)!r}, {len(self)} views of {len(self.episodes)} episodes)"
 
 
 def collate(samples: Sequence[Sample]) -> dict[str, Any]:

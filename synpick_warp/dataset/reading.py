@@ -237,8 +237,7 @@ class DataSet(Mapping[int, Episode]):
         """
         self.folder = folder
         self._store = folder / STORE
-        self._only = episodes
-        self._found_split = split
+        self._only, self._found_split = episodes, split
 
     @cached_property
     def found(self) -> FoundScenes | None:
@@ -386,8 +385,7 @@ class DataSet(Mapping[int, Episode]):
 
     def views(self, camera: int | None = None) -> Iterator[View]:
         """Iterate over the views of all episodes, of one camera or of all."""
-        for episode in self.values():
-            yield from episode.views(camera)
+        return (view for episode in self.values() for view in episode.views(camera))
 
     @property
     def has_store(self) -> bool:
@@ -470,15 +468,19 @@ class DataSet(Mapping[int, Episode]):
         return self.found is not None or not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 
     def __getitem__(self, index: int) -> Episode:
-        if not (self._is_committed(index) and self._has_files(index)):
-            raise KeyError(f"{self.folder} has no episode {index}")
-        return Episode(self, index)
+        if self._is_committed(index) and self._has_files(index):
+            return Episode(self, index)
+        raise KeyError(f"{self.folder} has no episode {index}")
 
     def __iter__(self) -> Iterator[int]:
         return iter(sorted(index for index in set(self._names()) if self._is_committed(index)))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
+
+    def length(self, index: int) -> int:
+        """Number of frames of an episode."""
+        return len(self[index])
 
     def __repr__(self) -> str:
         return f"DataSet({str(self.folder)!r}, {len(self)} episodes)"

@@ -10,9 +10,10 @@ import sys
 import threading
 import time
 
+import msgspec
 import pytest
 
-from synpick_warp.cloud import finish, run
+from synpick_warp.cloud import claims, finish, run
 from synpick_warp.cloud.claims import Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.errors import StoreError
@@ -96,6 +97,35 @@ def test_a_heartbeat_that_failed_after_it_was_written_loses_nothing(memory, monk
     time.sleep(0.6)
     claim.check()
     claim.stop()
+
+
+def test_a_worker_without_work_asks_little_and_each_lease_once(memory, monkeypatch):
+    """Of 1,500 chunks that others have: two pages of a listing and CHECKS leases a look, none twice before it may run out."""
+    store, asked = open_store(memory), []
+    others = Claims(store, 0.0)
+    ledger = Ledger(store, tiny(1_500), Probe(0.0, True))
+    chunks = Chunks(ledger, Claims(store, 0.0), [range(1_500)], 1)
+    for number, _ in enumerate(chunks.sizes.bounds()):
+        store.put(chunks._key(number), msgspec.json.encode(claims._Lease(others.owner, time.time() + 100.0)))
+    monkeypatch.setattr(store, "create", lambda key, data, real=store.create: asked.append(key) or real(key, data))
+    monkeypatch.setattr(store._obs, "list", lambda *a, real=store._obs.list, **given: asked.append("list") or real(*a, **given))
+    pauses = iter(range(3))
+    monkeypatch.setattr(claims.time, "sleep", lambda seconds: next(pauses))
+    with pytest.raises(RuntimeError):  # Of the iterator, when the pauses end.
+        next(iter(chunks))
+    assert asked.count("list") == 4 * 2
+    assert len(set(asked) - {"list"}) == len(asked) - 8 == 4 * claims.CHECKS
+
+
+def test_workers_try_different_chunks_of_each_size_first(memory):
+    """So that thousands that start at once, or end together, rarely collide."""
+    store = open_store(memory)
+    plans = [Chunks(Ledger(store, tiny(64), Probe(0.0, True)), Claims(store, 0.0), [range(64)], 8) for _ in range(16)]
+    orders = [list(each._order()) for each in plans]
+    assert all(sorted(order) == list(enumerate(plans[0].sizes.bounds())) for order in orders)
+    assert all(sizes == sorted(sizes, reverse=True) for sizes in ([end - start for _, (start, end) in order] for order in orders))
+    assert len({order[0] for order in orders}) > 2
+    assert len({order[-1] for order in orders}) > 2
 
 
 def test_an_error_ends_the_heartbeat_of_a_chunk(memory, monkeypatch):

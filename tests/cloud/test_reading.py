@@ -12,6 +12,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cloud import reading
+from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError, StoreError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import open_store
@@ -55,6 +56,20 @@ def test_views_are_those_on_disk_and_the_cache_is_bounded(sets, place):
     with pytest.raises(KeyError):
         stored[99]
     assert synpick_warp.open(url).planned == local.planned
+
+
+def test_a_training_set_knows_its_length_without_its_episodes(sets, place, monkeypatch):
+    url, folder = sets
+    fetched = []
+    monkeypatch.setattr(
+        reading.StoreCache, "fetch", lambda self, index, real=reading.StoreCache.fetch: fetched.append(index) or real(self, index)
+    )
+    views, local = Views(synpick_warp.open(url)), Views(folder)
+    assert len(views) == len(local)
+    assert set(fetched) <= {views.episodes[0]}  # Whose cameras count for all.
+    np.testing.assert_array_equal(views[-1]["rgb"], local[-1]["rgb"])
+    assert set(fetched) <= {views.episodes[0], views.episodes[-1]}
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(views))[0]["rgb"], local[0]["rgb"])
 
 
 def test_forked_workers_have_caches_of_their_own(picked_set, place):

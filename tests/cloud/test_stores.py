@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import itertools
 import threading
+from http.server import ThreadingHTTPServer
 from pathlib import Path
 from types import SimpleNamespace
 from uuid import uuid4
 
 import pytest
 
+from synpick_warp.cloud import run
 from synpick_warp.errors import StoreError
 from synpick_warp.system.inputs.urls import as_url
-from synpick_warp.system.stores import object_store
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores import base, object_store
 from synpick_warp.system.stores.file_system import FileSystemStore
 from synpick_warp.system.stores.opening import Probe, open_store, probe
+from tests.builders import mistake
+from tests.cloud.conftest import tiny
+from tests.cloud.mortal import stored
+from tests.harness import scripted_bake
 
 
 @pytest.fixture(params=["memory", "file", "s3", "fsspec"])
@@ -63,6 +70,30 @@ def test_the_probe_tells_conditional_writes(store):
     assert store.replace("claim", b"four", tag) is None
     assert store.get("claim") == b"three"
     assert store.get_tagged("none") is None
+
+
+def test_a_second_server_without_compare_and_swap_is_told_and_takes_shares(tmp_path, monkeypatch, local):
+    """It creates if absent and ignores If-Match."""
+    bucket = pytest.importorskip("localbucket")
+    monkeypatch.setattr(bucket.S3Handler, "data_root", tmp_path, raising=False)
+    monkeypatch.setattr(bucket.S3Handler, "disable_nagle_algorithm", True)
+    (tmp_path / "bucket").mkdir()
+    server = ThreadingHTTPServer(("127.0.0.1", 0), bucket.S3Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    given = {"ACCESS_KEY_ID": "key", "SECRET_ACCESS_KEY": "secret", "REGION": "us-east-1"}
+    for name, value in (given | {"ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}"}).items():
+        monkeypatch.setenv(f"AWS_{name}", value)
+    url = "s3://bucket/set"
+    store = open_store(url)
+    assert (store.create(".store/k", b"one") is None, store.create(".store/k", b"two")) == (False, None)
+    assert store.replace(".store/k", b"three", ' "another"') is not None
+    said = mistake("bake", "--config", "smoke", "--out", url, "--claim", "--device", "cpu")
+    assert "has no conditional writes, which --claim needs" in said
+    for share in range(2):
+        run.bake_into_store(tiny(), url, SilentProgress(), shard=(share, 2), bake=scripted_bake.bake_episodes)
+    assert stored(url) == local
+    server.shutdown()
+    server.server_close()
 
 
 def test_of_many_that_create_one_wins(memory):
@@ -129,6 +160,30 @@ def test_a_transient_error_that_mentions_credentials_is_repeated(memory, monkeyp
     monkeypatch.setattr(store, "_obs", SimpleNamespace(put=put))
     store.put("key", b"data")
     assert faults == []
+
+
+@pytest.mark.parametrize("failures", [2, base.TRIES])
+def test_a_listing_that_fails_is_repeated_or_an_error_and_never_short(memory, monkeypatch, failures):
+    monkeypatch.setattr(base, "FIRST_PAUSE", 0.0)
+    store = open_store(memory)
+    real = store._obs.list
+    keys = [f"many/{number:04d}" for number in range(1_001)]
+    for key in keys:
+        store.put(key, b"")
+    pages = iter([0, *[1] * failures])  # The first page is read, and the second fails.
+
+    def listing(*arguments, **given):
+        """A stream of obstore, which after its error has ended."""
+        if next(pages, 0):
+            raise store._errors.GenericError("Server returned non-2xx status code: 500")
+        yield from real(*arguments, **given)
+
+    monkeypatch.setattr(store, "_obs", SimpleNamespace(list=listing))
+    if failures < base.TRIES:
+        assert [key for key, _ in store.list("many")] == keys
+    else:
+        with pytest.raises(StoreError, match="6 attempts failed"):
+            list(store.list("many"))
 
 
 def test_an_object_that_is_replaced_while_it_is_read_is_told(memory, monkeypatch):

@@ -130,6 +130,22 @@ def test_blocks_are_listed_alone(memory, monkeypatch):
     assert list(ledger.blocks()) == [0, 1, 2, 3]
 
 
+def test_the_worker_that_ends_a_block_marks_it(memory, local, monkeypatch):
+    """So the last worker reads one object per block, not one per episode."""
+    monkeypatch.setattr("synpick_warp.cloud.ledger.BLOCK", 2)
+    store, read = open_store(memory), []
+    bake(memory, shard=(0, 4))
+    assert list(store.list(".store/done")) == []
+    bake(memory, shard=(1, 4))
+    assert [key for key, _ in store.list(".store/done")] == [".store/done/000000_000000-000001"]
+    bake(memory, shard=(0, 2))
+    real = type(store).get
+    monkeypatch.setattr(type(store), "get", lambda self, key: read.append(key) or real(self, key))
+    bake(memory)
+    assert stored(memory) == local
+    assert [key for key in read if ".store/index" in key] == [".store/index/000002.tar.gz", ".store/index/000003.tar.gz"]
+
+
 def test_another_set_or_other_settings_are_refused(memory):
     store = open_store(memory)
     store.put("thesis.txt", b"ten years")

@@ -6,7 +6,7 @@ import contextlib
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from synpick_warp.errors import OutputError
@@ -106,10 +106,10 @@ def output_errors(path: Path | str) -> Iterator[None]:
         raise output_error(path, error) from error
 
 
-def write_atomically(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes | Iterable[bytes]) -> None:
     """Replace a file atomically and durably: write a hidden sibling, fsync, rename, fsync the folder.
 
-    Readers find either the old or the new content, even after a power cut.
+    Readers find either the old or the new content, even after a power cut. `data`: the content, or its pieces in order.
     """
     temporary = path.with_name(f".{path.name}.new")
     try:
@@ -123,12 +123,23 @@ def write_atomically(path: Path, data: bytes) -> None:
     sync_folder(path.parent)
 
 
-def write_synced(path: Path, data: bytes) -> None:
-    """Write a file and fsync it."""
+def write_synced(path: Path, data: bytes | Iterable[bytes]) -> None:
+    """Write a file, given whole or in pieces, and fsync it."""
     with path.open("wb") as file:
-        file.write(data)
+        file.writelines([data] if isinstance(data, bytes) else data)
         file.flush()
         os.fsync(file.fileno())
+
+
+def join_lines(parts: Iterable[Path], begin: bytes, end: bytes) -> Iterator[bytes]:
+    """Lines of files as the rows of a JSON list or object, lazily: `begin`, each line behind a comma but the first, `end`."""
+    yield begin + b"\n"
+    comma = b""
+    for part in parts:
+        for line in part.read_bytes().splitlines():
+            yield comma + line
+            comma = b",\n"
+    yield b"\n" + end
 
 
 def sync_file(path: Path) -> None:

@@ -25,6 +25,8 @@ NICENESS = 10
 """Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""
 QUEUE_DEPTH = 4
 """Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
+MAX_WAITING = 4096
+"""Back-pressure of tasks without images: most that wait for a process, so that a list of millions is not held in memory."""
 PROCESSES_PER_COPY_THREAD = 4
 """Writer processes per thread that copies images into shared memory: one core cannot copy as fast as many cores write."""
 
@@ -120,7 +122,8 @@ class WriterPool:
         self.submit_all((WriteTask(function, images, arguments, path, on_done),))
 
     def submit_all(self, tasks: Iterable[WriteTask]) -> None:
-        """Submit tasks and return when all their images are copied. Blocks while no slot of shared memory is free (back-pressure).
+        """Submit tasks and return when all their images are copied. Blocks while no slot of shared memory is free, or more than MAX_WAITING
+        tasks wait (back-pressure).
 
         Threads copy the images of earlier tasks while the next one is prepared, so pass tasks that are costly to prepare as a generator.
 
@@ -136,6 +139,8 @@ class WriterPool:
             submitted.append(_QueuedTask(_Call(task.function, images, task.arguments), task.path, task.on_done, slot, copying))
             self._waiting.append(submitted[-1])
             self._progress(0.0)
+            while len(self._waiting) > MAX_WAITING and not self._finishing:
+                self._progress(None)
         for queued in submitted:
             _await_copy(queued)
         self._progress(0.0)

@@ -18,6 +18,10 @@ from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, p
 
 TIMEOUT = 60
 """Timeout of a request [s]."""
+PART_BYTES, PARTS_AT_ONCE = 16 << 20, 4
+"""Size of the parts in which larger files are uploaded [B], each a request that counts and costs, and parts of a file at a time."""
+PAGE = 1000
+"""Keys of a page of a listing: as many as S3 answers with."""
 _INSTALL = "install it by pip install 'synpick-warp[cloud]'"
 _ADVICE = (
     (
@@ -47,7 +51,7 @@ _PASSING = (
     "error decoding",
 )
 """Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
-_LASTING = ("status code: 401", "status code: 403", "status code: 404", "169.254.169.254")
+_LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
 
 _Result = TypeVar("_Result")
@@ -117,7 +121,7 @@ class ObjectStore:
 
     def put_file(self, key: str, path: Path) -> None:
         """See `Store`."""
-        self._write(key, lambda: self._obs.put(self._store, key, path))
+        self._write(key, lambda: self._obs.put(self._store, key, path, chunk_size=PART_BYTES, max_concurrency=PARTS_AT_ONCE))
 
     def _write(self, key: str, request: Callable[[], object]) -> None:
         """Retry a request that writes an object; what it does not find is a StoreError."""
@@ -159,13 +163,17 @@ class ObjectStore:
             found = self._try(lambda: [each for chunk in self._obs.list(self._store, folder or None) for each in chunk], f"list {self.url}")
             yield from sorted((each["path"], each["size"]) for each in found if each["path"] > after and "#" not in each["path"])
             return
+
+        def read(after: str) -> Any:
+            """First page after a key. The stream is made for each attempt: one that has failed says that it is at its end."""
+            return next(iter(self._obs.list(self._store, folder or None, offset=after or None, chunk_size=PAGE)), None)
+
         while True:
-            pages = iter(self._obs.list(self._store, folder or None, offset=last or None, chunk_size=1000))
-            page = self._try(lambda pages=pages: next(pages, None), f"list {self.url}/{folder}")
-            if not page:
-                return
+            page = self._try(lambda after=last: read(after), f"list {self.url}/{folder}") or []
             for each in page:
                 yield each["path"], each["size"]
+            if len(page) < PAGE:
+                return
             last = page[-1]["path"]
 
     def delete(self, key: str) -> None:

@@ -218,6 +218,15 @@ def test_many_tasks_without_images_do_not_block(tmp_path):
     assert len((tmp_path / "all").read_text()) == 500
 
 
+def test_a_list_of_tasks_without_images_waits_in_part(tmp_path, monkeypatch):
+    monkeypatch.setattr(pool_module, "MAX_WAITING", 5)
+    with WriterPool(1, SIZE) as pool:
+        for index in range(40):
+            pool.submit(os.mkdir, (), (str(tmp_path / str(index)),), path=tmp_path)
+            assert len(pool._waiting) <= 5
+    assert len(list(tmp_path.iterdir())) == 40
+
+
 def test_a_full_queue_blocks_the_caller(tmp_path):
     gate = tmp_path / "gate"
     with WriterPool(1, SIZE) as pool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,8 +14,15 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
-from synpick_warp.exporters.bop.shards.tar_files import commit_shards, find_shards, list_keys, shard_index, write_layer, write_view
-from synpick_warp.exporters.writing.files import PARTIAL, output_errors, write_atomically
+from synpick_warp.exporters.bop.shards.tar_files import (
+    commit_shards,
+    find_shards,
+    known_keys,
+    list_keys,
+    write_layer,
+    write_view,
+)
+from synpick_warp.exporters.writing.files import PARTIAL, join_lines, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -87,10 +95,15 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
-        shards = sorted(shard for scene in scenes for shard in find_shards(scene, out / split))
-        for shard in shards:
-            pool.submit(list_keys, (), (shard, parts), path=shard)
+        shards, size = 0, 0
+        for shard in (shard for scene in scenes for shard in find_shards(scene, out / split)):
+            shards, size = shards + 1, size + shard.stat().st_size
+            if (known := known_keys(shard)).exists():
+                known.rename(parts / shard.name)
+            else:
+                pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
-        lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
-        write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
-        return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
+        names = sorted(os.listdir(parts), key=lambda part: (len(part), part))
+        write_atomically(out / split / KEYS_FILE, join_lines((parts / part for part in names), b"{", b"}\n"))
+        views = sum((parts / part).read_bytes().count(b"\n") for part in names)
+        return SplitContent(name, split.name, views, shards, size)

@@ -128,11 +128,20 @@ def find_shards(scene: int, split: Path) -> Iterator[Path]:
         part += 1
 
 
-def list_keys(shard: Path, folder: Path) -> None:
-    """Task: write `"key": shard index` for each view of a shard, as lines of a JSON object, to a file of the shard's name in `folder`."""
+def known_keys(shard: Path) -> Path:
+    """Path of a shard's `key_lines` beside it, where they are made in advance: in the folder in which the indices of a store are joined."""
+    return shard.with_name(f".{shard.name}.keys")
+
+
+def key_lines(shard: Path) -> bytes:
+    """`"key": shard index` for each view of a shard, as lines of a JSON object."""
     keys = dict.fromkeys(name.partition(".")[0] for name, _, _ in list_members(shard, _ADVICE))
-    lines = (f"{json.dumps(key)}: {shard_index(shard)}\n" for key in keys)
-    (folder / shard.name).write_text("".join(lines), encoding="ascii")
+    return "".join(f"{json.dumps(key)}: {shard_index(shard)}\n" for key in keys).encode()
+
+
+def list_keys(shard: Path, folder: Path) -> None:
+    """Task: write the `key_lines` of a shard to a file of the shard's name in `folder`."""
+    (folder / shard.name).write_bytes(key_lines(shard))
 
 
 def shard_index(shard: Path) -> int:

@@ -13,7 +13,7 @@ import msgspec
 
 from synpick_warp.configs.dataset.splits import DataLayout, split_kind
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import write_atomically
+from synpick_warp.exporters.writing.files import join_lines, write_atomically
 from synpick_warp.system.inputs.json import read_json
 from synpick_warp.system.inputs.paths import path_inside
 
@@ -104,5 +104,4 @@ def concatenate_targets(folder: Path, out: Path, names: tuple[str, ...]) -> None
     """Concatenate the parts that `write_scene_targets` wrote to `folder/name` into the data set's files, in order of scenes."""
     for name in names:
         parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
-        lines = [line for part in parts for line in part.read_bytes().splitlines()]
-        write_atomically(out / name, b"[\n" + b",\n".join(lines) + b"\n]\n")
+        write_atomically(out / name, join_lines(parts, b"[", b"]\n"))

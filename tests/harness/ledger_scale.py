@@ -1,0 +1,131 @@
+"""Seconds, requests and peak memory of a resume and of the finalization, by the number of episodes that are done, in a store in memory.
+
+python -m tests.harness.ledger_scale --episodes 10000,100000,1000000 --finalize 1000,10000,100000 --json FILE
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import re
+import resource
+import sys
+import tarfile
+import tempfile
+import time
+import tracemalloc
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+from uuid import uuid4
+
+from synpick_warp.cloud import finish
+from synpick_warp.cloud.bundles import join_bundles
+from synpick_warp.cloud.ledger import BLOCK, DONE, FINISHED, INDEX, Ledger
+from synpick_warp.cloud.run import bake_into_store
+from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores.base import Store
+from synpick_warp.system.stores.opening import Probe, open_store
+from tests.cloud.conftest import tiny
+from tests.harness import scripted_bake
+from tools.figures import finish_report
+from tools.options import Row, make_parser, positive_count
+
+FRAMES = 504
+"""Frames of an episode of mode pick or move, about."""
+LEFT = 1000
+"""Episodes that are not done when a bake resumes."""
+
+
+def peak() -> float:
+    """Largest resident memory of this process so far [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def open_with_marks(episodes: int, make: bool) -> Store:
+    """A store with the records of a set, and batched marks of so many episodes, with index files if `make`."""
+    url = f"memory://{uuid4().hex}"
+    store = open_store(url)
+    with mock.patch.object(scripted_bake, "FRAMES", FRAMES if make else 1):
+        bake_into_store(tiny(1, ("shards",)), url, SilentProgress(), bake=scripted_bake.bake_episodes)
+    for key in (FINISHED, *(key for key, _ in list(store.list(DONE)))):
+        store.delete(key)
+    with tarfile.open(fileobj=io.BytesIO(gzip.decompress(store.get(f"{INDEX}/000000.tar.gz")))) as archive:
+        members = [(info.name, file.read()) for info in archive if (file := archive.extractfile(info)) is not None]
+    for first in range(0, episodes, BLOCK):
+        last, data = min(first + BLOCK, episodes) - 1, io.BytesIO(b"mark")
+        if make:
+            join_bundles((_renumber(members, episode) for episode in range(first, last + 1)), data)
+        store.put(f"{DONE}/{first // BLOCK:06d}_{first:06d}-{last:06d}", data.getvalue())
+    return store
+
+
+def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
+    """Index file of another episode with the same content."""
+    cameras = sum(name.startswith("size/") for name, _ in members)
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
+        for old, data in members:
+            name = re.sub(r"\d{6}", lambda found: f"{int(found[0]) + cameras * episode:06d}", old)
+            if old.startswith("manifest/"):
+                name, entry = f"manifest/{episode:06d}.json", json.loads(data)
+                for record in (entry, entry["row"], *entry["attempts"]):
+                    record["episode"] = episode
+                data = json.dumps(entry).encode()
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            archive.addfile(info, io.BytesIO(data))
+    return gzip.compress(packed.getvalue(), 1, mtime=0)
+
+
+def measure_resume(episodes: int) -> Iterator[Row]:
+    """Find the remaining episodes of a set of which so many are done."""
+    store, part, counts = open_with_marks(episodes, make=False), f"{episodes:,} episodes", Counter[str]()
+    real = store._obs.list  # type: ignore[attr-defined]
+
+    def resume() -> float:
+        started = time.perf_counter()
+        ledger = Ledger(store, tiny(episodes + LEFT, ("shards",)), Probe(0.0, True))
+        if sum(map(len, ledger.remaining([range(episodes + LEFT)]))) != LEFT:
+            raise RuntimeError("the wrong episodes are left")
+        return time.perf_counter() - started
+
+    with mock.patch.object(store._obs, "list", lambda *given, **named: counts.update(["list"]) or real(*given, **named)):  # type: ignore[attr-defined]
+        yield Row("resume", resume(), "s", part=part)
+    yield Row("resume: listings", counts["list"], part=part)
+    tracemalloc.start()
+    resume()
+    yield Row("resume: peak memory", 1e-6 * tracemalloc.get_traced_memory()[1], "MB", part=part)
+    tracemalloc.stop()
+
+
+def measure_finalization(episodes: int) -> Iterator[Row]:
+    """Make the indices of so many episodes, all but their upload."""
+    store, part, before = open_with_marks(episodes, make=True), f"{episodes:,} episodes", peak()
+    with tempfile.TemporaryDirectory() as name, mock.patch.object(finish, "_put_indices"):
+        started = time.perf_counter()
+        finish.finalize_store(Ledger(store, tiny(episodes, ("shards",)), Probe(0.0, True)), Path(name))
+        yield Row("finalization", time.perf_counter() - started, "s", part=part)
+        yield Row("finalization: peak memory", peak() - before, "MB", part=part)
+        size = sum(path.stat().st_blocks * 512 for path in Path(name).rglob("*"))
+        yield Row("finalization: temporary folder", 1e-6 * size, "MB", part=part)
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    counts = {"type": lambda text: sorted(map(positive_count, text.split(",")))}
+    own = {
+        "episodes": counts | {"default": [10_000, 100_000, 1_000_000], "help": "numbers for the resume"},
+        "finalize": counts | {"default": [1_000, 10_000, 100_000], "help": "numbers for the finalization"},
+    }
+    options = make_parser(__doc__, "json", own=own).parse_args()
+    rows = [row for count in options.episodes for row in measure_resume(count)]
+    rows += [row for count in options.finalize for row in measure_finalization(count)]
+    return finish_report("tests.harness.ledger_scale", options.json, pick_device("cpu"), "", "many episodes", rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
