@@ -7,6 +7,7 @@ import itertools
 import json
 import time
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,11 +16,12 @@ scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
 from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
 from synpick_warp.errors import SynpickError  # noqa: E402
-from tools.reports.real import ablation, interval  # noqa: E402
+from tools.options import Row  # noqa: E402
+from tools.reports.real import OBJECT, ablation, interval  # noqa: E402
 from tools.reports.real.__main__ import PRESET  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS  # noqa: E402
-from tools.reports.real.training import Recipe, segmentation_loss, train, warp_views  # noqa: E402
+from tools.reports.real.training import Recipe, compress_views, segmentation_loss, train, warp_views  # noqa: E402
 from tools.reports.real.tuning import changed  # noqa: E402
 from tools.reports.real.views import Pool, Source  # noqa: E402
 
@@ -63,6 +65,19 @@ def test_augmentation_moves_labels_with_the_image():
     images, labels = warp_views((classes[:, None] / 7.0).expand(-1, 3, -1, -1), classes, RECIPE)
     assert ((images[:, 0] > 0.5) != (labels == 7)).float().mean() < 0.01
     assert (labels != classes).float().mean() > 0.02
+
+
+@pytest.mark.parametrize("quality", [30, 75])
+def test_jpeg_is_opencvs(quality):
+    """Rounding to bytes before the transform moves some coefficients to the next step: less than half of what compression changes."""
+    image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8), (5, 5), 1.0)
+    image = cv2.resize(image, (128, 96))
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    expected = cv2.imdecode(cv2.imencode(".jpg", image, options)[1], cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
+    tensor = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1)[None] / 255.0
+    made = 255.0 * compress_views(tensor, torch.tensor([quality]))[0].permute(1, 2, 0).numpy()
+    assert np.abs(made - expected).mean() < 0.5 * np.abs(expected - image[..., ::-1]).mean()
+    assert np.abs(made - expected).max() < 20.0
 
 
 def test_windows_are_parts_of_the_view_at_its_scale():
@@ -142,12 +157,12 @@ class Drawn:
 
 
 def test_a_pool_that_fills_slowly_leaves_time_to_train():
-    recipe = dataclasses.replace(RECIPE, views=4000, capacity=4000, width=2, seconds=0.6)
+    recipe = dataclasses.replace(RECIPE, views=4000, capacity=4000, width=2, seconds=2.0, jpeg=0.0)
     trained, pool = train(Drawn(0.05), recipe, 2, torch.device("cpu"), 0)
     assert 0 < trained.views < 4000
     assert trained.views == pool.seen
     assert trained.stream_seconds < trained.seconds
-    assert trained.samples >= 4 * recipe.batch
+    assert trained.samples >= recipe.batch
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
@@ -183,10 +198,12 @@ def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, caps
     assert len(lines) == len(jobs)
     assert lines[-1].endswith("(left out)")
     for seed, value in enumerate((0.4, 0.6)):
+        rows = [{"name": "obj_id 2: IoU", "value": value, "part": OBJECT}, {"name": "views", "value": 8.0, "part": ""}]
         entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", "limit", *ablation.METRICS), value)
-        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}}))
+        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}, "rows": rows}))
     made = ablation.collect(tmp_path, jobs)
     assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
+    assert made["rows"][-1] == dataclasses.asdict(Row("obj_id 2: IoU", 0.5, part="all levers"))
     assert made["rows"][0]["name"] == "all levers: mIoU"
     assert made["rows"][0]["unit"].endswith("shortest time limit 0 s")
     assert made["more"]["seeds"]["all levers"]["mean_iou"] == [0.4, 0.6]

@@ -34,7 +34,7 @@ from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run
 from tools.options import Row, configure, fail, make_parser, number_in, positive_count, print_rows, write_json
-from tools.reports.real import interval
+from tools.reports.real import OBJECT, interval
 from tools.reports.real_frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
@@ -47,7 +47,7 @@ BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
 """Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
 BESIDE_STRIDE = 3
 """Every n-th frame of these episodes is taken."""
-RANGES = {"crop": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0)}
+RANGES = {"crop": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0)}
 """Argument types of the options that are not just non-negative numbers."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
@@ -106,8 +106,8 @@ def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
     config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
-    source = Source(config, TRAINING, options.stride, options.shrink)
-    held = replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT)
+    source = Source(config, TRAINING, options.stride, options.shrink, cameras=tuple(options.cameras or ()) or None)
+    held = replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
     if not options.beside:
         return source, held
     other = argparse.Namespace(**vars(options) | {"config": options.beside, "set": []})
@@ -147,7 +147,7 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
         row("loss at the end", [one.trained.losses[-1] for one in outcomes]),
     ]
     first = outcomes[0].real
-    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in first.iou]
+    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part=OBJECT) for index in first.iou]
     return rows + [row(f"{name}: mean IoU", [one.real.views[name] for one in outcomes], part="frame") for name in first.views]
 
 
@@ -237,6 +237,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
         "jitter": (0.3, "strength of photometric augmentation; 0: none"),
+        "jpeg": (40.0, "lowest JPEG quality of augmentation; 0: none"),
         "background": (1.0, "weight of the background in the cross entropy"),
         "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
         "rate": (2e-3, "largest learning rate"),
@@ -245,6 +246,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(f"--{name}", type=RANGES.get(name, number_in(0.0)), default=default, help=f"{text} (default: {default:g})")
+    parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
     parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
     parser.add_argument("--beside", default="", metavar="PRESET", help="train on views of this preset too, half and half")

@@ -1,7 +1,7 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
 AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
-borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may use
+borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw. Most of a training may use
 random crops at full scale, of which a GPU processes more in the same time.
 """
 
@@ -10,17 +10,24 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import cache
 
+import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
+from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
 from tools.examples.train_online import LEARNING_RATE, MIN_SIDE, WARM_UP
 from tools.reports.real.networks import NETWORKS
 from tools.reports.real.views import Pool, Source
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
+YCC = (LUMA, (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
+"""Y, Cb and Cr of red, green and blue (JFIF)."""
+BLOCK = 8
+"""Side of a JPEG block [px]."""
 LEAST_RATE = 0.01
 """Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
@@ -52,6 +59,8 @@ class Recipe:
     """Largest rotation in each direction [°]."""
     jitter: float = 0.3
     """Strength of the photometric augmentation; 0: none."""
+    jpeg: float = 40.0
+    """Lowest JPEG quality of the photometric augmentation; 0: no JPEG."""
     background: float = 1.0
     """Class weight of the background in the cross entropy."""
     dice: float = 0.0
@@ -121,6 +130,33 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     return (images + level * torch.randn_like(images)).clamp(0, 1)
 
 
+@cache
+def _jpeg_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Quantization tables (quality, 3, 8, 8) of levels 0..1, and the orthonormal DCT matrix (8, 8)."""
+    tables = np.empty((QUALITIES, 2, BLOCK * BLOCK), np.float32)
+    for quality in range(QUALITIES):
+        tables[quality, :, zigzag_order()] = quantization(quality).T / 255.0
+    frequency, place = np.mgrid[:BLOCK, :BLOCK]
+    matrix = np.cos((2 * place + 1) * frequency * np.pi / (2 * BLOCK)) * np.where(frequency, 0.5, 0.5**1.5)
+    channels = tables.reshape(QUALITIES, 2, BLOCK, BLOCK)[:, [0, 1, 1]]
+    return torch.from_numpy(channels).to(device), torch.from_numpy(matrix.astype(np.float32)).to(device)
+
+
+def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
+    """Images (B, 3, H, W) in 0..1 after JPEG compression of an integer `quality` each (B), without chroma subsampling: an image that a
+    camera compresses at twice the size has chroma of full size once it is reduced. Sides are multiples of BLOCK [px]."""
+    tables, dct = _jpeg_tables(images.device)
+    count, _, height, width = images.shape
+    matrix = images.new_tensor(YCC)
+    values = torch.einsum("kc,bchw->bkhw", matrix, images) - images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
+    blocks = values.view(count, 3, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    steps = tables[quality].view(count, 3, 1, BLOCK, 1, BLOCK)
+    levels = torch.einsum("ui,bkyixj,vj->bkyuxv", dct, blocks, dct).div(steps).round_().mul_(steps)
+    values = torch.einsum("ui,bkyuxv,vj->bkyixj", dct, levels, dct).reshape(count, 3, height, width)
+    values = values + images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
+    return torch.einsum("ck,bkhw->bchw", torch.linalg.inv(matrix), values).clamp(0, 1)
+
+
 def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Network input (B, 3, H, W) float32 in -0.5..0.5 and classes, after augmentation and random cropping."""
     values = images.float() / 255
@@ -128,6 +164,9 @@ def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: 
         values, classes = warp_views(values, classes, recipe, crop)
     if recipe.jitter:
         values = jitter_views(values, recipe.jitter)
+    if recipe.jpeg:
+        quality = recipe.jpeg + (QUALITIES - recipe.jpeg) * torch.rand(len(values), device=values.device)
+        values = compress_views(values, quality.long().clamp(1, QUALITIES - 1))
     return values - 0.5, classes
 
 

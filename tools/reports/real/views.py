@@ -29,6 +29,8 @@ class Source:
     """Factor by which images are reduced."""
     beside: Source | None = None
     """Another source, of images of the same size, whose batches come in turns with these."""
+    cameras: tuple[int, ...] | None = None
+    """Indices of the cameras whose views are taken; None: all."""
 
     def batches(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
         """Images (B, 3, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken, of all sources in turns."""
@@ -45,7 +47,7 @@ class Source:
 
     def _own(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
         """Batches of the stream of these settings."""
-        dataset = StreamDataset(self.config, fields=("rgb", "classes"), episodes=self.episodes, stride=self.stride)
+        dataset = StreamDataset(self.config, fields=("rgb", "classes"), episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
             image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
             if self.shrink > 1:
