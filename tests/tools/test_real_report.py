@@ -23,7 +23,7 @@ from tools.reports.real.detector import average_precision, boxes_of  # noqa: E40
 from tools.reports.real.networks import NETWORKS  # noqa: E402
 from tools.reports.real.training import Recipe, compress_views, segmentation_loss, train, warp_views  # noqa: E402
 from tools.reports.real.tuning import changed  # noqa: E402
-from tools.reports.real.views import Pool, Source  # noqa: E402
+from tools.reports.real.views import Pool  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
 
@@ -80,28 +80,15 @@ def test_jpeg_is_opencvs(quality):
     assert np.abs(made - expected).max() < 20.0
 
 
-def test_windows_are_parts_of_the_view_at_its_scale():
-    plain = dataclasses.replace(RECIPE, scale=1.0)
-    # Each pixel holds its column, so that crops show where they are and how large.
-    columns = torch.arange(64).expand(6, 48, 64)
-    images, labels = warp_views((columns[:, None] / 64.0).expand(-1, 3, -1, -1), columns, plain, 0.5)
-    assert images.shape == (6, 3, 24, 32)
-    assert labels.shape == (6, 24, 32)
-    assert (labels[:, :, 1:] - labels[:, :, :-1] == 1).all()
-    assert labels[:, 0, 0].unique().numel() > 1
-    assert (images[:, 0] * 64 - labels).abs().max() <= 1.0
-
-
 def test_the_loss_of_known_logits():
     classes = torch.tensor([[[0, 0, 1, 2]]])
-    weights = torch.ones(4)
     exact = 50.0 * torch.nn.functional.one_hot(classes, 4).permute(0, 3, 1, 2).float()
-    assert float(segmentation_loss(exact, classes, weights, 1.0)) == pytest.approx(0.0, abs=1e-6)
+    assert float(segmentation_loss(exact, classes, 1.0)) == pytest.approx(0.0, abs=1e-6)
     even = torch.zeros(1, 4, 1, 4)
     # Each object has one pixel, of which a quarter is predicted, as of the three others: Dice 2 x 1/4 / (1 + 1).
-    entropy = float(segmentation_loss(even, classes, weights, 0.0))
+    entropy = float(segmentation_loss(even, classes, 0.0))
     assert entropy == pytest.approx(np.log(4.0))
-    assert float(segmentation_loss(even, classes, weights, 2.0)) - entropy == pytest.approx(2 * 0.75)
+    assert float(segmentation_loss(even, classes, 2.0)) - entropy == pytest.approx(2 * 0.75)
 
 
 @pytest.mark.parametrize("name", NETWORKS)
@@ -109,17 +96,11 @@ def test_networks_have_logits_of_the_images_size(name):
     assert NETWORKS[name](5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
 
 
-def test_sources_come_in_turns_until_each_ends(monkeypatch):
-    monkeypatch.setattr(Source, "_own", lambda self: iter(Closable(self.config)))
-    mixed = Source([1, 2, 3], range(1), 1, beside=Source([7], range(1), 1))
-    assert list(mixed.batches()) == [1, 7, 2, 3]
-
-
 def test_a_trial_changes_what_it_names():
     assert changed(RECIPE, "base") == RECIPE
     made = changed(RECIPE, "dice=1,network=residual,width=4")
     assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
-    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "crop=0", "batch=0", "network=foo", "views=3", "depth=1"):
+    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "jpeg=101", "batch=0", "network=foo", "views=3", "depth=1"):
         with pytest.raises(SynpickError):
             changed(RECIPE, text)
 
@@ -133,13 +114,6 @@ def test_a_pool_replaces_views_once_it_is_full():
     assert pool.count == 4
     assert pool.seen > 4
     assert pool.draw(9)[0].shape == (9, 3, 2, 2)
-
-
-class Closable(list):
-    """Batches as of a generator."""
-
-    def __iter__(self):
-        yield from super().__iter__()
 
 
 class Drawn:
@@ -166,11 +140,10 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", crop=0.5, dice=1.0)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0)
     trained, _ = train(Drawn(most=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
-    # Ten steps with batches of 4: eight steps train on crops of a quarter of the area, two on whole views: 8 * 4 / 4 + 2 * 4 = 16 views.
-    assert trained.samples == 40
+    assert trained.samples == 16
 
 
 @pytest.mark.parametrize("name", ablation.LEVERS)

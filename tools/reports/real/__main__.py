@@ -43,11 +43,9 @@ FEW_WORLDS = 64
 """Maximum number of worlds for held-out views."""
 PRESET = "tabletop-train"
 """Default preset of the stream."""
-BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
-"""Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
-BESIDE_STRIDE = 3
-"""Every n-th frame of these episodes is taken."""
-RANGES = {"crop": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0)}
+VIEWS_PER_BATCH = 48
+"""Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
+RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0)}
 """Argument types of the options that are not just non-negative numbers."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
@@ -98,21 +96,16 @@ def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) 
 
 
 def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source, Source]:
-    """Sources of training views, and of held-out views: those of --config alone.
+    """Sources of training views, and of held-out views by all cameras.
 
     Raises:
         ConfigError: A setting is wrong.
     """
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
-    fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
+    fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
     source = Source(config, TRAINING, options.stride, options.shrink, cameras=tuple(options.cameras or ()) or None)
-    held = replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
-    if not options.beside:
-        return source, held
-    other = argparse.Namespace(**vars(options) | {"config": options.beside, "set": []})
-    beside = Source(configure(other, fixed | BESIDE | {"bake.worlds": few}), TRAINING, BESIDE_STRIDE, options.shrink)
-    return replace(source, beside=beside), held
+    return source, replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
 
 
 def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
@@ -221,7 +214,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "views": (24_000, "views of the stream"),
         "seeds": (3, "trainings, each with piles of its own"),
         "worlds": (512, "worlds simulated in parallel"),
-        "batch": (48, "views of a batch"),
+        "batch": (16, "views of a batch"),
         "width": (48, "channels of the network's first level"),
         "stride": (2, "every n-th frame of an episode is taken"),
         "shrink": (1, "factor by which the stream's images are reduced"),
@@ -232,16 +225,14 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
-        "passes": (4.0, "number of epochs; a crop counts as the fraction of the view that it covers"),
+        "passes": (4.0, "number of epochs"),
         "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
         "jitter": (0.3, "strength of photometric augmentation; 0: none"),
         "jpeg": (40.0, "lowest JPEG quality of augmentation; 0: none"),
-        "background": (1.0, "weight of the background in the cross entropy"),
         "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
         "rate": (2e-3, "largest learning rate"),
-        "crop": (1.0, "side of random crops, as a fraction of the view's; the last fifth of the training is on whole views"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():
@@ -249,7 +240,6 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
     parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
     parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
-    parser.add_argument("--beside", default="", metavar="PRESET", help="train on views of this preset too, half and half")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")

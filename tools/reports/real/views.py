@@ -27,26 +27,11 @@ class Source:
     """Every n-th frame of an episode."""
     shrink: int = 1
     """Factor by which images are reduced."""
-    beside: Source | None = None
-    """Another source, of images of the same size, whose batches come in turns with these."""
     cameras: tuple[int, ...] | None = None
     """Indices of the cameras whose views are taken; None: all."""
 
     def batches(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Images (B, 3, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken, of all sources in turns."""
-        waiting = [self._own(), *([self.beside.batches()] if self.beside is not None else [])]
-        try:
-            while waiting:
-                source = waiting.pop(0)
-                if (batch := next(source, None)) is not None:
-                    yield batch
-                    waiting.append(source)
-        finally:
-            for source in waiting:
-                source.close()
-
-    def _own(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Batches of the stream of these settings."""
+        """Images (B, 3, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken."""
         dataset = StreamDataset(self.config, fields=("rgb", "classes"), episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
             image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
