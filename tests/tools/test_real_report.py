@@ -62,7 +62,13 @@ def test_average_precision_of_known_detections():
 def test_augmentation_moves_labels_with_the_image():
     classes = torch.zeros(6, 40, 60, dtype=torch.int64)
     classes[:, 10:30, 20:45] = 7
-    images, labels = warp_views((classes[:, None] / 7.0).expand(-1, 3, -1, -1), classes, RECIPE)
+    images, labels = warp_views((classes[:, None] / 14.0).expand(-1, 4, -1, -1), classes, dataclasses.replace(RECIPE, rotation=0.0))
+    # Twice the size is at half the depth; what is not measured stays so, and there is nothing between.
+    depth, areas = images[:, 3].amax((1, 2)), (labels == 7).sum((1, 2)) / 500
+    assert ((images[:, 3] > 0.0) == (labels == 7)).all()
+    whole = areas < 1.2
+    assert torch.allclose(depth[whole], 0.5 * areas[whole].rsqrt(), atol=0.05)
+    images = 2 * images
     assert ((images[:, 0] > 0.5) != (labels == 7)).float().mean() < 0.01
     assert (labels != classes).float().mean() > 0.02
 
@@ -93,7 +99,7 @@ def test_the_loss_of_known_logits():
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_networks_have_logits_of_the_images_size(name):
-    assert NETWORKS[name](5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
+    assert NETWORKS[name](5, 4, 4)(torch.zeros(2, 4, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
 
 
 def test_a_trial_changes_what_it_names():
@@ -119,15 +125,15 @@ def test_a_pool_replaces_views_once_it_is_full():
 class Drawn:
     """Synthetic data source: batches of images of a bright square, each after a delay of `pause` seconds."""
 
-    def __init__(self, pause: float = 0.0, most: int | None = None):
-        self.pause, self.most = pause, most
+    def __init__(self, pause: float = 0.0, most: int | None = None, channels: int = 3):
+        self.pause, self.most, self.channels = pause, most, channels
 
     def batches(self):
         for _ in itertools.count() if self.most is None else range(self.most):
             time.sleep(self.pause)
             classes = torch.zeros(4, 16, 16, dtype=torch.uint8)
             classes[:, 4:12, 4:12] = 1
-            yield (classes[:, None] * 200).expand(-1, 3, -1, -1), classes
+            yield (classes[:, None] * 200).expand(-1, self.channels, -1, -1), classes
 
 
 def test_a_pool_that_fills_slowly_leaves_time_to_train():
@@ -140,8 +146,8 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0)
-    trained, _ = train(Drawn(most=4), recipe, 2, torch.device("cpu"), 0)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0, depth=True)
+    trained, _ = train(Drawn(most=4, channels=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
     assert trained.samples == 16
 

@@ -30,12 +30,13 @@ except ModuleNotFoundError as missing:
 
 from rich.console import Console
 
+from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run
 from tools.options import Row, configure, fail, make_parser, number_in, positive_count, print_rows, write_json
 from tools.reports.real import OBJECT, interval
-from tools.reports.real_frames import RealFrame, read_frames
+from tools.reports.real_frames import DEPTH_SCALE, RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
@@ -89,7 +90,9 @@ def recipe_of(options: argparse.Namespace) -> Recipe:
 def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) -> Outcome:
     """Scores of a network on real frames, and on held-out views."""
     height, width = held.tensors()[0].shape[2:]
-    found = [predict(trained.network, frame.color, (int(width), int(height)), device) for frame in frames]
+    size = (int(width), int(height))
+    depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if held.tensors()[0].shape[1] > 3 else None for frame in frames]
+    found = [predict(trained.network, frame.color, size, device, depth) for frame, depth in zip(frames, depths, strict=True)]
     real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
     return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
@@ -104,7 +107,7 @@ def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
-    source = Source(config, TRAINING, options.stride, options.shrink, cameras=tuple(options.cameras or ()) or None)
+    source = Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
     return source, replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
 
 
@@ -239,6 +242,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         parser.add_argument(f"--{name}", type=RANGES.get(name, number_in(0.0)), default=default, help=f"{text} (default: {default:g})")
     parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
     parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
+    parser.add_argument("--depth", action="store_true", help="train and measure on colour and depth")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")

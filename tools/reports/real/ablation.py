@@ -55,6 +55,8 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
+CHOICE = ("--network", "residual", "--width", "64", "--batch", "32", "--depth")
+"""Network of the row with the most views."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
@@ -67,10 +69,12 @@ VIEWS = 8
 
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
+HOLES = ("depth_sensor.shadows=false", "depth_sensor.edge_width=0", "depth_sensor.grazing_angle=89")
+"""Settings without what makes holes in depth."""
 LEVERS: dict[str, tuple[str, ...]] = {
+    "places": ("arrangement.drop=layers", "bins.area=[0.8,0.55]"),
     "surfaces": ("randomize.surfaces=0", "randomize.table_color={uniform=[[0.05,0.05,0.05],[0.9,0.9,0.9]]}"),
     "distractors": ("randomize.distractors=off",),
-    "places": ("arrangement.drop=layers", "bins.area=[0.8,0.55]"),
     "effects": ("effects.exposure_jitter=0", "effects.white_balance_jitter=0", *(f"effects.{name}={_OFF}" for name in _EFFECTS)),
     "contrast": (f"effects.contrast={_OFF}", f"effects.saturation={_OFF}"),
     "standing": ("arrangement.upright=0",),
@@ -146,10 +150,12 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
     yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"))
     yield Run("without JPEG", views, ("--jpeg", "0"))
+    yield Run("colour and depth", views, ("--depth",))
+    yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)))
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0, least=300.0)
+    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000", *CHOICE), seeds=1, passes=2.0, limit=400.0, least=300.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
     yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "16"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)

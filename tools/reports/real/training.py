@@ -64,6 +64,8 @@ class Recipe:
     """Peak learning rate of the schedule."""
     network: str = "unet"
     """Architecture: a key of NETWORKS."""
+    depth: bool = False
+    """Whether the network sees depth beside colours."""
     compiled: bool = False
     """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
 
@@ -84,16 +86,18 @@ class Trained:
 
 
 def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders."""
+    """Geometric augmentation of images (B, 3 or 4, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored
+    borders. Depth, the fourth channel, is of the nearest pixel, and becomes less as objects become larger."""
     count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle, aspect = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation), height / width
     cosine, sine, reach = factor * angle.cos(), factor * angle.sin(), (factor - 1).abs()
     rows = [torch.stack([cosine, -sine * aspect, reach * draw[2]], 1), torch.stack([sine / aspect, cosine, reach * draw[3]], 1)]
     grid = functional.affine_grid(torch.stack(rows, 1), [count, 1, height, width], align_corners=False)
-    images = functional.grid_sample(images, grid, "bilinear", "reflection", align_corners=False)
+    depth = functional.grid_sample(images[:, 3:], grid, "nearest", "reflection", align_corners=False) * factor.view(-1, 1, 1, 1)
+    images = functional.grid_sample(images[:, :3], grid, "bilinear", "reflection", align_corners=False)
     labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
-    return images, labels[:, 0].round().long()
+    return torch.cat((images, depth.clamp(max=1)), dim=1), labels[:, 0].round().long()
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
@@ -143,16 +147,15 @@ def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
 
 
 def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Network input (B, 3, H, W) float32 in -0.5..0.5 and classes, after augmentation."""
+    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation."""
     values = images.float() / 255
     if recipe.scale > 1:
         values, classes = warp_views(values, classes, recipe)
-    if recipe.jitter:
-        values = jitter_views(values, recipe.jitter)
+    colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
     if recipe.jpeg:
         quality = recipe.jpeg + (QUALITIES - recipe.jpeg) * torch.rand(len(values), device=values.device)
-        values = compress_views(values, quality.long().clamp(1, QUALITIES - 1))
-    return values - 0.5, classes
+        colors = compress_views(colors, quality.long().clamp(1, QUALITIES - 1))
+    return torch.cat((colors, values[:, 3:]), dim=1) - 0.5, classes
 
 
 def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) -> torch.Tensor:
@@ -177,7 +180,7 @@ class _Trainer:
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
-        self.network = NETWORKS[recipe.network](classes, recipe.width).to(device, memory_format=torch.channels_last)
+        self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network

@@ -27,7 +27,7 @@ SLACK = 15.0
 """Time that a trial takes beside its training, for scores and files [s]."""
 
 
-SHARED = ("views", "capacity", "seconds")
+SHARED = ("views", "capacity", "seconds", "depth")
 """Hyper-parameters that all trials share, by the options of these names."""
 
 
