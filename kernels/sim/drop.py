@@ -288,11 +288,10 @@ def scatter_objects_kernel(
     # Out:
     joint_q_inout: wp.array[float],  # (coord) [m, rad]
 ):
-    """Move objects that have just been dropped to places beside or right above each other, in turns from a random one (ballistic deposition
-    of vertical cylinders): each takes the lowest of PLACES.
+    """Move objects that have just been dropped beside or right above each other: ballistic deposition, each at the lowest of PLACES.
 
-    Places are uniform in the compartment's opening, reduced by the cylinder's radius and by the setting `spread`. A cylinder stands
-    `clearance` above the rim, and above all before it that are nearer than their radii and `clearance`. Launched over world.
+    Vertical cylinders take turns from a random one. Places are uniform in the compartment's opening, less the radius, times `spread`. One
+    begins `clearance` above the rim, and above all before it that are nearer than radii and `clearance`. Launched over world.
     """
     world = wp.tid()
     if not restarted[world] or phase[world] != Phase.SETTLE:
