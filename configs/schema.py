@@ -45,7 +45,7 @@ LAYOUTS = (CLASSIC, MULTISENSOR)
 """Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
 EXCEED = "exceed"
 WITHIN = "within"
-COLUMN, LAYERED = "column", "layers"
+COLUMN, LAYERED, SCATTERED = "column", "layers", "scattered"
 """Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
@@ -142,12 +142,12 @@ class Arrangement:
     drop: str = setting(
         COLUMN,
         "",
-        "Where objects begin to fall: column (one above the other, over the middle) or layers (side by side over the whole opening: many "
-        "from a low height).",
-        choices=(COLUMN, LAYERED),
+        "Where objects begin to fall: column (one above the other, over the middle), layers (side by side over the whole opening: many "
+        "from a low height) or scattered (each at the lowest of random places, beside those before it or right above them).",
+        choices=(COLUMN, LAYERED, SCATTERED),
     )
     clearance: float = setting(
-        0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column, or in layers.", low=0.0, high=1.0
+        0.01, "m", "Gap between the bounding spheres of objects as they begin to fall; scattered: of cylinders.", low=0.0, high=1.0
     )
     upright: float = setting(
         0.0, "", "Fraction of the objects that begin to fall with the z axis of their model upwards, so that most stand.", low=0.0, high=1.0

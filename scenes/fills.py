@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.episodes.fills import Counts
-from synpick_warp.configs.schema import COLUMN, LAYERED, Arrangement
+from synpick_warp.configs.schema import LAYERED, Arrangement
 from synpick_warp.errors import ConfigError, format_value, suggest
 from synpick_warp.scenes.types import Catalog
 
@@ -51,7 +51,7 @@ def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, 
         arrangement: Settings of the drop.
         sizes: The bin; in layers its compartments are taken to have equal shares of the objects.
     """
-    if arrangement.drop == COLUMN:
+    if arrangement.drop != LAYERED:
         return float(most @ (2.0 * radius + arrangement.clearance))
     pitch = float(2.0 * radius[most > 0].max(initial=0.0) + arrangement.clearance)
     cells = sum(max(1, int(length / pitch)) * max(1, int(width / pitch)) for length, width in sizes.mouths)
@@ -72,7 +72,7 @@ def check_fill(arrangement: Arrangement, guide_height: float, catalog: Catalog, 
     for sizes in bins:
         height = drop_height(most, radius, arrangement, sizes)
         if height > guide_height:
-            other = f'set arrangement.drop = "{LAYERED}"' if arrangement.drop == COLUMN else "raise physics.guide_height"
+            other = f'set arrangement.drop = "{LAYERED}"' if arrangement.drop != LAYERED else "raise physics.guide_height"
             raise ConfigError(
                 f"the {most.sum()} parts of arrangement.counts begin to fall from up to {height:.3g} m above the {sizes.noun}, but the "
                 f"walls that guide them are {guide_height:g} m high; {other}, or take fewer"

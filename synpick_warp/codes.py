@@ -194,6 +194,7 @@ class Stream(enum.IntEnum):
     CANDIDATES = 19
     TRIALS = 20
     UPRIGHT = 21
+    SCATTER = 22
 
 
 class Look(enum.IntEnum):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from synpick_warp.apps.validation.registry import load_rules
@@ -126,8 +127,11 @@ def store_reference() -> str:
 
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
-    table = figures_tables(read_runs())["photographs"].replace("](results/", "](../../results/")
-    return _with_results(PHOTOGRAPHS, {"photographs": table})
+    runs = newest_runs(read_runs())
+    table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
+    run = runs["photographs_ablation.json"]
+    objects = msgspec.structs.replace(run, shown=[row.name for row in run.rows if row.name.startswith("obj_id")])
+    return _with_results(PHOTOGRAPHS, {"photographs": table, "photographs_objects": pivot_table(objects)})
 
 
 def _with_results(path: Path, tables: Mapping[str, str]) -> str:

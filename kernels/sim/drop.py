@@ -13,6 +13,8 @@ wp.set_module_options({"enable_backward": False})
 PARKED_HEIGHT = wp.constant(-100.0)
 # Samples of the random stream that one drop uses: x, y and three for the rotation.
 DROP_SAMPLES = wp.constant(5)
+# Places among which a scattered object takes the lowest.
+PLACES = wp.constant(24)
 
 
 @wp.func
@@ -220,6 +222,12 @@ def drop_objects_kernel(
     phase_inout[world] = Phase.SETTLE
 
 
+@wp.func
+def stands(key: wp.uint64, instance: int, upright: float) -> bool:
+    """Whether an instance is turned upright, by the stream of `Stream.UPRIGHT`."""
+    return uniform(key, 2 * instance) < upright
+
+
 @wp.kernel
 def raise_objects_kernel(
     # Scene:
@@ -244,9 +252,81 @@ def raise_objects_kernel(
     if not restarted[world] or phase[world] != Phase.SETTLE or catalog_index[world, instance] < 0:
         return
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.UPRIGHT)
-    if uniform(key, 2 * instance) >= upright:
+    if not stands(key, instance, upright):
         return
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), TAU * uniform(key, 2 * instance + 1))
     first = world * layout.coords + layout.gripper_dofs + 7 * body_slot[world, instance] + 3
     for axis in range(4):
         joint_q_inout[first + axis] = turn[axis]
+
+
+@wp.func
+def enclose(key: wp.uint64, instance: int, upright: float, cylinder: wp.vec3, radius: float) -> wp.vec3:
+    """Vertical cylinder about an instance that begins to fall, radius, lower and upper end [m]: its own if it stands, else that of its
+    bounding sphere."""
+    if stands(key, instance, upright):
+        return cylinder
+    return wp.vec3(radius, -radius, radius)
+
+
+@wp.kernel
+def scatter_objects_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    bins: BinData,
+    upright: float,
+    cylinder: wp.array[wp.vec3],  # (body) [m]
+    # State:
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    phase: wp.array[int],  # (world)
+    restarted: wp.array[wp.bool],  # (world_and_global)
+    # Out:
+    joint_q_inout: wp.array[float],  # (coord) [m, rad]
+):
+    """Move objects that have just been dropped beside or right above each other: ballistic deposition, each at the lowest of PLACES.
+
+    Vertical cylinders take turns from a random one. Places are uniform in the compartment's opening, less the radius, times `spread`. One
+    begins `clearance` above the rim, and above all before it that are nearer than radii and `clearance`. Launched over world.
+    """
+    world = wp.tid()
+    if not restarted[world] or phase[world] != Phase.SETTLE:
+        return
+    episode, arrangement = arrangement_id[world][0], arrangement_id[world][1]
+    key = stream_key(seed, episode, arrangement, Stream.SCATTER)
+    standing = stream_key(seed, episode, arrangement, Stream.UPRIGHT)
+    compartments = stream_key(seed, episode, arrangement, Stream.COMPARTMENT)
+    coords = world * layout.coords + layout.gripper_dofs
+    count = count_instances(catalog_index, world, layout.instances)
+    if count == 0:
+        return
+    first = uniform_index(key, 0, count)
+    for turn in range(count):
+        instance = (first + turn) % count
+        index = catalog_index[world, instance]
+        own = enclose(standing, instance, upright, cylinder[index], catalog.radius[index])
+        chosen = choose_compartment(bins, world, compartments, instance)
+        best = wp.vec3()
+        for place in range(PLACES):
+            sample = 1 + 2 * (instance * PLACES + place)
+            x = (2.0 * uniform(key, sample) - 1.0) * drop.spread * wp.max(0.0, bins.half[chosen][0] - own[0])
+            y = (2.0 * uniform(key, sample + 1) - 1.0) * drop.spread * wp.max(0.0, bins.half[chosen][1] - own[0])
+            center = wp.vec3(x + bins.center[chosen][0], y + bins.center[chosen][1], bins.rim_height[bins.chosen[world]])
+            point = wp.transform_point(bins.pose[world], center)
+            for before in range(turn):
+                other = (first + before) % count
+                body = catalog_index[world, other]
+                placed = enclose(standing, other, upright, cylinder[body], catalog.radius[body])
+                q = coords + 7 * body_slot[world, other]
+                apart = wp.length(wp.vec2(point[0] - joint_q_inout[q], point[1] - joint_q_inout[q + 1]))
+                if apart < own[0] + placed[0] + drop.clearance:
+                    point[2] = wp.max(point[2], joint_q_inout[q + 2] + placed[2])
+            if place == 0 or point[2] < best[2]:
+                best = point
+        best[2] += drop.clearance - own[1]
+        for axis in range(3):
+            joint_q_inout[coords + 7 * body_slot[world, instance] + axis] = best[axis]

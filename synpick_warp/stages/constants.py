@@ -38,7 +38,8 @@ GRIPPER_HOME = (3.0, 0.0, 1.0)
 class SceneData:
     """Constants of the kernels: one struct for each subject, and the modes of the splits: `modes` has one `ModeData` each.
 
-    `tries_another`: whether failed attempts are counted by instance (`pick.retry`); `upright`: of the settings `arrangement`.
+    `tries_another`: whether failed attempts are counted by instance (`pick.retry`); `upright`, and `scattered` by
+    `drop`: of the settings `arrangement`; `cylinder`: radius about the z axis, lower and upper end of each object as it stands (body) [m].
     """
 
     layout: structs.LayoutData
@@ -55,6 +56,8 @@ class SceneData:
     looks: LookTable
     tries_another: bool = False
     upright: float = 0.0
+    scattered: bool = False
+    cylinder: wp.array | None = None
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
@@ -111,6 +114,8 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
         build_look_table(Looks(config.randomize, (), ()), 0, device),
         config.pick.retry == ANOTHER,
         config.arrangement.upright,
+        config.arrangement.drop == schema.SCATTERED,
+        wp.array([_cylinder(entry) for entry in catalog.bodies], dtype=wp.vec3, device=device),
     )
 
 
@@ -163,6 +168,12 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, counts: Counts, dev
 def _extents(entry: CatalogEntry) -> np.ndarray:
     """Side lengths of the mesh's bounding box in the object's frame, ascending (3) [m]."""
     return np.sort(np.ptp(entry.mesh.vertices.astype(np.float64), axis=0))
+
+
+def _cylinder(entry: CatalogEntry) -> tuple[float, float, float]:
+    """Cylinder about the z axis that encloses the mesh: radius, lower and upper end [m]."""
+    points = entry.mesh.vertices.astype(np.float64)
+    return float(np.linalg.norm(points[:, :2], axis=1).max()), float(points[:, 2].min()), float(points[:, 2].max())
 
 
 def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) -> wp.array:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -375,6 +376,38 @@ def test_in_layers_objects_fall_from_cells_of_their_compartments(seed, compartme
         assert gaps[~np.eye(count, dtype=bool)].min() > -1e-6
         assert (np.abs(place[:, :2] - np.array(sizes.centers)[chosen]) <= halves[chosen] - each[:, None] + 1e-6).all()
         assert place[:, 2].max() < sizes.height + each.max() + pitch * (count - 1) / 2
+
+
+@pytest.mark.parametrize("number", [2, 12])
+def test_scattered_objects_rest_on_the_rim_or_on_those_below(number, device):
+    """Cylinders about objects, their own if upright, do not overlap, are over the opening, and one clearance above what carries them."""
+    radius, clearance = np.array([0.03, 0.04, 0.05]), 0.004
+    room = {"instances": 36, "single_slots": 36, "compound_slots": 36, "counts": [(number // 2, number // 2)] * 3, "radius": radius}
+    worlds = arrangement_worlds(device, 4, **room, drop={"spread": 1.0, "clearance": clearance})
+    own = np.array([(0.015, -0.02, 0.026), (0.02, -0.03, 0.03), (0.04, -0.03, 0.03)], np.float32)
+    cylinder = wp.array(own, dtype=wp.vec3, device=device)
+    worlds.scene = dataclasses.replace(worlds.scene, upright=0.5, scattered=True, cylinder=cylinder)
+    worlds.begin(Phase.START)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    count, stacked = 3 * (number // 2), 0
+    for world in range(4):
+        entries, slots = (array.numpy()[world, :count] for array in (worlds.state.catalog_index, worlds.state.body_slot))
+        pose = worlds.coordinates()[world, slots].astype(np.float64)
+        stands = (pose[:, 3:5] == 0.0).all(axis=1)
+        assert 0 < stands.sum() < count
+        sphere = radius[entries, None] * (1.0, -1.0, 1.0)
+        wide, low, high = np.where(stands[:, None], own[entries], sphere).T
+        low, high = low + pose[:, 2], high + pose[:, 2]
+        assert (np.abs(pose[:, :2]) <= np.array(BIN.mouth) / 2 - wide[:, None] + 1e-6).all()
+        apart = np.linalg.norm(pose[:, None, :2] - pose[None, :, :2], axis=2) - wide[:, None] - wide[None]
+        near = (apart < clearance - 1e-6) & ~np.eye(count, dtype=bool)
+        assert (np.maximum(low[:, None] - high[None], low[None] - high[:, None])[near] > clearance - 1e-6).all()
+        on_rim = np.isclose(low, BIN.height + clearance, atol=1e-6)
+        carried = (near & np.isclose(low[:, None], high[None] + clearance, atol=1e-6)).any(axis=1)
+        assert (on_rim | carried).all()
+        stacked += int(carried.sum())
+    assert (stacked > 0) == (number > 2)
 
 
 def test_the_drop_uses_the_whole_spread(device):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -20,10 +22,10 @@ RENDERED = {item.name for item in load_rules().values() if item.subject is Diagn
 VISIBLE = f"{SCENE}/mask_visib/000001_000001.png"
 
 
-def measure(folder):
-    """Rules that are violated with the tolerance, and the distributions of deviations."""
+def measure(folder, tolerance=TOLERANCE):
+    """Rules that are violated with a tolerance, and the distributions of deviations."""
     summary = Summary()
-    found = {violation.rule for violation in validate(folder, Options(sample=None, threads=1, tolerance=TOLERANCE), summary)}
+    found = {violation.rule for violation in validate(folder, Options(sample=None, threads=1, tolerance=tolerance), summary)}
     return found, distributions(summary.deviations)
 
 
@@ -71,6 +73,18 @@ GROSS = {
 def test_a_gross_fault_is_still_found(copy, rule):
     GROSS[rule](copy)
     assert rule in measure(copy)[0]
+
+
+def test_depth_in_coarse_counts_is_judged_by_its_counts(copy):
+    """Counts of 4 mm are up to 2 mm off: more than 1 mm, less than the one and a half counts that no rule tells apart."""
+    path = copy / f"{SCENE}/depth/000001.png"
+    depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    scale = 4.0 / json.loads((copy / f"{SCENE}/scene_camera.json").read_text())["1"]["depth_scale"]
+    cv2.imwrite(str(path), np.round(depth / scale).astype(np.uint16))
+    edit_entry(copy, "camera", depth_scale=4.0)
+    found, measured = measure(copy, Tolerance(1.0, 3.0))
+    assert not found & {"pose", "depth-rendered"}
+    assert 1.0 < max(item.largest for item in measured if item.rule == "depth-rendered") <= 2.0 + 1e-3
 
 
 def test_a_swap_is_reported_once(copy):

@@ -45,7 +45,7 @@ class Deviation(NamedTuple):
     wrong: bool = False
     """Whether validation without a tolerance reports it as a violation."""
     explained: bool = False
-    """Whether a finding explains it. It is then part of the distribution, but not reported as a violation."""
+    """Whether a finding, or depth in coarse counts, explains it. It is then part of the distribution, but not reported as a violation."""
 
 
 Findings = Iterator[tuple[str, str] | Deviation]

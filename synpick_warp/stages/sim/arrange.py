@@ -77,12 +77,14 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Reset free worlds, stack sampled objects above the bin, and load variants and joint coordinates into the physics."""
+    """Reset free worlds, stack or scatter sampled objects above the bin, and load variants and joint coordinates into the physics."""
     sources = (scene, state, physics.state, physics.control)
     launch(drop.reset_worlds_kernel, len(state.phase), *sources)
     launch(drop.drop_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
     if scene.upright > 0.0:
         launch(drop.raise_objects_kernel, state.catalog_index.shape, *sources, seed=wp.uint64(seed))
+    if scene.scattered:
+        launch(drop.scatter_objects_kernel, len(state.phase), *sources, seed=wp.uint64(seed))
     physics.load(state.variant, state.restarted)
 
 

@@ -7,6 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
+OBJECT = "object"
+"""Part of the rows about single objects."""
+
 
 def interval(values: Sequence[float]) -> str:
     """95 % confidence interval of the mean over seeds by Student's t, as text; empty for fewer than two values."""

@@ -30,12 +30,13 @@ except ModuleNotFoundError as missing:
 
 from rich.console import Console
 
+from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run
 from tools.options import Row, configure, fail, make_parser, number_in, positive_count, print_rows, write_json
-from tools.reports.real import interval
-from tools.reports.real_frames import RealFrame, read_frames
+from tools.reports.real import OBJECT, interval
+from tools.reports.real_frames import DEPTH_SCALE, RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
@@ -43,11 +44,9 @@ FEW_WORLDS = 64
 """Maximum number of worlds for held-out views."""
 PRESET = "tabletop-train"
 """Default preset of the stream."""
-BESIDE = {"bake.mode": "mixed", "cameras.resolution": [320, 240]}
-"""Settings of the stream of --beside: episodes of stirring and picking, images of the size of the default preset's."""
-BESIDE_STRIDE = 3
-"""Every n-th frame of these episodes is taken."""
-RANGES = {"crop": number_in(0.05, 1.0), "scale": number_in(1.0, 4.0)}
+VIEWS_PER_BATCH = 48
+"""Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
+RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0)}
 """Argument types of the options that are not just non-negative numbers."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
@@ -91,28 +90,25 @@ def recipe_of(options: argparse.Namespace) -> Recipe:
 def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) -> Outcome:
     """Scores of a network on real frames, and on held-out views."""
     height, width = held.tensors()[0].shape[2:]
-    found = [predict(trained.network, frame.color, (int(width), int(height)), device) for frame in frames]
+    size = (int(width), int(height))
+    depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if held.tensors()[0].shape[1] > 3 else None for frame in frames]
+    found = [predict(trained.network, frame.color, size, device, depth) for frame, depth in zip(frames, depths, strict=True)]
     real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
     return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
 
 
 def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source, Source]:
-    """Sources of training views, and of held-out views: those of --config alone.
+    """Sources of training views, and of held-out views by all cameras.
 
     Raises:
         ConfigError: A setting is wrong.
     """
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
-    fixed |= {"render.views_per_batch": options.batch, "bake.device": device.alias}
+    fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
-    source = Source(config, TRAINING, options.stride, options.shrink)
-    held = replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT)
-    if not options.beside:
-        return source, held
-    other = argparse.Namespace(**vars(options) | {"config": options.beside, "set": []})
-    beside = Source(configure(other, fixed | BESIDE | {"bake.worlds": few}), TRAINING, BESIDE_STRIDE, options.shrink)
-    return replace(source, beside=beside), held
+    source = Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
+    return source, replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
 
 
 def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
@@ -147,7 +143,7 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
         row("loss at the end", [one.trained.losses[-1] for one in outcomes]),
     ]
     first = outcomes[0].real
-    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in first.iou]
+    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part=OBJECT) for index in first.iou]
     return rows + [row(f"{name}: mean IoU", [one.real.views[name] for one in outcomes], part="frame") for name in first.views]
 
 
@@ -221,7 +217,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "views": (24_000, "views of the stream"),
         "seeds": (3, "trainings, each with piles of its own"),
         "worlds": (512, "worlds simulated in parallel"),
-        "batch": (48, "views of a batch"),
+        "batch": (16, "views of a batch"),
         "width": (48, "channels of the network's first level"),
         "stride": (2, "every n-th frame of an episode is taken"),
         "shrink": (1, "factor by which the stream's images are reduced"),
@@ -232,22 +228,22 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
-        "passes": (4.0, "number of epochs; a crop counts as the fraction of the view that it covers"),
+        "passes": (4.0, "number of epochs"),
         "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
         "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (15.0, "half width of augmentation by rotation [°]"),
         "jitter": (0.3, "strength of photometric augmentation; 0: none"),
-        "background": (1.0, "weight of the background in the cross entropy"),
+        "jpeg": (40.0, "lowest JPEG quality of augmentation; 0: none"),
         "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
         "rate": (2e-3, "largest learning rate"),
-        "crop": (1.0, "side of random crops, as a fraction of the view's; the last fifth of the training is on whole views"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(f"--{name}", type=RANGES.get(name, number_in(0.0)), default=default, help=f"{text} (default: {default:g})")
+    parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
     parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
+    parser.add_argument("--depth", action="store_true", help="train and measure on colour and depth")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
-    parser.add_argument("--beside", default="", metavar="PRESET", help="train on views of this preset too, half and half")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")

@@ -29,7 +29,7 @@ import numpy as np
 
 from tools.figures import describe_run
 from tools.options import Row, finite_seconds, make_parser, positive_count, write_json
-from tools.reports.real import interval
+from tools.reports.real import OBJECT, interval
 
 START = 60.0
 """Time of a run beside its training [s]: imports, cached kernels, models and lights, held-out views, scores. 50 to 55 on an H200 host."""
@@ -55,14 +55,24 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
+CHOICE = ("--network", "residual", "--width", "64", "--batch", "32", "--depth")
+"""Network of the row with the most views."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
 """Number of training samples of runs with few views, equal to that of the others."""
 
+CAMERAS = ("2", "5")
+"""Cameras of the row with few positions, both 0.86 m from the middle of the table."""
+VIEWS = 8
+"""Views of a pile with all cameras."""
+
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
+HOLES = ("depth_sensor.shadows=false", "depth_sensor.edge_width=0", "depth_sensor.grazing_angle=89")
+"""Settings without what makes holes in depth."""
 LEVERS: dict[str, tuple[str, ...]] = {
+    "places": ("arrangement.drop=layers", "bins.area=[0.8,0.55]"),
     "surfaces": ("randomize.surfaces=0", "randomize.table_color={uniform=[[0.05,0.05,0.05],[0.9,0.9,0.9]]}"),
     "distractors": ("randomize.distractors=off",),
     "effects": ("effects.exposure_jitter=0", "effects.white_balance_jitter=0", *(f"effects.{name}={_OFF}" for name in _EFFECTS)),
@@ -137,11 +147,15 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("all levers, ablation's number of views", views)
     for name, settings in LEVERS.items():
         yield Run(f"without {name}", views, _settings(*settings))
-    yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0"))
-    yield Run("without photometric augmentation", views, ("--jitter", "0"))
+    yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
+    yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"))
+    yield Run("without JPEG", views, ("--jpeg", "0"))
+    yield Run("colour and depth", views, ("--depth",))
+    yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)))
+    yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000"), seeds=1, passes=2.0, limit=400.0, least=300.0)
+    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000", *CHOICE), seeds=1, passes=2.0, limit=400.0, least=300.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
     yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "16"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
@@ -229,12 +243,14 @@ def stem_of(run: Run, seed: int) -> str:
 
 
 def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
-    """Results as JSON: means over seeds of all rows that have some, with 95 % intervals by Student's t; scores and times of seeds."""
+    """Results as JSON: means over seeds of all rows that have some, with 95 % intervals by Student's t, without those by object; scores
+    and times of seeds."""
     rows: list[Row] = []
     times: dict[str, Any] = {}
     for run in dict.fromkeys(run for run, _ in jobs):
         paths = [folder / f"{stem_of(run, seed)}.json" for seed in range(run.seeds)]
-        seeds = [json.loads(path.read_text())["more"]["seeds"][0] for path in paths if path.exists()]
+        documents = [json.loads(path.read_text()) for path in paths if path.exists()]
+        seeds = [document["more"]["seeds"][0] for document in documents]
         if not seeds:
             continue
         limit = min(seed["limit"] for seed in seeds)
@@ -244,6 +260,8 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
             if values:
                 words = " ".join(word for word in (unit, interval(values), shorter) if word)
                 rows.append(Row(f"{run.name}: {label}", round(float(np.mean(values)), 4), words, part=run.name))
+        objects = [{row["name"]: row["value"] for row in document["rows"] if row["part"] == OBJECT} for document in documents]
+        rows += [Row(name, round(float(np.mean([one[name] for one in objects])), 4), part=run.name) for name in objects[0]]
         times[run.name] = {
             name: [seed[name] for seed in seeds] for name in ("views", "samples", "seconds", "stream_seconds", "limit", *METRICS)
         }

@@ -57,7 +57,7 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
             if index not in truth:
                 boxes, ids = boxes_of(classified[index].cpu().numpy())
                 truth[index] = {"boxes": torch.from_numpy(boxes).to(device), "labels": torch.from_numpy(ids).to(device)}
-        images = jitter_views(views[chosen].float() / 255, JITTER)
+        images = jitter_views(views[chosen, :3].float() / 255, JITTER)
         losses = network(list(images), [truth[index] for index in chosen])
         optimizer.zero_grad()
         torch.stack(list(losses.values())).sum().backward()

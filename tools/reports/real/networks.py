@@ -22,10 +22,10 @@ class ResidualNetwork(nn.Module):
     operations, on tensors of a quarter of the size.
     """
 
-    def __init__(self, classes: int, width: int) -> None:
+    def __init__(self, classes: int, width: int, inputs: int = 3) -> None:
         super().__init__()
         widths = [width * factor for factor in (1, 2, 4, 8)]
-        self.stem = _convolution(3, width, size=5, stride=2)
+        self.stem = _convolution(inputs, width, size=5, stride=2)
         self.down = nn.ModuleList(
             nn.Sequential(_convolution(before, after, stride=1 + (level > 0)), *(_Block(after) for _ in range(depth)))
             for level, (before, after, depth) in enumerate(zip([width, *widths], widths, DEPTHS, strict=False))
@@ -34,7 +34,7 @@ class ResidualNetwork(nn.Module):
         self.head = nn.Conv2d(width, classes, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Logits (B, classes, H, W) of an image (B, 3, H, W): uint8, or float32 as it is."""
+        """Logits (B, classes, H, W) of an image (B, inputs, H, W): uint8, or float32 as it is."""
         size = image.shape[2:]
         x, skips = self.stem(image.float().div(255).sub(0.5) if image.dtype == torch.uint8 else image), []
         for level in self.down:
@@ -64,5 +64,5 @@ def _convolution(before: int, after: int, size: int = 3, stride: int = 1) -> nn.
     return nn.Sequential(nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.ReLU())
 
 
-NETWORKS: dict[str, Callable[[int, int], nn.Module]] = {"unet": Network, "residual": ResidualNetwork}
-"""Constructors by name, of numbers of classes and of channels."""
+NETWORKS: dict[str, Callable[[int, int, int], nn.Module]] = {"unet": Network, "residual": ResidualNetwork}
+"""Constructors by name, of numbers of classes, of channels and of input channels."""

@@ -16,7 +16,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from tools.reports.real.views import Pool
+from tools.reports.real.views import Pool, code_depth
 
 FOUND_IOU = 0.5
 """IoU above which an instance counts as found."""
@@ -48,10 +48,17 @@ class Scores:
         return float(np.mean([iou > FOUND_IOU for _, _, iou in self.instances])) if self.instances else float("nan")
 
 
-def predict(network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device) -> np.ndarray:
-    """obj_id of each pixel (H, W) uint8 of a colour image (H, W, 3) uint8; the network sees it at `size` (width, height)."""
+def predict(
+    network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device, depth: np.ndarray | None = None
+) -> np.ndarray:
+    """obj_id of each pixel (H, W) uint8 of a colour image (H, W, 3) uint8, which the network sees at `size` (width, height), with depth
+    (H, W) [m] if there is some."""
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
-    image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None].to(device)
+    image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
+    if depth is not None:
+        nearest = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        image = torch.cat((image, code_depth(torch.from_numpy(nearest))[None, None]), dim=1)
+    image = image.to(device)
     with torch.no_grad():
         logits = network(image).float()
         logits = functional.interpolate(logits, size=color.shape[:2], mode="bilinear", align_corners=False)

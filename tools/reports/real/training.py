@@ -1,8 +1,7 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
 AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
-borders) and photometric (gain, contrast, saturation, gamma, blur, noise), each image by its own draw. Most of a training may use
-random crops at full scale, of which a GPU processes more in the same time.
+borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
 from __future__ import annotations
@@ -10,25 +9,30 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import cache
 
+import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from tools.examples.train_online import LEARNING_RATE, MIN_SIDE, WARM_UP
+from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
+from tools.examples.train_online import LEARNING_RATE, WARM_UP
 from tools.reports.real.networks import NETWORKS
 from tools.reports.real.views import Pool, Source
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
+YCC = (LUMA, (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
+"""Y, Cb and Cr of red, green and blue (JFIF)."""
+BLOCK = 8
+"""Side of a JPEG block [px]."""
 LEAST_RATE = 0.01
 """Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
 FILLING = 0.5
 """Largest fraction of the time limit that passes before the first step, while the stream fills the pool."""
-WHOLE = 0.2
-"""Last fraction of the schedule. It trains on whole views even if the rest trains on crops, so that batch normalization adapts to them."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class Recipe:
     views: int
     """Views of the stream."""
     passes: float
-    """Number of epochs; a crop counts as the fraction of the view that it covers."""
+    """Number of epochs."""
     batch: int
     width: int
     """Channels of the network's first level."""
@@ -52,16 +56,16 @@ class Recipe:
     """Largest rotation in each direction [°]."""
     jitter: float = 0.3
     """Strength of the photometric augmentation; 0: none."""
-    background: float = 1.0
-    """Class weight of the background in the cross entropy."""
+    jpeg: float = 40.0
+    """Lowest JPEG quality of the photometric augmentation; 0: no JPEG."""
     dice: float = 0.0
     """Weight of the Dice loss, which is added to the cross entropy."""
     rate: float = LEARNING_RATE
     """Peak learning rate of the schedule."""
-    crop: float = 1.0
-    """Side of random crops, as a fraction of the view's; 1: no crops."""
     network: str = "unet"
     """Architecture: a key of NETWORKS."""
+    depth: bool = False
+    """Whether the network sees depth beside colours."""
     compiled: bool = False
     """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
 
@@ -78,28 +82,22 @@ class Trained:
     """Total time [s]."""
     views: int
     samples: int
-    """Views or crops trained on, repeats counted."""
+    """Views trained on, repeats counted."""
 
 
-def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders.
-
-    With `crop` below 1, random crops with that fraction of the view's sides are returned; sides are multiples of MIN_SIDE [px].
-    """
-    count, *sides = classes.shape
-    height, width = (side if crop == 1 else max(MIN_SIDE, round(side * crop / MIN_SIDE) * MIN_SIDE) for side in sides)
+def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
+    """Geometric augmentation of images (B, 3 or 4, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored
+    borders. Depth, the fourth channel, is of the nearest pixel, and becomes less as objects become larger."""
+    count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
-    factor, angle = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation if recipe.scale > 1 else 0.0)
-    aspect = sides[0] / sides[1]
-    across, down = factor * (width / sides[1]), factor * (height / sides[0])
-    rows = [
-        torch.stack([across * angle.cos(), -down * angle.sin() * aspect, (across - 1).abs() * draw[2]], 1),
-        torch.stack([across * angle.sin() / aspect, down * angle.cos(), (down - 1).abs() * draw[3]], 1),
-    ]
+    factor, angle, aspect = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation), height / width
+    cosine, sine, reach = factor * angle.cos(), factor * angle.sin(), (factor - 1).abs()
+    rows = [torch.stack([cosine, -sine * aspect, reach * draw[2]], 1), torch.stack([sine / aspect, cosine, reach * draw[3]], 1)]
     grid = functional.affine_grid(torch.stack(rows, 1), [count, 1, height, width], align_corners=False)
-    images = functional.grid_sample(images, grid, "bilinear", "reflection", align_corners=False)
+    depth = functional.grid_sample(images[:, 3:], grid, "nearest", "reflection", align_corners=False) * factor.view(-1, 1, 1, 1)
+    images = functional.grid_sample(images[:, :3], grid, "bilinear", "reflection", align_corners=False)
     labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
-    return images, labels[:, 0].round().long()
+    return torch.cat((images, depth.clamp(max=1)), dim=1), labels[:, 0].round().long()
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
@@ -121,22 +119,51 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     return (images + level * torch.randn_like(images)).clamp(0, 1)
 
 
-def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Network input (B, 3, H, W) float32 in -0.5..0.5 and classes, after augmentation and random cropping."""
+@cache
+def _jpeg_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Quantization tables (quality, 3, 8, 8) of levels 0..1, and the orthonormal DCT matrix (8, 8)."""
+    tables = np.empty((QUALITIES, 2, BLOCK * BLOCK), np.float32)
+    for quality in range(QUALITIES):
+        tables[quality, :, zigzag_order()] = quantization(quality).T / 255.0
+    frequency, place = np.mgrid[:BLOCK, :BLOCK]
+    matrix = np.cos((2 * place + 1) * frequency * np.pi / (2 * BLOCK)) * np.where(frequency, 0.5, 0.5**1.5)
+    channels = tables.reshape(QUALITIES, 2, BLOCK, BLOCK)[:, [0, 1, 1]]
+    return torch.from_numpy(channels).to(device), torch.from_numpy(matrix.astype(np.float32)).to(device)
+
+
+def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
+    """Images (B, 3, H, W) in 0..1 after JPEG compression of an integer `quality` each (B), without chroma subsampling: an image that a
+    camera compresses at twice the size has chroma of full size once it is reduced. Sides are multiples of BLOCK [px]."""
+    tables, dct = _jpeg_tables(images.device)
+    count, _, height, width = images.shape
+    matrix = images.new_tensor(YCC)
+    values = torch.einsum("kc,bchw->bkhw", matrix, images) - images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
+    blocks = values.view(count, 3, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
+    steps = tables[quality].view(count, 3, 1, BLOCK, 1, BLOCK)
+    levels = torch.einsum("ui,bkyixj,vj->bkyuxv", dct, blocks, dct).div(steps).round_().mul_(steps)
+    values = torch.einsum("ui,bkyuxv,vj->bkyixj", dct, levels, dct).reshape(count, 3, height, width)
+    values = values + images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
+    return torch.einsum("ck,bkhw->bchw", torch.linalg.inv(matrix), values).clamp(0, 1)
+
+
+def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
+    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation."""
     values = images.float() / 255
-    if recipe.scale > 1 or crop < 1:
-        values, classes = warp_views(values, classes, recipe, crop)
-    if recipe.jitter:
-        values = jitter_views(values, recipe.jitter)
-    return values - 0.5, classes
+    if recipe.scale > 1:
+        values, classes = warp_views(values, classes, recipe)
+    colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
+    if recipe.jpeg:
+        quality = recipe.jpeg + (QUALITIES - recipe.jpeg) * torch.rand(len(values), device=values.device)
+        colors = compress_views(colors, quality.long().clamp(1, QUALITIES - 1))
+    return torch.cat((colors, values[:, 3:]), dim=1) - 0.5, classes
 
 
-def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, weights: torch.Tensor, dice: float) -> torch.Tensor:
-    """Cross entropy of logits (B, C, H, W) with class weights (C), and `dice` times the Dice loss: over the pixels of the batch, averaged
+def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) -> torch.Tensor:
+    """Cross entropy of logits (B, C, H, W), and `dice` times the Dice loss: over the pixels of the batch, averaged
     over the objects that occur in it. `classes` (B, H, W) int64; class 0 is the background."""
     # A view where channels are last in memory; softmax then reads rows.
     rows, truth = logits.permute(0, 2, 3, 1).flatten(0, 2).float(), classes.flatten()
-    loss = functional.cross_entropy(rows, truth, weights)
+    loss = functional.cross_entropy(rows, truth)
     if dice:
         shares = rows.softmax(1)
         exact = torch.zeros_like(shares).scatter_(1, truth[:, None], 1.0)
@@ -153,15 +180,12 @@ class _Trainer:
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
-        self.network = NETWORKS[recipe.network](classes, recipe.width).to(device, memory_format=torch.channels_last)
+        self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network
         self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
-        self.weights = torch.ones(classes, device=device)
-        self.weights[0] = recipe.background
-        area = (1 - WHOLE) * recipe.crop**2 + WHOLE
-        self.total = max(1, round(recipe.views * recipe.passes / (recipe.batch * area)))
+        self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
         """Time before the first step, in which the stream filled the pool [s]."""
@@ -177,12 +201,11 @@ class _Trainer:
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        crop = self.recipe.crop if done < 1 - WHOLE else 1.0
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, crop)
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.logits(images)
-        loss = self.loss(logits, classes, self.weights, self.recipe.dice)
+        loss = self.loss(logits, classes, self.recipe.dice)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)

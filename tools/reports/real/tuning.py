@@ -1,6 +1,6 @@
 """Hyper-parameter search on synthetic views: trials train on one pool of views, each for --seconds, and are ranked by held-out mIoU.
 
-A trial names the hyper-parameters that it changes, as `dice=1,background=0.3`; `base` changes none. Photographs are scored too, into the
+A trial names the hyper-parameters that it changes, as `dice=1,batch=48`; `base` changes none. Photographs are scored too, into the
 trial's JSON only: they are not printed, and nothing is chosen by them. Trials with results in --out are not repeated.
 
     python -m tools.reports.real.tuning --real REAL --models YCB --lights HDRI --passes 1000 --seconds 90 --out OUT base dice=1
@@ -27,7 +27,7 @@ SLACK = 15.0
 """Time that a trial takes beside its training, for scores and files [s]."""
 
 
-SHARED = ("views", "capacity", "seconds")
+SHARED = ("views", "capacity", "seconds", "depth")
 """Hyper-parameters that all trials share, by the options of these names."""
 
 

@@ -16,6 +16,14 @@ from torch.nn import functional  # pyright: ignore[reportMissingImports]
 from synpick_warp.configs.schema import Config
 from synpick_warp.online.dataset import StreamDataset
 
+FARTHEST = 1.5
+"""Depth that is coded by 255 [m], and all beyond: objects are nearer, and what is behind them differs from room to room."""
+
+
+def code_depth(depth: torch.Tensor) -> torch.Tensor:
+    """Depth [m] as uint8: 255 at FARTHEST, 0 where it is not measured."""
+    return depth.mul(255 / FARTHEST).round_().clamp_(0, 255).to(torch.uint8)
+
 
 @dataclass(frozen=True, eq=False)
 class Source:
@@ -27,31 +35,24 @@ class Source:
     """Every n-th frame of an episode."""
     shrink: int = 1
     """Factor by which images are reduced."""
-    beside: Source | None = None
-    """Another source, of images of the same size, whose batches come in turns with these."""
+    cameras: tuple[int, ...] | None = None
+    """Indices of the cameras whose views are taken; None: all."""
+    depth: bool = False
+    """Whether images have depth as a fourth channel, by `code_depth`."""
 
     def batches(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Images (B, 3, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken, of all sources in turns."""
-        waiting = [self._own(), *([self.beside.batches()] if self.beside is not None else [])]
-        try:
-            while waiting:
-                source = waiting.pop(0)
-                if (batch := next(source, None)) is not None:
-                    yield batch
-                    waiting.append(source)
-        finally:
-            for source in waiting:
-                source.close()
-
-    def _own(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Batches of the stream of these settings."""
-        dataset = StreamDataset(self.config, fields=("rgb", "classes"), episodes=self.episodes, stride=self.stride)
+        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken."""
+        fields = ("rgb", "classes", "depth") if self.depth else ("rgb", "classes")
+        dataset = StreamDataset(self.config, fields=fields, episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
             image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
+            half = self.shrink // 2
             if self.shrink > 1:
-                half = self.shrink // 2
                 image = functional.avg_pool2d(image.float(), self.shrink).round_().to(torch.uint8)
                 classes = classes[:, half :: self.shrink, half :: self.shrink][:, : image.shape[2], : image.shape[3]]
+            if self.depth:
+                depth = code_depth(batch["depth"])[:, :, half :: self.shrink, half :: self.shrink]
+                image = torch.cat((image, depth[:, :, : image.shape[2], : image.shape[3]]), dim=1)
             yield image, classes
 
 
@@ -60,7 +61,7 @@ class Pool:
     """Replay buffer of views on the device; once full, new ones replace random ones.
 
     Attributes:
-        images: (N, 3, H, W) uint8.
+        images: (N, 3 or 4, H, W) uint8.
         classes: obj_ids (N, H, W) uint8.
     """
 
@@ -104,7 +105,7 @@ class Pool:
         return self.seen >= views
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Batch of random views, drawn with replacement: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
+        """Batch of random views, drawn with replacement: images (size, 3 or 4, H, W) uint8, obj_ids (size, H, W) int64."""
         images, classes = self.tensors()
         chosen = torch.randint(self.count, (size,), generator=self._random).to(images.device)
         return images[chosen], classes[chosen].long()

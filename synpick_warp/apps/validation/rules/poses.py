@@ -27,7 +27,8 @@ def _declare(name: str, sentence: str, cure: str, *kinds: Kind) -> None:
             yield _file(rendered, finding.kind, finding.index), finding.text
         for index, value in rendered.deviations[kinds[0]] if unit and rendered.given is not None else ():
             text = f"image {rendered.view.image}, instance {index}: {_DEVIATIONS[kinds[0]]} {value:.3g} {unit}"
-            explained = any(finding.explains(index, unit) for finding in rendered.findings)
+            coarse = unit == "mm" and value <= rendered.tolerance
+            explained = coarse or any(finding.explains(index, unit) for finding in rendered.findings)
             file = _file(rendered, Kind.SHIFT_VISIBLE if kinds[0] is Kind.SHIFT else kinds[0], index)
             yield Deviation(file, text, rendered.view.truths[index].obj_id, value, explained=explained)
 
