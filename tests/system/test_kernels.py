@@ -99,6 +99,29 @@ def test_a_launch_waits_for_the_thread_that_compiles_its_module(device, empty_ca
     assert (reports[0], reports[-1], compiler.compiled) == ((0, 1), (1, 1), 1)
 
 
+def test_hashes_that_warp_drops_meanwhile_are_made_again(device, empty_cache, monkeypatch):
+    """As by an overload that another thread registers while a module compiles: its load ends with a KeyError, and the next one succeeds."""
+    scale, load, loads = make_kernel(17.0), wp.Module.load, []
+
+    def load_without_hashes(module, *arguments, **options):
+        loads.append(module)
+        done = load(module, *arguments, **options)
+        if len(loads) == 1:
+            module.mark_modified()
+            return module.hashers[1]
+        return done
+
+    monkeypatch.setattr(wp.Module, "load", load_without_hashes)
+    values = wp.ones(4, dtype=float, device=device)
+    with Compiler(lambda *_: None) as compiler:
+        compiler.submit([build_of(scale, device)])
+        wp.launch(scale, dim=4, inputs=[values], device=device)
+    np.testing.assert_array_equal(values.numpy(), 17.0)
+    assert compiler.compiled == 1
+    assert len(loads) > 1
+    assert len(kernels.list_binaries()) == 1
+
+
 def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
     builds = [build_of(make_kernel(9.0 + index), device) for index in range(MODULES)]
 

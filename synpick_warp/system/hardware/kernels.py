@@ -200,8 +200,16 @@ class Compiler:
         # All are looked up before the first is compiled: names of modules are hashes of kernels, and compiling threads change these.
         missing = [build for build in builds if build not in self._tasks and build != self._last and not build.is_cached()]
         for build in missing:
-            self._tasks[build] = self._pool.submit(self._load, build.module, build.device, build.block)
+            self._tasks[build] = self._pool.submit(self._compile, build)
         self._say()
+
+    def _compile(self, build: ModuleBuild) -> None:
+        """Compile and load a module, in a thread of the pool."""
+        try:
+            self._load(build.module, build.device, build.block)
+        except KeyError:
+            # Another thread has registered an overload of a kernel, so Warp has dropped the hashes of the module; the binary is cached.
+            self._load(build.module, build.device, build.block)
 
     def _await(self, build: ModuleBuild) -> None:
         """Wait for a module that a launch needs; without a task it is counted as one that the launch will compile."""
