@@ -97,7 +97,7 @@ def bake_episodes(
     episodes: Sequence[int],
     devices: Sequence[str] = (),
     deliver: Callable[[], None] | None = None,
-    build: Callable[..., Factory] = build_factory,
+    build: Callable[..., Factory] | None = None,
 ) -> BakeSummary:
     """Generate these episodes of a data set in a folder, or the remaining ones of them.
 
@@ -108,7 +108,7 @@ def bake_episodes(
         episodes: Indices, sorted.
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
-        build: Builds the stages of one device, as `build_factory`.
+        build: Builds the stages of one device; None: `build_factory`.
 
     Raises:
         SynpickError: As `run_bake`.
@@ -128,7 +128,7 @@ def bake_episodes(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if advice := advise_processes(config, names, len(output.remaining)):
                     progress.note(advice)
-                _fill(output, needs, names, summary, progress, deliver, build)
+                _fill(output, needs, names, summary, progress, deliver, build or build_factory)
         except OutputError as error:
             if out.exists():
                 raise
