@@ -45,12 +45,12 @@ _ENDING, _STOPPING = 30.0, 120.0
 MAX_DEATHS = 5
 """Deaths of a worker and its successors without an episode between them, after which the bake ends with an error."""
 _SAID = 300
-"""Longest part of a message of Ray's that is passed on [characters]."""
+"""Maximum length of an error message of Ray that is shown; longer ones are cut [characters]."""
 STORE_BYTES = 100 << 20
 """Size of a local cluster's object store [B]: workers send counts."""
 _ENGINE, _PLACE = re.compile(r"ray(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{1,5})?"), re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
-"""Variables that Ray reads when it starts: it reports to nobody, and warns of nothing."""
+"""Environment variables of Ray: usage statistics and warnings are off."""
 
 
 @dataclass
@@ -60,13 +60,13 @@ class Crew:
     engine: str = ENGINE
     """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client."""
     workers: int = 0
-    """Number of workers; 0: one for each GPU of the cluster, or each CPU core where `bake.device` is cpu, also of those that come later."""
+    """Number of workers; 0: one a GPU of the cluster, or one a CPU core with `bake.device` cpu, growing with the cluster."""
     price: float = 0.0
     """Price of a worker an hour."""
     alive: int = 0
-    """Number of workers that run."""
+    """Number of running workers."""
     seconds: float = 0.0
-    """Time that workers have run, all together [s]."""
+    """Accumulated running time of all workers [s]."""
 
     def __str__(self) -> str:
         cost = f" · cost {self.price * self.seconds / 3600.0:,.2f}" if self.price else ""

@@ -43,7 +43,7 @@ class Report:
     """Counts of a worker since its start, and what is new since its last report."""
 
     busy: bool = False
-    """Whether it bakes a chunk; otherwise it looks for one, or waits for other workers."""
+    """Whether it is baking a chunk; False: it is looking for a free chunk, or waiting for other workers."""
     episodes: int = 0
     views: int = 0
     worlds: int = 0

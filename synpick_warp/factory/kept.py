@@ -1,4 +1,4 @@
-"""Bakes that follow one another in a process without a new start: objects, lights, worlds, renderer and captured graphs are kept."""
+"""Cache of a bake's stages: successive bakes of a process reuse objects, lights, worlds, renderer and captured graphs."""
 
 from __future__ import annotations
 

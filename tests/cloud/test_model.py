@@ -1,4 +1,4 @@
-"""Model of claiming workers by what is known without it: constant rates, limits, losses, a measured bake, requests of a real worker."""
+"""Discrete-event model of claiming workers against analytic cases (rates, limits, losses), a measured bake and counted requests."""
 
 from __future__ import annotations
 

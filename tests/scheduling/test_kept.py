@@ -1,4 +1,4 @@
-"""Bakes that follow one another with kept worlds: the bytes of one bake, and new worlds where the kept ones do not do."""
+"""Reuse of worlds by successive bakes: same bytes as a single bake, and a rebuild when settings or episode counts demand it."""
 
 from __future__ import annotations
 

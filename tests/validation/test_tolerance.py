@@ -23,7 +23,7 @@ VISIBLE = f"{SCENE}/mask_visib/000001_000001.png"
 
 
 def measure(folder, tolerance=TOLERANCE):
-    """Rules that are violated with a tolerance, and the distributions of deviations."""
+    """Validate with a tolerance: the violated rules, and the distributions of the deviations."""
     summary = Summary()
     found = {violation.rule for violation in validate(folder, Options(sample=None, threads=1, tolerance=tolerance), summary)}
     return found, distributions(summary.deviations)

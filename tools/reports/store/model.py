@@ -107,15 +107,15 @@ class Outcome:
     """Result of a simulated bake."""
 
     seconds: float = 0.0
-    """Until the last end mark."""
+    """Time until the last chunk ends [s]."""
     finalization: float = 0.0
-    """After that: the indices, by one worker [s]."""
+    """Time of one worker to write the indices after that [s]."""
     views: float = 0.0
-    """Delivered views, each once."""
+    """Delivered views; duplicates are not counted."""
     wasted: float = 0.0
-    """Views that were made and lost, or made twice."""
+    """Wasted views: rendered but lost with their worker, or rendered by two workers."""
     busy: float = 0.0
-    """Time of workers from their start to the end, all together [s]."""
+    """Accumulated time of all workers from their start to the end [s]."""
     requests: Counter[str] = field(default_factory=Counter)
     """Answered requests: write, read, list, and among the writes those of claims: claim, heartbeat."""
     refused: float = 0.0
@@ -151,7 +151,7 @@ class Simulation:
         self.left = self.length.astype(float)
         """Episodes of each chunk without done mark."""
         self.until = np.full(len(bounds), -1.0)
-        """Expiry of each chunk's lease; negative: it has none [s]."""
+        """Expiry time of each chunk's lease [s]; negative: the chunk is not leased."""
         self.owner = np.full(len(bounds), -1)
         self.over = np.zeros(len(bounds), bool)
         self.out, self.now, self.active = Outcome(), 0.0, 0

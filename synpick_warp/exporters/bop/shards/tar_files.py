@@ -134,7 +134,7 @@ def known_keys(shard: Path) -> Path:
 
 
 def key_lines(shard: Path) -> bytes:
-    """`"key": shard index` for each view of a shard, as lines of a JSON object."""
+    """Key table of a shard: a line `"key": shard index` of a JSON object for each view."""
     keys = dict.fromkeys(name.partition(".")[0] for name, _, _ in list_members(shard, _ADVICE))
     return "".join(f"{json.dumps(key)}: {shard_index(shard)}\n" for key in keys).encode()
 
