@@ -144,7 +144,8 @@ class Worker:
 
     def work(self) -> str | int:
         """Bake until nothing is left; returns an empty string then, an error that the user can correct, or the signal that stopped it."""
-        import ray  # type: ignore[reportMissingImports]  # An actor has it.
+        import ray  # An actor has it.
+        import ray.exceptions
 
         board, version, data, device, cores, number = self._given
         if version != __version__:
