@@ -21,7 +21,7 @@ from tools.reports.real import OBJECT, ablation, interval  # noqa: E402
 from tools.reports.real.__main__ import PRESET  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS  # noqa: E402
-from tools.reports.real.training import Recipe, compress_views, segmentation_loss, train, warp_views  # noqa: E402
+from tools.reports.real.training import Recipe, compress_views, halve_views, segmentation_loss, train, warp_views  # noqa: E402
 from tools.reports.real.tuning import changed  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
 
@@ -39,6 +39,28 @@ def test_scores_of_a_known_prediction():
     assert made.found == 0.5
     assert made.background == pytest.approx(1 / 14)
     assert made.views == {"a": 0.75}
+
+
+def test_predictions_are_averaged_over_sizes():
+    """A network that names bright pixels, and is sure only where its image is large."""
+
+    def network(image):
+        bright = (image[:, :1].float() > 100).float()
+        return torch.cat((torch.zeros_like(bright), (2 * bright - 1) * image.shape[3] / 10), dim=1)
+
+    color = np.zeros((24, 40, 3), np.uint8)
+    color[5:12, 9:28] = 200
+    shown = [scores.predict(network, color, (20, 12), torch.device("cpu"), scales=scales) for scales in ((1.0,), (1.0, 2.0))]
+    truth = color[..., 0] > 0
+    assert (shown[0] != truth).mean() > (shown[1] != truth).mean() == 0.0
+
+
+def test_halved_views_are_means_and_single_pixels():
+    images, classes = torch.arange(4 * 16.0).view(1, 4, 4, 4), torch.arange(16).view(1, 4, 4)
+    colors, labels = halve_views(images, classes)
+    assert labels.tolist() == [[[5, 7], [13, 15]]]
+    assert colors[0, 0].tolist() == [[2.5, 4.5], [10.5, 12.5]]
+    assert colors[0, 3].tolist() == [[53.0, 55.0], [61.0, 63.0]]
 
 
 def test_the_interval_is_students():
@@ -107,7 +129,7 @@ def test_a_trial_changes_what_it_names():
     assert changed(RECIPE, "base") == RECIPE
     made = changed(RECIPE, "dice=1,network=residual,width=4")
     assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
-    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "jpeg=101", "batch=0", "network=foo", "views=3", "depth=1"):
+    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "jpeg=101", "half=2", "batch=0", "network=foo", "views=3", "depth=1"):
         with pytest.raises(SynpickError):
             changed(RECIPE, text)
 
@@ -147,7 +169,7 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0, depth=True)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0, depth=True, half=0.5)
     trained, _ = train(Drawn(most=4, channels=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
     assert trained.samples == 16

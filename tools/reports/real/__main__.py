@@ -46,8 +46,10 @@ PRESET = "tabletop-train"
 """Default preset of the stream."""
 VIEWS_PER_BATCH = 48
 """Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
-RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0)}
+RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0), "half": number_in(0.0, 1.0)}
 """Argument types of the options that are not just non-negative numbers."""
+SCALES = (0.8, 1.0, 1.25)
+"""Factors of the image's size over which predictions are averaged for `Outcome.averaged`: within those of the augmentation."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
@@ -58,6 +60,8 @@ class Outcome:
 
     trained: Trained
     real: Scores
+    averaged: Scores
+    """Scores on photographs of predictions that are averaged over SCALES."""
     synthetic: Scores
     overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
@@ -92,10 +96,14 @@ def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) 
     height, width = held.tensors()[0].shape[2:]
     size = (int(width), int(height))
     depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if held.tensors()[0].shape[1] > 3 else None for frame in frames]
-    found = [predict(trained.network, frame.color, size, device, depth) for frame, depth in zip(frames, depths, strict=True)]
-    real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
+
+    def scored(scales: tuple[float, ...]) -> tuple[Scores, list[np.ndarray]]:
+        found = [predict(trained.network, frame.color, size, device, depth, scales) for frame, depth in zip(frames, depths, strict=True)]
+        return score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS), found
+
+    real, found = scored((1.0,))
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
-    return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
+    return Outcome(trained, real, scored(SCALES)[0], score_pool(trained.network, held, 1 + MODELS), overlay)
 
 
 def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source, Source]:
@@ -130,6 +138,8 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
         row("real frames: mIoU", [one.real.mean_iou for one in outcomes]),
         row("real frames: instances with IoU above 0.5", [100 * one.real.found for one in outcomes], "%"),
         row("real frames: background taken for objects", [100 * one.real.background for one in outcomes], "%"),
+        row("real frames, averaged over sizes: mIoU", [one.averaged.mean_iou for one in outcomes]),
+        row("real frames, averaged over sizes: instances with IoU above 0.5", [100 * one.averaged.found for one in outcomes], "%"),
         row("synthetic, held out: mIoU", [one.synthetic.mean_iou for one in outcomes]),
         row("synthetic, held out: instances with IoU above 0.5", [100 * one.synthetic.found for one in outcomes], "%"),
         row("synthetic, held out: background taken for objects", [100 * one.synthetic.background for one in outcomes], "%"),
@@ -192,6 +202,8 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
             "mean_iou": one.real.mean_iou,
             "found": one.real.found,
             "background": one.real.background,
+            "averaged_mean_iou": one.averaged.mean_iou,
+            "averaged_found": one.averaged.found,
             "synthetic_mean_iou": one.synthetic.mean_iou,
             "instances": one.real.instances,
             "losses": one.trained.losses,
@@ -236,6 +248,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "jpeg": (40.0, "lowest JPEG quality of augmentation; 0: none"),
         "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
         "rate": (2e-3, "largest learning rate"),
+        "half": (0.0, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():

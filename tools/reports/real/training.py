@@ -66,6 +66,8 @@ class Recipe:
     """Architecture: a key of NETWORKS."""
     depth: bool = False
     """Whether the network sees depth beside colours."""
+    half: float = 0.0
+    """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
     compiled: bool = False
     """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
 
@@ -146,11 +148,20 @@ def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
     return torch.einsum("ck,bkhw->bchw", torch.linalg.inv(matrix), values).clamp(0, 1)
 
 
-def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
-    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation."""
+def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (B, 3 or 4, H, W) and classes (B, H, W) of half the size: means of colours, depth and class of one pixel of four."""
+    colors = functional.avg_pool2d(images[:, :3], 2)
+    nearest = (..., slice(1, None, 2), slice(1, None, 2))
+    return torch.cat((colors, images[:, 3:][nearest]), dim=1), classes[nearest]
+
+
+def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, half: bool) -> tuple[torch.Tensor, torch.Tensor]:
+    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation; of half the size if `half`."""
     values = images.float() / 255
     if recipe.scale > 1:
         values, classes = warp_views(values, classes, recipe)
+    if half:
+        values, classes = halve_views(values, classes)
     colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
     if recipe.jpeg:
         quality = recipe.jpeg + (QUALITIES - recipe.jpeg) * torch.rand(len(values), device=values.device)
@@ -201,7 +212,7 @@ class _Trainer:
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe)
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, done < self.recipe.half)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.logits(images)
