@@ -66,7 +66,7 @@ def predict(
         depth: Depth (H, W) [m], if the network sees it.
         scales: Factors of the size.
     """
-    total = 0.0
+    shares = []
     for scale in scales:
         own = round(scale * size[0]), round(scale * size[1])
         small = cv2.resize(color, own, interpolation=cv2.INTER_AREA)
@@ -77,9 +77,8 @@ def predict(
             image = torch.cat((image, code_depth(torch.from_numpy(nearest))[None, None]), dim=1)
         with torch.no_grad():
             logits = network(image.to(device)).float()
-            total += functional.interpolate(logits, size=color.shape[:2], mode="bilinear", align_corners=False).softmax(1)
-    assert isinstance(total, torch.Tensor)
-    return total.argmax(1)[0].to(torch.uint8).cpu().numpy()
+            shares.append(functional.interpolate(logits, size=color.shape[:2], mode="bilinear", align_corners=False).softmax(1)[0])
+    return torch.stack(shares).mean(0).argmax(0).to(torch.uint8).cpu().numpy()
 
 
 def score(predictions: Iterable[tuple[str, np.ndarray, np.ndarray]], classes: int, least: int = 1) -> Scores:
