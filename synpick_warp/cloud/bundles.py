@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import os
 import re
 import struct
 import tarfile
@@ -27,6 +28,8 @@ from synpick_warp.system.inputs.paths import path_inside
 
 MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""
+_LINES = re.compile(rf"{re.escape(LINES)}(?:/[^./][^/]*)+")
+"""Names of lines in an index file: inside of LINES, which only `unpack_bundle` fills."""
 _LENGTH = struct.Struct("<Q")
 """In a block: length prefix of each index file [B]."""
 
@@ -84,14 +87,14 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
             raise DatasetError(f"{source} is damaged: it is cut off or too large; delete it and its block's mark, and resume the bake")
         with tarfile.open(fileobj=io.BytesIO(plain), mode="r:") as archive:
             for info in archive:
-                is_lines, content = info.name.startswith(f"{LINES}/"), archive.extractfile(info)
+                is_lines, content = _LINES.fullmatch(info.name), archive.extractfile(info)
                 if content is None or not (is_lines or indexed.fullmatch(info.name)):
-                    raise DatasetError(
-                        f"{source} is damaged: it has {info.name[:80]!r}; delete it and its block's mark, and resume the bake"
-                    )
-                path = path_inside(folder, info.name, source, DatasetError)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with path.open("ab" if is_lines else "wb") as file:
+                    advice = "delete it and its block's mark, and resume the bake"
+                    raise DatasetError(f"{source} is damaged: it has {info.name[:80]!r}; {advice}")
+                path = folder / info.name if is_lines else path_inside(folder, info.name, source, DatasetError)
+                if not os.path.exists(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                with open(path, "ab" if is_lines else "wb") as file:
                     file.write(content.read())
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None

@@ -65,15 +65,14 @@ def open_with_marks(episodes: int, kind: str, make: bool) -> Store:
 
 def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
     """Index file of another episode with the same content."""
-    cameras = len(tiny().rig)
+    first = len(tiny().rig) * episode
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name, data in members:
             if name.startswith(f"{LINES}/"):
-                scene = cameras * episode
-                data = re.sub(rb'"00000(\d)_', lambda found: b'"%06d_' % (scene + int(found[1])), data)
+                data = re.sub(rb'"00000(\d)_', lambda found: b'"%06d_' % (first + int(found[1])), data)
                 data = re.sub(rb'"episode": 0\b', b'"episode": %d' % episode, data)
-                data = re.sub(rb'"scene_id": (\d)\b', lambda found: b'"scene_id": %d' % (scene + int(found[1])), data)
+                data = re.sub(rb'"scene_id": (\d)\b', lambda found: b'"scene_id": %d' % (first + int(found[1])), data)
             info = tarfile.TarInfo(name)
             info.size = len(data)
             archive.addfile(info, io.BytesIO(data))
