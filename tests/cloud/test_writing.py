@@ -203,6 +203,10 @@ def _unset(server, monkeypatch) -> None:
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
 
 
+def _set_endpoint(address: str):
+    return lambda server, monkeypatch: monkeypatch.setenv("AWS_ENDPOINT_URL_S3", address)
+
+
 def _fail(fault: str, *methods: str):
     def prepare(server, monkeypatch) -> None:
         server.fault = lambda method, path: fault if method in methods else None
@@ -219,18 +223,32 @@ def _fail(fault: str, *methods: str):
         (_fail("403 RequestTimeTooSkewed", "PUT"), None, "the clock of this machine differs"),
         (_fail("late clock", "HEAD"), None, "the clock of this machine differs"),
         (_fail("", ""), "s3://", "names no bucket"),
+        (_set_endpoint("127.0.0.1:9"), None, "AWS_ENDPOINT_URL_S3 is 127.0.0.1:9; set it to the address of a server"),
         (_fail("", ""), "nowhere://a/b", "nowhere"),
         (_fail("", ""), "memory://a/..", "has a part . or .."),
         (_fail("", ""), "file:///proc/none", "cannot be opened"),
         (_fail("", ""), "file:///tmp/typo-of/a-folder", "typo-of is no folder; make it"),
     ],
-    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme", "dots", "folder", "parent"],
+    ids=[
+        "credentials",
+        "bucket",
+        "read-only",
+        "skew refused",
+        "skew measured",
+        "no bucket",
+        "endpoint",
+        "scheme",
+        "dots",
+        "folder",
+        "parent",
+    ],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
     prepare(server, monkeypatch)
     message = mistake("bake", "--config", "smoke", "--out", url or prefix, "--device", "cpu")
     assert said in message
     server.fault = lambda method, path: None
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", "")  # As if it was unset.
     if prepare is not _unset:
         assert stored(prefix) == {}
 
