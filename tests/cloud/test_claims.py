@@ -278,10 +278,11 @@ def test_workers_killed_fifty_times_leave_the_set_of_one_bake(prefix, tmp_path):
 
 
 @pytest.mark.slow
-def test_workers_of_several_devices_share_a_set(prefix, local):
+def test_workers_of_several_devices_share_a_set(prefix, tmp_path):
     """Each device has one process for all of its chunks; the settings in the store are those of the command."""
     job = Job(tiny(), prefix, bake=scripted_bake.bake_episodes, lease=60.0)
     summary = bake_with_devices(job, ("cpu", "cpu"), SilentProgress())
     assert (summary.total, summary.stopped) == (EPISODES, 0)
-    assert stored(prefix) == local
+    scripted_bake.bake(tmp_path / "local", tiny().with_values({"bake.device": "cpu"}))
+    assert stored(prefix) == files(tmp_path / "local")
     assert bake_with_devices(job, ("cpu", "cpu"), SilentProgress()).total == 0
