@@ -13,7 +13,7 @@ from tools.figures import finish_report
 from tools.options import Row, make_parser, number_in, positive_count
 from tools.reports.store.model import Limits, Machine, Replication, Simulation, measured_machine
 
-INDICES = 0.0040
+INDICES = 0.0007
 """Time of the indices for an episode of shards, 3 cameras and 504 frames [s] (tools/results/store_indices.json)."""
 VARIANTS = ((512, 1, 0), (4096, 64, 128))
 """Columns besides: GPUs, partitions of the prefix, episodes of a chunk (0: that of a bake)."""
