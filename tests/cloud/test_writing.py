@@ -13,6 +13,7 @@ from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
+from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
@@ -259,3 +260,9 @@ def test_the_local_file_is_checked_before_it_is_sent(memory, monkeypatch):
     with pytest.raises((OutputError, StoreError), match="has changed since it was written"):
         bake(memory)
     assert not any(key.startswith("manifest/0") for key in stored(memory))
+
+
+def test_a_folder_of_index_lines_is_never_taken_for_a_local_bake(tmp_path):
+    (tmp_path / LINES).mkdir()
+    with pytest.raises(OutputError, match="is where the lines of indices are joined; move it away"):
+        scripted_bake.bake(tmp_path, tiny(1))

@@ -305,8 +305,10 @@ def finalize_data_set(
         episodes: The committed ones, sorted, whose index lines are in LINES; None: those of the manifest, from their files.
 
     Raises:
-        OutputError: A file cannot be written.
+        OutputError: A file cannot be written, or LINES are not of this call.
     """
+    if episodes is None and os.path.lexists(out / LINES):
+        raise OutputError(f"{out / LINES} is where the lines of indices are joined; move it away")
     try:
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
