@@ -117,10 +117,10 @@ def bake(
     if isinstance(devices, str):
         devices = tuple(name.strip() for name in devices.split(","))
     if (url := as_url(out)) is not None:
-        from synpick_warp.cloud.start import Crew, start_bake
+        from synpick_warp.cloud.start import Crew, Job, start_bake
 
         crew = Crew(engine, workers) if engine else None
-        return start_bake(config, url, progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
+        return start_bake(Job(config, url), progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
     if claim or engine:
         raise ConfigError("claiming workers share out the episodes of a prefix in an object store; name one as the place of the data set")
     return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)

@@ -432,9 +432,9 @@ def _bake(
 
             bake = partial(run_bake, config, out)
         else:
-            from synpick_warp.cloud.start import start_bake
+            from synpick_warp.cloud.start import Job, start_bake
 
-            bake = partial(start_bake, config, url, claim=claim, crew=crew)
+            bake = partial(start_bake, Job(config, url), claim=claim, crew=crew)
 
     console = make_console()
     with make_progress(console, crew or "") as progress:
