@@ -78,6 +78,9 @@ def bake(
     shard: tuple[int, int] = (0, 1),
     splits: Sequence[str] = (),
     devices: Sequence[str] | str = (),
+    claim: bool = False,
+    engine: str = "",
+    workers: int = 0,
     progress: Progress | None = None,
 ) -> BakeSummary:
     """Generate a data set: simulate, render and write it; or resume one that was interrupted. `synpick-warp bake` does the same.
@@ -90,6 +93,9 @@ def bake(
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
         devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or "cpu" once per process, or "all": every GPU, or
             without one a process per CPU core. The bytes are those of one device. Empty: `bake.device` alone.
+        claim: Whether this is one of several equal workers, on any number of machines, which share out the episodes of a prefix among them.
+        engine: "ray" or "ray://HOST:PORT": claiming workers on a Ray cluster; empty: on this machine.
+        workers: Number of the engine's workers; 0: as many as its cluster has room for.
         progress: Receives stages, counts and notes; None: silent. See `synpick_warp.system.progress`.
 
     Returns:
@@ -111,9 +117,12 @@ def bake(
     if isinstance(devices, str):
         devices = tuple(name.strip() for name in devices.split(","))
     if (url := as_url(out)) is not None:
-        from synpick_warp.cloud.run import bake_into_store
+        from synpick_warp.cloud.start import Crew, Job, start_bake
 
-        return bake_into_store(config, url, progress or SilentProgress(), shard, splits, devices)
+        crew = Crew(engine, workers) if engine else None
+        return start_bake(Job(config, url), progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
+    if claim or engine:
+        raise ConfigError("claiming workers share out the episodes of a prefix in an object store; name one as the place of the data set")
     return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
 
 

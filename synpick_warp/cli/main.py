@@ -431,15 +431,10 @@ def _bake(
             from synpick_warp.factory.pipeline import run_bake
 
             bake = partial(run_bake, config, out)
-        elif crew is None:
-            from synpick_warp.cloud.run import bake_into_store
-
-            bake = partial(bake_into_store, config, url, claim=claim)
         else:
-            from synpick_warp.cloud.ray_engine import Job, bake_with_ray
+            from synpick_warp.cloud.start import Job, start_bake
 
-            job = Job(config, url, tuple(splits))
-            bake = lambda progress, *_: bake_with_ray(job, crew, progress)  # noqa: E731
+            bake = partial(start_bake, Job(config, url), claim=claim, crew=crew)
 
     console = make_console()
     with make_progress(console, crew or "") as progress:

@@ -1,12 +1,13 @@
 """Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode, and their concatenation per block.
 
-A shard is reduced to its size and its lines in the index of its split, which its worker makes: the last worker only joins them.
+What an episode adds to lists of lines is made by its worker: the last worker only appends it to the parts of the lists, below LINES.
 """
 
 from __future__ import annotations
 
 import gzip
 import io
+import os
 import re
 import struct
 import tarfile
@@ -15,39 +16,47 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
+from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums, read_entry
+from synpick_warp.dataset.commit.writing import list_lines
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop.shards.tar_files import key_lines, known_keys
+from synpick_warp.exporters.base import Exporter
+from synpick_warp.exporters.formats import indexed_files
+from synpick_warp.exporters.registry import index_lines
+from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.inputs.paths import path_inside
 
-SIZE, KEYS = "size/", "keys/"
-"""Prefixes of the names of shards in an index file, of which it has the size and the `key_lines`."""
 MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""
-_SIZE = struct.Struct("<Q")
-"""Size of a shard [B]."""
+_LINES = re.compile(rf"{re.escape(LINES)}(?:/[^./][^/]*)+")
+"""Names of lines in an index file: inside of LINES, which only `unpack_bundle` fills."""
 _LENGTH = struct.Struct("<Q")
 """In a block: length prefix of each index file [B]."""
 
 
-def make_bundle(folder: Path, episode: int, indexed: re.Pattern[str]) -> bytes:
+def make_bundle(folder: Path, episode: int, settings: ExportSettings, kinds: Sequence[type[Exporter]]) -> bytes:
     """Pack an episode's index file; deterministic on one machine (another zlib may compress otherwise).
 
     Args:
         folder: Data set with the committed episode.
         episode: Its index.
-        indexed: Pattern of the names of files that indices are made of.
+        settings: Settings of the data set.
+        kinds: Exporters of its formats.
+
+    Raises:
+        OutputError: The episode was removed.
     """
-    entry = episode_entry(episode)
-    packed = io.BytesIO()
+    entry = read_entry(folder, episode_entry(episode))
+    if entry is None:
+        raise OutputError(f"{folder / episode_entry(episode)}.json was removed while it was uploaded; resume the bake")
+    packed, names = io.BytesIO(), list(read_checksums(folder, episode_entry(episode)))
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        _add(archive, f"{entry}.json", (folder / f"{entry}.json").read_bytes())
-        for name in filter(indexed.fullmatch, read_checksums(folder, entry)):
-            if name.endswith(".tar"):
-                _add(archive, SIZE + name, _SIZE.pack((folder / name).stat().st_size))
-                _add(archive, KEYS + name, key_lines(folder / name))
-            else:
-                _add(archive, name, (folder / name).read_bytes())
+        for name, lines in list_lines(entry).items():
+            _add(archive, f"{LINES}/{name}/0", lines)
+        for name, lines in index_lines(kinds, folder, settings, names):
+            _add(archive, f"{LINES}/{name}", lines)
+        for name in filter(indexed_files(settings.layout.formats).fullmatch, names):
+            _add(archive, name, (folder / name).read_bytes())
     return gzip.compress(packed.getvalue(), 6, mtime=0)
 
 
@@ -58,17 +67,14 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
     archive.addfile(info, io.BytesIO(data))
 
 
-def _restore(name: str, data: bytes, path: Path) -> None:
-    """Restore a member of an index file: a shard as a hole of its size, others as they are."""
-    if name.startswith(SIZE):
-        with path.open("wb") as file:
-            file.truncate(_SIZE.unpack(data)[0])
-    else:
-        (known_keys(path) if name.startswith(KEYS) else path).write_bytes(data)
-
-
 def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: str) -> None:
-    """Unpack an episode's index file into a folder; `source` is its object, for messages.
+    """Unpack an episode's index file into a folder: files, and lines, which are appended to those of the episodes before.
+
+    Args:
+        data: The index file.
+        folder: The folder.
+        indexed: Pattern of the names of files that indices are made of.
+        source: Its object, for messages.
 
     Raises:
         DatasetError: It is damaged, too large, or has files that no index is made of.
@@ -81,13 +87,15 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
             raise DatasetError(f"{source} is damaged: it is cut off or too large; delete it and its block's mark, and resume the bake")
         with tarfile.open(fileobj=io.BytesIO(plain), mode="r:") as archive:
             for info in archive:
-                name = info.name.removeprefix(SIZE).removeprefix(KEYS)
-                content = archive.extractfile(info)
-                if content is None or not (indexed.fullmatch(name) or re.fullmatch(r"manifest/[0-9]{6,12}\.json", name)):
-                    raise DatasetError(f"{source} is damaged: it has {name[:80]!r}; delete it and its block's mark, and resume the bake")
-                path = path_inside(folder, name, source, DatasetError)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _restore(info.name, content.read(), path)
+                is_lines, content = _LINES.fullmatch(info.name), archive.extractfile(info)
+                if content is None or not (is_lines or indexed.fullmatch(info.name)):
+                    advice = "delete it and its block's mark, and resume the bake"
+                    raise DatasetError(f"{source} is damaged: it has {info.name[:80]!r}; {advice}")
+                path = folder / info.name if is_lines else path_inside(folder, info.name, source, DatasetError)
+                if not os.path.exists(path):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                with open(path, "ab" if is_lines else "wb") as file:
+                    file.write(content.read())
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     except (zlib.error, tarfile.TarError, struct.error, OverflowError, ValueError, RecursionError) as error:

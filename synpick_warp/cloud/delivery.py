@@ -18,10 +18,10 @@ from typing import Any, Self
 
 from synpick_warp.cloud.bundles import make_bundle
 from synpick_warp.cloud.ledger import INDEX, Ledger
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
 from synpick_warp.errors import OutputError, StoreError, SynpickError
 from synpick_warp.exporters.base import list_folders
-from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.base import Store, TransientError, persist
@@ -75,8 +75,8 @@ class Delivery:
         self.delivered: list[int] = []
         """Episodes whose done mark is written."""
         self._ledger, self._folder, self._permit = ledger, folder, permit
-        self._indexed = indexed_files(ledger.layout.formats)
-        self._shared = shared_files(load_exporter_classes(ledger.layout.formats), ledger.layout).folders
+        self._settings, self._kinds = ExportSettings.of(ledger.config), load_exporter_classes(ledger.layout.formats)
+        self._shared = shared_files(self._kinds, ledger.layout).folders
         self._fault: BaseException | None = None
         self._waiting: dict[int, int] = {}
         """Backlog: sizes of the episodes that are committed in the folder and not delivered [B]."""
@@ -177,7 +177,7 @@ class Delivery:
             entry, folder, store = episode_entry(episode), self._folder, self._ledger.store
             names = read_checksums(folder, entry)
             self._send_files(names)
-            store.put(f"{INDEX}/{episode:06d}.tar.gz", make_bundle(folder, episode, self._indexed))
+            store.put(f"{INDEX}/{episode:06d}.tar.gz", make_bundle(folder, episode, self._settings, self._kinds))
             self._permit()
             self._ledger.commit(episode, (folder / f"{entry}.sha256").read_bytes(), (folder / f"{entry}.json").read_bytes())
             with self._lock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import heapq
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +26,7 @@ from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import Needs, shared_files
 from synpick_warp.exporters.writing.checksums import parse_checksums
+from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.sizes import count_writers
 from synpick_warp.system.folders import make_folder
@@ -95,10 +97,9 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
         return missing
     work = folder / "set"
     with _clear_errors(ledger, folder):
-        _gather(ledger, work)
-        needs = Needs.of(ledger.config)
+        episodes, needs = _gather(ledger, work), Needs.of(ledger.config)
         with WriterPool(count_writers(ledger.config.bake.writers, needs.slot_bytes), needs.slot_bytes) as pool:
-            finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool)
+            finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool, episodes)
     if not ledger.finished():  # Else another bake of these episodes, or of more, has ended meanwhile.
         _put_indices(ledger, work)
     return 0
@@ -123,11 +124,12 @@ def _put_indices(ledger: Ledger, work: Path) -> None:
         raise StoreError(f"another bake finalized {store.url} for other episodes at the same time; when it has ended, run the larger again")
 
 
-def _gather(ledger: Ledger, work: Path) -> None:
-    """Gather the inputs of the indices in a local data set: manifest, settings, indexed constants, and the content of all index files."""
+def _gather(ledger: Ledger, work: Path) -> list[int]:
+    """Gather the inputs of the indices in a local data set: manifest, settings, indexed constants, and the content of all index files;
+    returns the episodes, sorted."""
     store, layout = ledger.store, ledger.layout
     indexed = indexed_files(layout.formats)
-    for name in (ENTRIES, *shared_files(Needs.of(ledger.config).classes, layout).folders):
+    for name in (ENTRIES, Path(LINES), *shared_files(Needs.of(ledger.config).classes, layout).folders):
         if not name.name.endswith("*"):
             make_folder(work / name)
     (work / MANIFEST_FILE).write_bytes(store.get(MANIFEST_FILE))
@@ -136,12 +138,15 @@ def _gather(ledger: Ledger, work: Path) -> None:
     for name in filter(indexed.fullmatch, constants):
         (work / name).parent.mkdir(parents=True, exist_ok=True)
         (work / name).write_bytes(store.get(name))
-    for source, bundle in _bundles(ledger):
+    episodes: list[int] = []
+    for episode, source, bundle in _bundles(ledger):
+        episodes.append(episode)
         unpack_bundle(bundle, work, indexed, source)
+    return episodes
 
 
-def _bundles(ledger: Ledger) -> Iterator[tuple[str, bytes]]:
-    """Yield the index files of all planned episodes, each after the URL of the batched mark that it is from.
+def _bundles(ledger: Ledger) -> Iterator[tuple[int, str, bytes]]:
+    """Yield the index files of all planned episodes, sorted, each after its episode and the URL of the batched mark that it is from.
 
     Raises:
         StoreError: A planned episode is in no batched mark.
@@ -149,13 +154,17 @@ def _bundles(ledger: Ledger) -> Iterator[tuple[str, bytes]]:
     marks = ledger.marks()
     for block in ledger.blocks():
         wanted = set(ledger.planned(block))
-        for key, spans in marks.get(block, {}).items():
-            source, episodes = f"{ledger.store.url}/{key}", [episode for span in spans for episode in span]
-            if wanted.isdisjoint(episodes):
-                continue
-            for episode, bundle in split_bundles(ledger.store.blocks(key), episodes, source):
-                if episode in wanted:
-                    wanted.remove(episode)
-                    yield source, bundle
+        found = [_read_mark(ledger, key, spans) for key, spans in marks.get(block, {}).items() if not all(map(wanted.isdisjoint, spans))]
+        for episode, source, bundle in heapq.merge(*found, key=lambda each: each[0]):
+            if episode in wanted:
+                wanted.remove(episode)
+                yield episode, source, bundle
         if wanted:
             raise StoreError(f"{ledger.store.url} has no batched mark of episode {min(wanted)}; the same command resumes")
+
+
+def _read_mark(ledger: Ledger, key: str, spans: Sequence[range]) -> Iterator[tuple[int, str, bytes]]:
+    """Yield the index files of a batched mark, sorted by episode, lazily; items as of `_bundles`."""
+    source = f"{ledger.store.url}/{key}"
+    for episode, bundle in split_bundles(ledger.store.blocks(key), [episode for span in spans for episode in span], source):
+        yield episode, source, bundle

@@ -9,7 +9,7 @@ import contextlib
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -36,6 +36,12 @@ class Job:
     splits: tuple[str, ...] = ()
     bake: Baker | None = None
     lease: float = LEASE
+    folder: str | None = None
+    """Folder for temporary files; None: the system's."""
+    processes: int = 1
+    """Workers on this host, which share its memory."""
+    own: Mapping[str, object] = field(default_factory=dict)
+    """Full key -> value of settings of the worker alone: device, writers."""
 
 
 @dataclass

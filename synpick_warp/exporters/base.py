@@ -245,6 +245,20 @@ class Exporter(Protocol):
         """
         ...
 
+    @staticmethod
+    def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+        """Yield what an episode adds to index files that are lists of lines, so that `finalize` only joins them if `out` has LINES.
+
+        Args:
+            out: Folder of the data set, with the committed episode.
+            settings: Its settings.
+            names: Files of the episode, of all formats, relative to `out`.
+
+        Returns:
+            Names of parts, relative to LINES, and whole lines; those of one name are joined in order of the episodes.
+        """
+        ...
+
     def write_constants(self) -> list[Path]:
         """Write the files that all episodes share, such as models; replaces what a killed bake may have left.
 

@@ -90,7 +90,8 @@ class Format(NamedTuple):
     packages: tuple[str, ...] = ()
     """Packages of this format alone whose versions its output depends on."""
     indexed: str = r"(?!)"
-    """Names of the files of episodes, and of constants, that `Exporter.finalize` reads, as a regular expression."""
+    """Names of the files of episodes, and of constants, that `Exporter.finalize` reads, as a regular expression; without those of which
+    there are `Exporter.index_lines`."""
     remedy: str = "name other formats"
     """What to do if a package that it needs is not installed."""
 
@@ -154,7 +155,6 @@ FORMAT_TABLE: dict[str, Format] = {
         "BopExporter",
         _SCENE_CONSTANTS,
         _bop,
-        indexed=rf"{_PLAIN}/{_INDEX}/scene_gt(?:_info)?(?!_coco)(?:_[^/]*)?\.json",
         sources=lambda bop: ("views", "masks") if bop.coco else ("views",),
     ),
     "shards": Format(
@@ -162,7 +162,6 @@ FORMAT_TABLE: dict[str, Format] = {
         "ShardsExporter",
         _SCENE_CONSTANTS,
         _shards,
-        indexed=rf"{_PLAIN}_web/shard-[0-9]+\.tar",  # Their headers.
         sources=lambda _: ("views",),
     ),
     "usd": Format(

@@ -156,6 +156,14 @@ def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> Share
     return SharedFiles(constants, indices, folders)
 
 
+def index_lines(
+    classes: Iterable[type[Exporter]], out: Path, settings: ExportSettings, names: Sequence[str]
+) -> Iterator[tuple[str, bytes]]:
+    """Yield what an episode adds to index files of every format; see `Exporter.index_lines`."""
+    for exporter_class in classes:
+        yield from exporter_class.index_lines(out, settings, names)
+
+
 def finalize(
     classes: Iterable[type[Exporter]], out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]
 ) -> list[Path]:

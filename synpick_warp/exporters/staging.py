@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -81,6 +81,11 @@ class EpisodeExporter(ABC, Generic[_Content]):
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
         """Write nothing: there are no index files unless a format overrides this; returns an empty list. See `Exporter`."""
         return []
+
+    @staticmethod
+    def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+        """Yield nothing: `finalize` reads the files of episodes unless a format overrides this. See `Exporter`."""
+        return iter(())
 
     def write_views(self, batch: FrameBatch) -> None:
         """Ignore views: no images unless a format overrides this. See `Exporter`."""

@@ -119,11 +119,11 @@ class DeviceProcesses:
             self._reported.add((kind, text))
             getattr(progress, kind)(text)
 
-    def run(self, shares: Sequence[Share], summary: BakeSummary, progress: Progress) -> str:
+    def run(self, shares: Sequence[Any], summary: BakeSummary, progress: Progress) -> str:
         """Hand out the shares, and wait until all processes have ended; if a device is lost, the others go on.
 
         Args:
-            shares: Part of each device.
+            shares: What each device's process is sent: its `Share`, or what its program takes.
             summary: Receives the processes' summaries; its `resumed` episodes count as done.
             progress: Observer.
 

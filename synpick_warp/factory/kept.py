@@ -14,13 +14,19 @@ from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.pipeline import bake_episodes
+from synpick_warp.factory.worker import BakeLink
 from synpick_warp.system.progress import Progress
 
 
-def keeping_baker() -> Callable[..., BakeSummary]:
+def keeping_baker(processes: int = 1, stop: BakeLink | None = None) -> Callable[..., BakeSummary]:
     """A function like `pipeline.bake_episodes` that keeps the stages of one device from call to call, for workers that bake chunk after
-    chunk. Several devices have processes of their own, which keep nothing."""
-    return partial(bake_episodes, build=KeptStages())
+    chunk. Several devices have processes of their own, which keep nothing.
+
+    Args:
+        processes: Such workers on this host, which share its memory.
+        stop: Requests to stop; None: signals do.
+    """
+    return partial(bake_episodes, build=KeptStages(processes), stop=stop)
 
 
 class KeptStages:
@@ -30,7 +36,8 @@ class KeptStages:
     last bake did not come to its end.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, processes: int = 1) -> None:
+        self._processes = processes
         self._factory: Factory | None = None
         self._given: tuple[Any, ...] = ()
         """What the factory was built from: settings, needs of the formats, order of the episodes."""
@@ -44,7 +51,7 @@ class KeptStages:
         if factory is None or self._given != given or grown or not _has_ended(factory):
             self._factory = factory = None
             gc.collect()  # Frees its arrays before the memory for others is planned.
-            self._factory = build_factory(config, progress, episodes, *needs, longest_first=longest_first)
+            self._factory = build_factory(config, progress, episodes, *needs, longest_first=longest_first, processes=self._processes)
             self._given, self._most = given, len(episodes)
             return self._factory
         if longest_first:

@@ -98,6 +98,7 @@ def bake_episodes(
     devices: Sequence[str] = (),
     deliver: Callable[[], None] | None = None,
     build: Callable[..., Factory] | None = None,
+    stop: BakeLink | None = None,
 ) -> BakeSummary:
     """Generate these episodes of a data set in a folder, or the remaining ones of them.
 
@@ -109,6 +110,7 @@ def bake_episodes(
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
         build: Builds the stages of one device; None: `build_factory`.
+        stop: Requests to stop one device; None: signals do.
 
     Raises:
         SynpickError: As `run_bake`.
@@ -126,9 +128,9 @@ def bake_episodes(
         try:
             with explain_shortage(config):
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
-                if advice := advise_processes(config, names, len(output.remaining)):
+                if build is None and (advice := advise_processes(config, names, len(output.remaining))):
                     progress.note(advice)
-                _fill(output, needs, names, summary, progress, deliver, build or build_factory)
+                _fill(output, needs, names, summary, progress, deliver, build or build_factory, stop or StopRequest())
         except OutputError as error:
             if out.exists():
                 raise
@@ -144,6 +146,7 @@ def _fill(
     progress: Progress,
     deliver: Callable[[], None] | None,
     build: Callable[..., Factory],
+    stop: StopRequest | BakeLink,
 ) -> None:
     """Generate the remaining episodes, then the indices over all, or deliver the episodes."""
     config, factory = output.config, None
@@ -165,7 +168,7 @@ def _fill(
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
-                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
+                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, stop).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()

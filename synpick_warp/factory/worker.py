@@ -11,14 +11,13 @@ import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.processes.threads import LINK
 from synpick_warp.system.processes.worker import send
 
 if TYPE_CHECKING:
-    from synpick_warp.factory.devices import Share
     from synpick_warp.factory.episodes import BakeSummary
 
 _MAX_FAULT = 200
@@ -36,6 +35,8 @@ class BakeLink:
         """Number of the signal; 0: none."""
         self.writers: Sequence[int] = ()
         """Process ids of the writers, once they run."""
+        self.on_stop: Callable[[], None] | None = None
+        """Called by the thread after a stop request, for a worker that waits; None: the bake polls `number`."""
         self._link = link
 
     def listen(self) -> None:
@@ -74,6 +75,8 @@ class BakeLink:
         with contextlib.suppress(EOFError, OSError):
             while True:
                 self.number = self._link.recv()
+                if self.on_stop is not None:
+                    self.on_stop()
         for pid in self.writers:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
@@ -84,17 +87,17 @@ class BakeLink:
         self.number = number
 
 
-def main(generate: Callable[[Share, Sequence[int], BakeLink], BakeSummary]) -> None:
+def main(generate: Callable[[Any, Sequence[int], BakeLink], BakeSummary]) -> None:
     """Serve one share from the socket with handle argv[1]; the other handles are for the writers to keep open.
 
     Args:
-        generate: Generates the episodes of a share; its other arguments are these handles and the link.
+        generate: Generates the episodes of a share (`devices.Share`, `ray_worker.Job`); its other arguments are these handles and the link.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection, *handles = map(int, sys.argv[1:])
     link = Connection(connection)
     try:
-        share: Share = link.recv()
+        share = link.recv()
     except (EOFError, OSError):
         return  # The bake has ended before it began.
     bake = BakeLink(link)

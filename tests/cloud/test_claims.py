@@ -13,10 +13,13 @@ import time
 import msgspec
 import pytest
 
+import synpick_warp
 from synpick_warp.cloud import claims, finish, run
 from synpick_warp.cloud.claims import Chunks, Claims, LeaseLostError, Sizes, default_chunk
+from synpick_warp.cloud.device_workers import bake_with_devices
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.errors import StoreError
+from synpick_warp.cloud.ray_worker import Job
+from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
@@ -273,3 +276,29 @@ def test_workers_killed_fifty_times_leave_the_set_of_one_bake(prefix, tmp_path):
             each.kill()
     scripted_bake.bake(tmp_path / "local", tiny(episodes))
     assert stored(prefix) == files(tmp_path / "local")
+
+
+@pytest.mark.slow
+def test_workers_of_several_devices_share_a_set(prefix, tmp_path):
+    """Each device has one process for all of its chunks; the settings in the store are those of the command."""
+    job = Job(tiny(), prefix, bake=scripted_bake.bake_episodes, lease=60.0)
+    summary = bake_with_devices(job, ("cpu", "cpu"), SilentProgress())
+    assert (summary.total, summary.stopped) == (EPISODES, 0)
+    scripted_bake.bake(tmp_path / "local", tiny().with_values({"bake.device": "cpu"}))
+    assert stored(prefix) == files(tmp_path / "local")
+    assert bake_with_devices(job, ("cpu", "cpu"), SilentProgress()).total == 0
+
+
+@pytest.mark.parametrize(
+    ("out", "given", "said"),
+    [
+        ("DATA", {"claim": True}, "name one as the place"),
+        ("DATA", {"engine": "ray"}, "name one as the place"),
+        ("memory://x", {"claim": True, "shard": (0, 2)}, "drop the shard"),
+        ("memory://x", {"engine": "ray", "devices": "all"}, "drop the devices"),
+        ("memory://x", {"engine": "dask"}, "--engine is dask"),
+    ],
+)
+def test_the_function_takes_claims_and_engines_as_the_command_does(out, given, said):
+    with pytest.raises(SynpickError, match=said):
+        synpick_warp.bake("smoke", out, **given)

@@ -13,6 +13,7 @@ from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
+from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
@@ -203,6 +204,10 @@ def _unset(server, monkeypatch) -> None:
     monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
 
 
+def _set_endpoint(address: str):
+    return lambda server, monkeypatch: monkeypatch.setenv("AWS_ENDPOINT_URL_S3", address)
+
+
 def _fail(fault: str, *methods: str):
     def prepare(server, monkeypatch) -> None:
         server.fault = lambda method, path: fault if method in methods else None
@@ -219,18 +224,32 @@ def _fail(fault: str, *methods: str):
         (_fail("403 RequestTimeTooSkewed", "PUT"), None, "the clock of this machine differs"),
         (_fail("late clock", "HEAD"), None, "the clock of this machine differs"),
         (_fail("", ""), "s3://", "names no bucket"),
+        (_set_endpoint("127.0.0.1:9"), None, "AWS_ENDPOINT_URL_S3 is 127.0.0.1:9; set it to the address of a server"),
         (_fail("", ""), "nowhere://a/b", "nowhere"),
         (_fail("", ""), "memory://a/..", "has a part . or .."),
         (_fail("", ""), "file:///proc/none", "cannot be opened"),
         (_fail("", ""), "file:///tmp/typo-of/a-folder", "typo-of is no folder; make it"),
     ],
-    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "scheme", "dots", "folder", "parent"],
+    ids=[
+        "credentials",
+        "bucket",
+        "read-only",
+        "skew refused",
+        "skew measured",
+        "no bucket",
+        "endpoint",
+        "scheme",
+        "dots",
+        "folder",
+        "parent",
+    ],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
     prepare(server, monkeypatch)
     message = mistake("bake", "--config", "smoke", "--out", url or prefix, "--device", "cpu")
     assert said in message
     server.fault = lambda method, path: None
+    monkeypatch.setenv("AWS_ENDPOINT_URL_S3", "")  # As if it was unset.
     if prepare is not _unset:
         assert stored(prefix) == {}
 
@@ -241,3 +260,9 @@ def test_the_local_file_is_checked_before_it_is_sent(memory, monkeypatch):
     with pytest.raises((OutputError, StoreError), match="has changed since it was written"):
         bake(memory)
     assert not any(key.startswith("manifest/0") for key in stored(memory))
+
+
+def test_a_folder_of_index_lines_is_never_taken_for_a_local_bake(tmp_path):
+    (tmp_path / LINES).mkdir()
+    with pytest.raises(OutputError, match="is where the lines of indices are joined; move it away"):
+        scripted_bake.bake(tmp_path, tiny(1))

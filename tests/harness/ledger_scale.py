@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gzip
 import io
-import json
 import re
 import resource
 import sys
@@ -25,6 +24,7 @@ from synpick_warp.cloud import finish
 from synpick_warp.cloud.bundles import join_bundles
 from synpick_warp.cloud.ledger import BLOCK, DONE, FINISHED, INDEX, Ledger
 from synpick_warp.cloud.run import bake_into_store
+from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.base import Store
@@ -45,12 +45,12 @@ def peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def open_with_marks(episodes: int, make: bool) -> Store:
-    """A store with the records of a set, and batched marks of so many episodes, with index files if `make`."""
+def open_with_marks(episodes: int, kind: str, make: bool) -> Store:
+    """A store with the records of a set of a format, and batched marks of so many episodes, with index files if `make`."""
     url = f"memory://{uuid4().hex}"
     store = open_store(url)
     with mock.patch.object(scripted_bake, "FRAMES", FRAMES if make else 1):
-        bake_into_store(tiny(1, ("shards",)), url, SilentProgress(), bake=scripted_bake.bake_episodes)
+        bake_into_store(tiny(1, (kind,)), url, SilentProgress(), bake=scripted_bake.bake_episodes)
     for key in (FINISHED, *(key for key, _ in list(store.list(DONE)))):
         store.delete(key)
     with tarfile.open(fileobj=io.BytesIO(gzip.decompress(store.get(f"{INDEX}/000000.tar.gz")))) as archive:
@@ -65,16 +65,14 @@ def open_with_marks(episodes: int, make: bool) -> Store:
 
 def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
     """Index file of another episode with the same content."""
-    cameras = sum(name.startswith("size/") for name, _ in members)
+    first = len(tiny().rig) * episode
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
-        for old, data in members:
-            name = re.sub(r"\d{6}", lambda found: f"{int(found[0]) + cameras * episode:06d}", old)
-            if old.startswith("manifest/"):
-                name, entry = f"manifest/{episode:06d}.json", json.loads(data)
-                for record in (entry, entry["row"], *entry["attempts"]):
-                    record["episode"] = episode
-                data = json.dumps(entry).encode()
+        for name, data in members:
+            if name.startswith(f"{LINES}/"):
+                data = re.sub(rb'"00000(\d)_', lambda found: b'"%06d_' % (first + int(found[1])), data)
+                data = re.sub(rb'"episode": 0\b', b'"episode": %d' % episode, data)
+                data = re.sub(rb'"scene_id": (\d)\b', lambda found: b'"scene_id": %d' % (first + int(found[1])), data)
             info = tarfile.TarInfo(name)
             info.size = len(data)
             archive.addfile(info, io.BytesIO(data))
@@ -83,7 +81,7 @@ def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
 
 def measure_resume(episodes: int) -> Iterator[Row]:
     """Find the remaining episodes of a set of which so many are done."""
-    store, part, counts = open_with_marks(episodes, make=False), f"{episodes:,} episodes", Counter[str]()
+    store, part, counts = open_with_marks(episodes, "shards", make=False), f"{episodes:,} episodes", Counter[str]()
     real = store._obs.list  # type: ignore[attr-defined]
 
     def resume() -> float:
@@ -102,16 +100,16 @@ def measure_resume(episodes: int) -> Iterator[Row]:
     tracemalloc.stop()
 
 
-def measure_finalization(episodes: int) -> Iterator[Row]:
-    """Make the indices of so many episodes, all but their upload."""
-    store, part, before = open_with_marks(episodes, make=True), f"{episodes:,} episodes", peak()
+def measure_finalization(episodes: int, kind: str) -> Iterator[Row]:
+    """Make the indices of so many episodes of a format, all but their upload."""
+    store, part, before = open_with_marks(episodes, kind, make=True), f"{episodes:,} episodes", peak()
     with tempfile.TemporaryDirectory() as name, mock.patch.object(finish, "_put_indices"):
         started = time.perf_counter()
-        finish.finalize_store(Ledger(store, tiny(episodes, ("shards",)), Probe(0.0, True)), Path(name))
-        yield Row("finalization", time.perf_counter() - started, "s", part=part)
-        yield Row("finalization: peak memory", peak() - before, "MB", part=part)
+        finish.finalize_store(Ledger(store, tiny(episodes, (kind,)), Probe(0.0, True)), Path(name))
+        yield Row(f"finalization of {kind}", time.perf_counter() - started, "s", part=part)
+        yield Row(f"finalization of {kind}: peak memory", peak() - before, "MB", part=part)
         size = sum(path.stat().st_blocks * 512 for path in Path(name).rglob("*"))
-        yield Row("finalization: temporary folder", 1e-6 * size, "MB", part=part)
+        yield Row(f"finalization of {kind}: temporary folder", 1e-6 * size, "MB", part=part)
 
 
 def main() -> int:
@@ -123,7 +121,7 @@ def main() -> int:
     }
     options = make_parser(__doc__, "json", own=own).parse_args()
     rows = [row for count in options.episodes for row in measure_resume(count)]
-    rows += [row for count in options.finalize for row in measure_finalization(count)]
+    rows += [row for count in options.finalize for kind in ("bop", "shards") for row in measure_finalization(count, kind)]
     return finish_report("tests.harness.ledger_scale", options.json, pick_device("cpu"), "", "many episodes", rows)
 
 

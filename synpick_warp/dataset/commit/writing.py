@@ -13,10 +13,12 @@ import fcntl
 import json
 import os
 import re
+import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.modes import may_pick
@@ -47,6 +49,7 @@ from synpick_warp.exporters.base import Exporter, SharedFiles, list_folders
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.checksums import join_manifest_entry, name_parts, write_checksums, write_manifest_entry
 from synpick_warp.exporters.writing.files import (
+    LINES,
     PARTIAL,
     check_output_folder,
     is_folder,
@@ -289,18 +292,29 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
         submit_entry()
 
 
-def finalize_data_set(out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
+def finalize_data_set(
+    out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool, episodes: Sequence[int] | None = None
+) -> None:
     """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes.
 
+    Args:
+        out: Folder of the data set.
+        settings: Its settings.
+        kinds: Exporters of its formats.
+        pool: Writer processes.
+        episodes: The committed ones, sorted, whose index lines are in LINES; None: those of the manifest, from their files.
+
     Raises:
-        OutputError: A file cannot be written.
+        OutputError: A file cannot be written, or LINES are not of this call.
     """
+    if episodes is None and os.path.lexists(out / LINES):
+        raise OutputError(f"{out / LINES} is where the lines of indices are joined; move it away")
     try:
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
-        episodes = committed_episodes(out)
-        paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, episodes)
-        write_manifest_entry(out, INDICES, paths, {"episodes": episodes})
+        known = committed_episodes(out) if episodes is None else list(episodes)
+        paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, known)
+        write_manifest_entry(out, INDICES, paths, {"episodes": known})
     except OSError as error:
         raise output_error(out, error) from error
     finally:
@@ -308,25 +322,35 @@ def finalize_data_set(out: Path, settings: ExportSettings, kinds: Sequence[type[
 
 
 def build_lists(out: Path, picks: bool) -> list[Path]:
-    """Write the list of episodes, and if episodes can pick (`may_pick`) the list of attempts, from the manifest entries, sorted by episode.
+    """Write the list of episodes, and if episodes can pick (`may_pick`) the list of attempts, from the manifest entries, sorted by episode,
+    or of lines made in advance, if there are LINES.
 
     Returns:
         Paths of the lists, relative to the data set.
     """
     paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if picks else ()))]
     for path in paths:
-        with (out / PARTIAL / path).open("w", encoding="ascii") as file:
-            for index in committed_episodes(out):
+        known = out / LINES / path / "0"
+        with (out / PARTIAL / path).open("wb") as file:
+            if known.is_file():
+                with known.open("rb") as lines:
+                    shutil.copyfileobj(lines, file)
+            for index in () if (out / LINES).is_dir() else committed_episodes(out):
                 entry = read_entry(out, episode_entry(index))
                 if entry is None:
                     raise OutputError(f"{out / episode_entry(index)}.json was removed while the lists were written; resume the bake")
-                rows = [{**entry["row"], "checksum": entry["checksum"]}] if path.name == EPISODES_FILE else entry["attempts"]
-                file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
+                file.write(list_lines(entry)[path.name])
             file.flush()
             os.fsync(file.fileno())
         (out / PARTIAL / path).replace(out / path)
     sync_folder(out)
     return paths
+
+
+def list_lines(entry: Mapping[str, Any]) -> dict[str, bytes]:
+    """Lines that a manifest entry adds to the lists of episodes and attempts, by their names."""
+    rows = {EPISODES_FILE: [{**entry["row"], "checksum": entry["checksum"]}], ATTEMPTS_FILE: entry["attempts"]}
+    return {name: "".join(json.dumps(row, allow_nan=False) + "\n" for row in found).encode() for name, found in rows.items()}
 
 
 def _planned_end(out: Path) -> int:

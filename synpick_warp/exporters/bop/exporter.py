@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,14 @@ from synpick_warp.exporters.bop.sensors import commit_sensor_scene
 from synpick_warp.exporters.bop.shared.targets import (
     concatenate_targets,
     find_scenes,
+    make_scene_targets,
     scene_target_files,
     sensor_suffixes,
     target_files,
     write_scene_targets,
 )
 from synpick_warp.exporters.bop.view import ViewSettings
-from synpick_warp.exporters.writing.files import PARTIAL, output_errors
+from synpick_warp.exporters.writing.files import LINES, PARTIAL, output_errors
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.views.picks import PickBatch
 
@@ -68,17 +69,32 @@ class BopExporter(SceneExporter):
         layout = settings.layout
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
         with output_errors(out):
-            parts.parent.mkdir(exist_ok=True)
-            shutil.rmtree(parts, ignore_errors=True)
-            for name in (parts, *(parts / name for name in names)):
-                name.mkdir()
-            for folder in layout.folders:
+            known = (out / LINES).is_dir()
+            if known:
+                parts = out / LINES
+            else:
+                parts.parent.mkdir(exist_ok=True)
+                shutil.rmtree(parts, ignore_errors=True)
+                parts.mkdir()
+            for name in names:
+                (parts / name).mkdir(exist_ok=known)
+            for folder in () if known else layout.folders:
                 places = tuple(str(parts / name) for name in scene_target_files(layout, folder))
                 for scene in find_scenes(out / folder, layout.scene_ids(episodes)):
                     pool.submit(write_scene_targets, (), (scene, places, settings.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)
         return [Path(name) for name in names]
+
+    @staticmethod
+    def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+        """Targets of the episode's scenes. See `Exporter`."""
+        layout, sensors = settings.layout, sensor_suffixes(settings.layout)
+        truths = filter(lambda path: path.name == f"scene_gt{sensors[0]}.json", map(Path, names))
+        for scene in sorted((path.parent for path in truths), key=lambda scene: int(scene.name)):
+            lists = make_scene_targets(out / scene, settings.bop.target_visibility, sensors)
+            for name, lines in zip(scene_target_files(layout, scene.parent.name), lists, strict=False):
+                yield f"{name}/0", lines
 
     def write_picks(self, batch: PickBatch) -> None:
         """Keep grasp trials for scene_picks.json. See `Exporter`."""

@@ -17,8 +17,13 @@ PARTIAL = ".partial"
 
 The name is reserved beside a manifest, which is written first and removed last; a folder of this name without a manifest is not ours, and
 is neither used nor removed."""
+LINES = ".lines"
+"""Folder of index lines that were made when each episode was committed: LINES/INDEX/NUMBER for parts of an index file, in order of their
+numbers. It exists where the indices of a store are joined."""
 MANIFEST_FILE = "manifest.json"
 """Marks a folder as a data set."""
+_JOIN_BYTES = 1 << 20
+"""Size of a block of lines that are joined [B]."""
 _LITTER = ("thumbs.db", "ehthumbs.db", "desktop.ini")
 """What Windows leaves in folders, in lower case."""
 _ALLOWED = "--out takes a new or an empty folder"
@@ -132,13 +137,15 @@ def write_synced(path: Path, data: bytes | Iterable[bytes]) -> None:
 
 
 def join_lines(parts: Iterable[Path], begin: bytes, end: bytes) -> Iterator[bytes]:
-    """Lines of files as the rows of a JSON list or object, lazily: `begin`, each line behind a comma but the first, `end`."""
+    """Lines of files, which all end in a newline, as the rows of a JSON list or object, lazily: `begin`, lines behind commas, `end`."""
     yield begin + b"\n"
-    comma = b""
+    held = b""
     for part in parts:
-        for line in part.read_bytes().splitlines():
-            yield comma + line
-            comma = b",\n"
+        with part.open("rb") as file:
+            while block := file.read(_JOIN_BYTES):
+                block = held + block
+                held = b"\n" if block.endswith(b"\n") else b""
+                yield block.removesuffix(b"\n").replace(b"\n", b",\n")
     yield b"\n" + end
 
 

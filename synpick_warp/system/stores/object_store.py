@@ -9,6 +9,7 @@ import datetime
 import functools
 import importlib
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -57,6 +58,8 @@ _LASTING = ("status code: 401", "status code: 403", "status code: 404", "status 
 _Result = TypeVar("_Result")
 _memories: dict[str, Any] = {}
 """Stores in memory by name, shared within the process."""
+_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
+"""Variables of S3 servers other than Amazon's, the first before the next."""
 
 
 class ObjectStore:
@@ -85,7 +88,7 @@ class ObjectStore:
             return self._kinds.LocalStore(rest, mkdir=True)
         if scheme in ("s3", "s3a"):
             _check_credentials(url)
-        endpoint = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL") or ""
+        endpoint = _find_endpoint() if scheme in ("s3", "s3a") else ""
         client = {"timeout": f"{TIMEOUT}s", "allow_http": endpoint.startswith("http://")}
         retries = {"max_retries": 3, "retry_timeout": datetime.timedelta(seconds=TIMEOUT)}
         return self._kinds.from_url(url, client_options=client, retry_config=retries)
@@ -215,6 +218,21 @@ class ObjectStore:
 def _process() -> int:
     """Process that sent the first request, which started the threads of obstore; its forks have none, and would wait forever."""
     return os.getpid()
+
+
+def _find_endpoint() -> str:
+    """Address of the S3 server that the environment names; empty: Amazon's. Variables that are empty are unset, as to boto: obstore panics.
+
+    Raises:
+        StoreError: It is no address.
+    """
+    found = {name: os.environ[name] for name in _ENDPOINTS if name in os.environ}
+    for name, address in found.items():
+        if not address:
+            del os.environ[name]
+        elif re.match(r"https?://[^/]", address) is None:
+            raise StoreError(f"{name} is {address}; set it to the address of a server, such as http://127.0.0.1:9000, or unset it")
+    return next(filter(None, found.values()), "")
 
 
 def _check_credentials(url: str) -> None:

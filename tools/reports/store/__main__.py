@@ -11,15 +11,15 @@ from collections.abc import Iterator
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import finish_report
 from tools.options import Row, make_parser, number_in, positive_count
-from tools.reports.store.model import Limits, Machine, Outcome, Simulation, measured_machine
+from tools.reports.store.model import Limits, Machine, Replication, Simulation, measured_machine
 
-INDICES = 0.0040
+INDICES = 0.0007
 """Time of the indices for an episode of shards, 3 cameras and 504 frames [s] (tools/results/store_indices.json)."""
 VARIANTS = ((512, 1, 0), (4096, 64, 128))
 """Columns besides: GPUs, partitions of the prefix, episodes of a chunk (0: that of a bake)."""
 
 
-def describe(part: str, out: Outcome, machine: Machine, limits: Limits) -> Iterator[Row]:
+def describe(part: str, out: Replication, machine: Machine, limits: Limits) -> Iterator[Row]:
     """Rows of a simulated bake."""
     gpus, requests = out.price(machine, limits)
     yield Row("views", out.views / out.seconds, "1/s", part=part)

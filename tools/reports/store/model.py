@@ -103,8 +103,8 @@ def _value(run: dict[str, list[dict[str, float]]], name: str) -> float:
 
 
 @dataclass
-class Outcome:
-    """Result of a simulated bake."""
+class Replication:
+    """Output of one run of the simulation: times, views, requests."""
 
     seconds: float = 0.0
     """Time until the last chunk ends [s]."""
@@ -154,11 +154,11 @@ class Simulation:
         """Expiry time of each chunk's lease [s]; negative: the chunk is not leased."""
         self.owner = np.full(len(bounds), -1)
         self.over = np.zeros(len(bounds), bool)
-        self.out, self.now, self.active = Outcome(), 0.0, 0
+        self.out, self.now, self.active = Replication(), 0.0, 0
         self._finalization, self._draw = finalization, random.Random(seed)
         self._groups = [list(group) for _, group in itertools.groupby(range(len(bounds)), lambda each: self.length[each])]
 
-    def run(self) -> Outcome:
+    def run(self) -> Replication:
         """Simulate until the last chunk is done."""
         events = [(0.0, number, self._work(number)) for number in range(self.workers)]
         order = itertools.count(self.workers)

@@ -2,31 +2,34 @@
 
 from __future__ import annotations
 
-import os
+import contextlib
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.cell.rig import lens_map
 from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import (
     commit_shards,
     find_shards,
-    known_keys,
+    key_lines,
     list_keys,
+    shard_index,
     write_layer,
     write_view,
 )
-from synpick_warp.exporters.writing.files import PARTIAL, join_lines, output_errors, write_atomically
+from synpick_warp.exporters.writing.files import LINES, PARTIAL, join_lines, output_errors, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
 """Index file: key of a view -> index of its shard."""
+_SIZES = "sizes"
+"""Name in LINES: size [B] and number of views of each shard, a line each."""
 
 
 class ShardsExporter(SceneExporter):
@@ -57,12 +60,23 @@ class ShardsExporter(SceneExporter):
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
         contents = [
-            _write_keys(out, name, split, pool, scenes)
+            _join_known(out, name, split) if (out / LINES).is_dir() else _write_keys(out, name, split, pool, scenes)
             for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
         with output_errors(out / CARD_FILE):
             write_atomically(out / CARD_FILE, make_card(_describe(settings, contents)).encode())
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
+
+    @staticmethod
+    def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
+        """See `Exporter`: the keys of each shard, by the million of its index, and its size and number of views."""
+        splits = ShardsExporter.folders(settings.layout)
+        shards = filter(lambda path: path.parent in splits and path.suffix == ".tar", map(Path, names))
+        for shard in sorted(shards, key=shard_index):
+            lines, size = key_lines(out / shard), (out / shard).stat().st_size
+            views = lines.count(b"\n")
+            yield f"{shard.parent / KEYS_FILE}/{shard_index(shard) // MAX_SHARD_SCENES}", lines
+            yield f"{shard.parent}/{_SIZES}/0", f"{size} {views}\n".encode()
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the shards of its scenes."""
@@ -98,12 +112,26 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
         shards, size = 0, 0
         for shard in (shard for scene in scenes for shard in find_shards(scene, out / split)):
             shards, size = shards + 1, size + shard.stat().st_size
-            if (known := known_keys(shard)).exists():
-                known.rename(parts / shard.name)
-            else:
-                pool.submit(list_keys, (), (shard, parts), path=shard)
+            pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
-        names = sorted(os.listdir(parts), key=lambda part: (len(part), part))
-        write_atomically(out / split / KEYS_FILE, join_lines((parts / part for part in names), b"{", b"}\n"))
-        views = sum((parts / part).read_bytes().count(b"\n") for part in names)
+        views = sum(path.read_bytes().count(b"\n") for path in _join_keys(parts, out / split))
         return SplitContent(name, split.name, views, shards, size)
+
+
+def _join_keys(parts: Path, split: Path) -> list[Path]:
+    """Join the lines of all files in a folder to the index of a split, in order of their numbers; returns the files."""
+    paths = sorted(parts.iterdir(), key=lambda path: (len(path.name), path.name)) if parts.is_dir() else []
+    write_atomically(split / KEYS_FILE, join_lines(paths, b"{", b"}\n"))
+    return paths
+
+
+def _join_known(out: Path, name: str, split: Path) -> SplitContent:
+    """Write the index of a split from lines that were made in advance; returns as `_write_keys`."""
+    known, shards, size, views = out / LINES / split, 0, 0, 0
+    with output_errors(out / split):
+        _join_keys(known / KEYS_FILE, out / split)
+        with (known / _SIZES / "0").open() if (known / _SIZES).is_dir() else contextlib.nullcontext(()) as rows:
+            for row in rows:
+                own_size, own_views = map(int, row.split())
+                shards, size, views = shards + 1, size + own_size, views + own_views
+    return SplitContent(name, split.name, views, shards, size)

@@ -128,11 +128,6 @@ def find_shards(scene: int, split: Path) -> Iterator[Path]:
         part += 1
 
 
-def known_keys(shard: Path) -> Path:
-    """Path of a shard's `key_lines` beside it, where they are made in advance: in the folder in which the indices of a store are joined."""
-    return shard.with_name(f".{shard.name}.keys")
-
-
 def key_lines(shard: Path) -> bytes:
     """Key table of a shard: a line `"key": shard index` of a JSON object for each view."""
     keys = dict.fromkeys(name.partition(".")[0] for name, _, _ in list_members(shard, _ADVICE))

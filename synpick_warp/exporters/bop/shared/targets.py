@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -74,7 +74,13 @@ def find_scenes(split: Path, scenes: Collection[int]) -> list[Path]:
 
 
 def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float, sensors: tuple[str, ...] = ("",)) -> None:
-    """Task: write a scene's targets, one per line, under its name, into up to three folders: BOP19, BOP24, MULTIVIEW.
+    """Task: write a scene's targets (`make_scene_targets`) under its name into a folder for each list."""
+    for folder, lines in zip(folders, make_scene_targets(scene, visibility, sensors), strict=False):
+        Path(folder, scene.name).write_bytes(lines)
+
+
+def make_scene_targets(scene: Path, visibility: float, sensors: tuple[str, ...]) -> Iterator[bytes]:
+    """Yield a scene's targets, one per line, for each list: BOP19, BOP24, MULTIVIEW.
 
     BOP19: for each image and object, the number of instances of at least `visibility` (fraction), if any. BOP24: every image. Of several
     sensors, both list the images of the first, by which the toolkit evaluates. MULTIVIEW: the images of all sensors at a time.
@@ -91,8 +97,8 @@ def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float
         localize += [{**image, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(visible.items())]
         detect.append({**image, "scene_id": scene_id})
         together.append({"im_id": [[sensor.removeprefix("_"), int(frame)] for sensor in sensors], "scene_id": scene_id})
-    for folder, targets in zip(folders, (localize, detect, together), strict=False):
-        Path(folder, scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
+    for targets in (localize, detect, together):
+        yield "".join(json.dumps(target) + "\n" for target in targets).encode()
 
 
 def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
@@ -101,7 +107,7 @@ def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
 
 
 def concatenate_targets(folder: Path, out: Path, names: tuple[str, ...]) -> None:
-    """Concatenate the parts that `write_scene_targets` wrote to `folder/name` into the data set's files, in order of scenes."""
+    """Concatenate the parts in `folder/name`, of a scene or of many, into the data set's files, in order of their numbers."""
     for name in names:
         parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
         write_atomically(out / name, join_lines(parts, b"[", b"]\n"))
