@@ -74,12 +74,13 @@ class LiveProgress:
 
 
 class PlainProgress:
-    """Plain progress lines: one per stage and note, and a rate-limited one for counts."""
+    """Plain progress lines: one per stage and note, and rate-limited ones for counts, also for those of a stage ("name: 3 of 9")."""
 
     def __init__(self, console: Console, remark: object = "") -> None:
         self._console, self._remark = console, remark
         self._started = time.monotonic()
         self._printed_at = float("-inf")
+        self._counted_at: dict[str, float] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -88,7 +89,12 @@ class PlainProgress:
         return None
 
     def stage(self, text: str) -> None:
-        """Print the stage's name as a line."""
+        """Print the stage's name as a line; of the counts of one stage at most one every `PLAIN_INTERVAL`."""
+        name, counts, _ = text.partition(": ")
+        now = time.monotonic()
+        if counts and now - self._counted_at.get(name, float("-inf")) < PLAIN_INTERVAL:
+            return
+        self._counted_at[name] = now
         self.note(text)
 
     def update(

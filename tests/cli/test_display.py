@@ -81,6 +81,8 @@ def test_progress_displays(kind):
     progress: Progress = kind(console)
     with progress:
         progress.stage("baking [bold]")
+        for done in range(5):
+            progress.stage(f"compiling: {done} of 5 modules")
         for done in range(50):
             progress.update(episodes_done=done, episodes=50, worlds_active=4, views=done, views_per_s=3.0, seconds_left=90.0)
         progress.note("note [x]")
@@ -88,7 +90,7 @@ def test_progress_displays(kind):
     assert "note [x]" in text
     assert "1:30 left" in text
     if kind is PlainProgress:
-        lines = ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
+        lines = ["baking [bold]", "compiling: 0 of 5 modules", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
         assert text.splitlines() == [f"   0:00  {line}" for line in lines]
 
 
