@@ -25,6 +25,8 @@ PLAIN_WIDTH = 120
 """Width of tables without a terminal [characters]."""
 PLAIN_INTERVAL = 10.0
 """Minimum time between two plain progress lines [s]."""
+BAR_WIDTH = 12
+"""Width of a bake's bar, which leaves room for the counts beside it on a terminal of 80 columns [characters]."""
 MAX_ROWS = 20
 """Maximum number of episodes in the table; with more, only failed ones are listed."""
 
@@ -46,7 +48,7 @@ class LiveProgress:
     def __init__(self, console: Console, remark: object = "") -> None:
         self._remark = remark
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
-        columns = (stage, BarColumn(bar_width=30), MofNCompleteColumn(), detail, TimeElapsedColumn())
+        columns = (stage, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
         self._bar = Bar(*columns, console=console, transient=True)
         self._task = self._bar.add_task("starting", total=None, detail="")
 
@@ -64,9 +66,10 @@ class LiveProgress:
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Set the bar to the episodes done, with worlds, views and time left [s] beside it. See `Progress`."""
+        """Set the bar to the episodes done, with worlds, views and time left [s] beside it; it is named so from the first view on."""
         detail = _detail(worlds_active, views, views_per_s, seconds_left, self._remark)
-        self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
+        name = "episodes" if views or episodes_done else None
+        self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail, description=name)
 
     def note(self, text: str) -> None:
         """Print a note as a line above the bar."""

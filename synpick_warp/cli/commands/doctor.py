@@ -60,7 +60,7 @@ def memory_report(config: Config) -> Table:
     small = [row[3] for row in rows if row[3] < _SMALL * total]
     for name, shape, unit, size in sorted(rows, key=lambda row: -row[3])[: len(rows) - len(small)]:
         table.add_row(name, " x ".join(map(str, shape)), unit, f"{size / MIB:.2f}")
-    table.add_row(f"{len(small)} smaller arrays", "", "", f"{sum(small) / MIB:.2f}")
+    table.add_row(f"smaller arrays: {len(small)}", "", "", f"{sum(small) / MIB:.2f}")
     table.columns[0].footer = "the whole plan"
     table.columns[3].footer = f"{total / MIB:.2f}"
     return table
