@@ -200,7 +200,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
-    """Table of episodes, one line each: mode, ending, resamples, frames, time, and attempts if there are any."""
+    """Table of episodes, one line each: mode, ending, resamples, frames, simulated time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
     cells = [[str(row.episode), row.mode, row.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows]
     if any(row.attempts for row in rows):

@@ -342,7 +342,7 @@ def test_other_cameras_than_pinholes_are_named(plain):
 
 
 def test_folders_that_are_no_data_set_say_so(tmp_path, plain):
-    with pytest.raises(DatasetError, match="is not a data set: it has neither"):
+    with pytest.raises(DatasetError, match="is not a data set: it does not exist"):
         synpick_warp.open(tmp_path / "gone")
     with pytest.raises(DatasetError, match="is a split; name the data set, the folder above"):
         synpick_warp.open(plain / "test")
