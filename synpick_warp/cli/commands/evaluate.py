@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
 
@@ -161,16 +161,13 @@ def make_table(
     files = [read_results(path) for path in results]
     truth = read_truth(data_set)
     models = read_models(data_set.folder, truth.poses.object_id.tolist(), vertices)
-    known = set(data_set.models_info) | set(models)
     for file in files:
-        check_results(file, truth, known)
+        check_results(file, truth, set(data_set.models_info) | set(models))
     if targets is not None:
         truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.sensors))
     if not truth.shown(visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
-    for file in files:
-        if gap := describe_gap(file, truth, listed=targets is not None):
-            print(gap, file=sys.stderr)
+    print(*describe_gaps(files, truth, listed=targets is not None), sep="", end="", file=sys.stderr)
     methods = make_methods(results, files, alpha)
     scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
     # Modes are those of a bake.
@@ -182,16 +179,18 @@ def make_table(
     return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
 
 
-def describe_gap(file: ResultFile, truth: Truth, *, listed: bool) -> str:
-    """One line on images with targets in which a result file has no estimate; empty if there are none. `listed`: by a target list."""
+def describe_gaps(files: Sequence[ResultFile], truth: Truth, *, listed: bool) -> Iterator[str]:
+    """A line for each result file without any estimate in an image that has targets. `listed`: images are those of a target list."""
     from synpick_warp.cli.commands.estimate import targets_file
 
-    wanted, found = (set(zip(poses.scene.tolist(), poses.image.tolist(), strict=True)) for poses in (truth.poses, file.poses))
-    if not (missing := len(wanted - found)):
-        return ""
-    own = targets_file(file.path)
-    advice = f"; --targets {own} scores those that were estimated" if not listed and own.is_file() else ""
-    return escape(f"{file.path} has no estimate in {missing:,} of {len(wanted):,} images, whose objects count as missed{advice}")
+    wanted = set(zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), strict=True))
+    for file in files:
+        missing = len(wanted - set(zip(file.poses.scene.tolist(), file.poses.image.tolist(), strict=True)))
+        own = targets_file(file.path)
+        advice = f"; --targets {own} scores those that were estimated" if not listed and own.is_file() else ""
+        if missing:
+            text = f"{file.path} has no estimate in {missing:,} of {len(wanted):,} images, whose objects count as missed{advice}"
+            yield f"{escape(text)}\n"
 
 
 def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
