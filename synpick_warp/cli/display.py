@@ -25,6 +25,8 @@ PLAIN_WIDTH = 120
 """Width of tables without a terminal [characters]."""
 PLAIN_INTERVAL = 10.0
 """Minimum time between two plain progress lines [s]."""
+BAR_WIDTH = 12
+"""Width of a bake's bar, which leaves room for the counts beside it on a terminal of 80 columns [characters]."""
 MAX_ROWS = 20
 """Maximum number of episodes in the table; with more, only failed ones are listed."""
 
@@ -46,7 +48,7 @@ class LiveProgress:
     def __init__(self, console: Console, remark: object = "") -> None:
         self._remark = remark
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
-        columns = (stage, BarColumn(bar_width=30), MofNCompleteColumn(), detail, TimeElapsedColumn())
+        columns = (stage, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
         self._bar = Bar(*columns, console=console, transient=True)
         self._task = self._bar.add_task("starting", total=None, detail="")
 
@@ -64,9 +66,10 @@ class LiveProgress:
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Set the bar to the episodes done, with worlds, views and time left [s] beside it. See `Progress`."""
+        """Set the bar to the episodes done, with worlds, views and time left [s] beside it; it is named so from the first view on."""
         detail = _detail(worlds_active, views, views_per_s, seconds_left, self._remark)
-        self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
+        name = "episodes" if views or episodes_done else None
+        self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail, description=name)
 
     def note(self, text: str) -> None:
         """Print a note as a line above the bar."""
@@ -74,12 +77,13 @@ class LiveProgress:
 
 
 class PlainProgress:
-    """Plain progress lines: one per stage and note, and a rate-limited one for counts."""
+    """Plain progress lines: one per stage and note, and rate-limited ones for counts, also for those of a stage ("name: 3 of 9")."""
 
     def __init__(self, console: Console, remark: object = "") -> None:
         self._console, self._remark = console, remark
         self._started = time.monotonic()
         self._printed_at = float("-inf")
+        self._counted_at: dict[str, float] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -88,7 +92,12 @@ class PlainProgress:
         return None
 
     def stage(self, text: str) -> None:
-        """Print the stage's name as a line."""
+        """Print the stage's name as a line; of the counts of one stage at most one every `PLAIN_INTERVAL`."""
+        name, counts, _ = text.partition(": ")
+        now = time.monotonic()
+        if counts and now - self._counted_at.get(name, float("-inf")) < PLAIN_INTERVAL:
+            return
+        self._counted_at[name] = now
         self.note(text)
 
     def update(
@@ -191,7 +200,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
-    """Table of episodes, one line each: mode, ending, resamples, frames, time, and attempts if there are any."""
+    """Table of episodes, one line each: mode, ending, resamples, frames, simulated time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
     cells = [[str(row.episode), row.mode, row.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows]
     if any(row.attempts for row in rows):

@@ -28,6 +28,7 @@ from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
     Count,
     WholeNumber,
+    describe_misuse,
     one_line,
     parse_devices,
     parse_engine,
@@ -321,7 +322,8 @@ def _run(arguments: list[str]) -> int:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
         print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
-        print(f"{NAME}: error: {one_line(name_fetched(str(error)))}", file=sys.stderr)
+        said = describe_misuse(error) if isinstance(error, cyclopts.CycloptsError) else str(error)
+        print(f"{NAME}: error: {one_line(name_fetched(said))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
@@ -349,8 +351,10 @@ def _resolve(
 
 def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
     """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
-    if claim and (as_url(out) is None or shard is not None):
-        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, and drop --shard")
+    if claim and as_url(out) is None:
+        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
+    if claim and shard is not None:
+        raise ConfigError("--claim and --shard both share out the episodes; drop one of them")
     if as_url(out) is not None and profile:
         raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from cyclopts import Parameter, Token
+from cyclopts import CycloptsError, MissingArgumentError, Parameter, Token, UnusedCliTokensError
 
 from synpick_warp.errors import ConfigError, escape, format_value
 from synpick_warp.system.inputs.urls import as_url
@@ -66,6 +66,19 @@ def one_line(text: str) -> str:
     return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 1]}…"
 
 
+def describe_misuse(error: CycloptsError) -> str:
+    """Message of a command line that does not parse; names the word that is too many, the option that is missing, or has no value."""
+    command, words = " ".join(error.command_chain or ()), list(error.unused_tokens or [])
+    if isinstance(error, UnusedCliTokensError) and words:
+        return f"{format_value(words[0])} is neither an option nor the value of one; see synpick-warp {command} --help"
+    if not isinstance(error, MissingArgumentError) or error.argument is None:
+        return str(error)
+    if error.keyword is None:
+        return str(error) if words else f"{command} needs {error.argument.name}; see synpick-warp {command} --help"
+    value = next(iter(words[words.index(error.keyword) + 1 :]), "") if error.keyword in words else ""
+    return f"{error.keyword} has no value" + (f"; if {value} is one, write {error.keyword}={value}" if value.startswith("-") else "")
+
+
 def check_range(option: str, value: float, low: float, high: float) -> None:
     """Check that the value of a numeric option lies in [low, high].
 
@@ -114,20 +127,22 @@ def parse_engine(engine: str | None, workers: int, price: float, out: Path, besi
 
     Raises:
         ConfigError: An option is out of range, or does not go with the others.
+        DeviceError: There is no such engine.
     """
     if engine is None:
         if workers or price:
             raise ConfigError("--workers and --price go with --engine; name one, such as ray")
         return None
-    if as_url(out) is None or beside is not None:
-        raise ConfigError(
-            "--engine has workers claim episodes of a prefix in an object store; name one by --out, and drop --devices and --shard"
-        )
     check_range("--workers", workers, 0, MAX_CREW)
     check_range("--price", price, 0.0, MAX_PRICE)
     from synpick_warp.cloud.ray_engine import Crew
 
-    return Crew(engine, workers, price)
+    crew = Crew(engine, workers, price)
+    if as_url(out) is None:
+        raise ConfigError("--engine has workers claim episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
+    if beside is not None:
+        raise ConfigError("--engine has workers claim episodes; drop --devices and --shard")
+    return crew
 
 
 def parse_shard(text: str) -> tuple[int, int]:

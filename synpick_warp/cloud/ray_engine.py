@@ -55,7 +55,7 @@ _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZER
 
 @dataclass
 class Crew:
-    """Options of a bake on Ray, and what its workers have cost."""
+    """Options of a bake on Ray, and what its workers have cost. Raises DeviceError if there is no such engine."""
 
     engine: str = ENGINE
     """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client."""
@@ -67,6 +67,10 @@ class Crew:
     """Number of running workers."""
     seconds: float = 0.0
     """Accumulated running time of all workers [s]."""
+
+    def __post_init__(self) -> None:
+        if _ENGINE.fullmatch(self.engine) is None:
+            raise DeviceError(f"--engine is {self.engine}; allowed: ray, or ray://HOST:PORT of a Ray Client, such as ray://head:10001")
 
     def __str__(self) -> str:
         cost = f" · cost {self.price * self.seconds / 3600.0:,.2f}" if self.price else ""
@@ -133,10 +137,8 @@ def find_address(engine: str) -> str | None:
     """Address of the cluster that an engine names, for `ray.init`; None: one on this machine is to be started.
 
     Raises:
-        DeviceError: The engine is neither "ray" nor "ray://HOST:PORT", or nobody answers there.
+        DeviceError: Nobody answers there.
     """
-    if _ENGINE.fullmatch(engine) is None:
-        raise DeviceError(f"--engine is {engine}; allowed: ray, or ray://HOST:PORT of a Ray Client, such as ray://head:10001")
     address = engine if engine != ENGINE else os.environ.get("RAY_ADDRESS") or None
     if address is not None and (match := _PLACE.search(address)) is not None:
         try:

@@ -254,8 +254,9 @@ class DataSet(Mapping[int, Episode]):
         try:
             return FoundScenes(self.folder, self._found_split)
         except NoLayoutError:
-            has = f"it has neither {MANIFEST_FILE} nor {STORE} nor BOP scenes, such as test/000001 with a scene_camera.json"
-            raise DatasetError(f"{self.folder} is not a data set: {has}; name the folder of one") from None
+            has = f"has neither {MANIFEST_FILE} nor {STORE} nor BOP scenes, such as test/000001 with a scene_camera.json"
+            why = f"it {has if self.folder.exists() else 'does not exist'}"
+            raise DatasetError(f"{self.folder} is not a data set: {why}; name the folder of one") from None
 
     @cached_property
     def config(self) -> Config:
@@ -489,11 +490,7 @@ class DataSet(Mapping[int, Episode]):
 def open_data_set(folder: Path | str) -> DataSet:
     """Open a data set; reads nothing yet, but the names of splits and scenes where there is no manifest.
 
-    Args:
-        folder: Folder that a bake wrote, or is still writing, or any BOP data set.
-
-    Raises:
-        DatasetError: The folder is not a data set.
+    Raises DatasetError if the folder is neither one that a bake wrote, or is still writing, nor another BOP data set.
     """
     data_set = DataSet(Path(folder))
     data_set.found  # noqa: B018

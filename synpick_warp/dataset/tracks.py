@@ -90,6 +90,8 @@ class Tracks(Mapping[int, Track]):
         )
 
     def __getitem__(self, instance_id: int) -> Track:
+        if instance_id not in self._tracks:
+            raise KeyError(f"there is no instance {instance_id}; instances: {', '.join(map(str, self))}")
         return self._tracks[instance_id]
 
     def __iter__(self) -> Iterator[int]:

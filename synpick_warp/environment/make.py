@@ -45,10 +45,12 @@ CACHE = 4096
 
 def require_libraries(backend: str) -> None:
     """Raise ModuleNotFoundError unless Gymnasium and the library of the arrays are installed."""
-    wanted = {"gymnasium": "make_env needs Gymnasium"} | ({"torch": f'backend="{TORCH}" needs PyTorch'} if backend == TORCH else {})
-    for module, reason in wanted.items():
+    wanted = [("gymnasium", "make_env needs Gymnasium", "'synpick-warp[environment]'")]
+    if backend == TORCH:
+        wanted.append(("torch", f'backend="{TORCH}" needs PyTorch', "torch"))
+    for module, reason, package in wanted:
         if importlib.util.find_spec(module) is None:
-            raise ModuleNotFoundError(f"{reason}, which is not installed: pip install {module}", name=module)
+            raise ModuleNotFoundError(f"{reason}, which is not installed: pip install {package}", name=module)
 
 
 def make_picking(

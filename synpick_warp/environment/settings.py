@@ -102,10 +102,11 @@ def make_choice(
     sides = [to_index(side) or 0 for side in resolution] if isinstance(resolution, Sequence) else []
     if len(sides) != 2 or min(sides) < 1:
         raise ConfigError(f"resolution is {format_value(resolution)}; allowed: width and height [px]")
-    if to_index(seed) is None:
-        raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number")
+    number = to_index(seed)
+    if number is None or number < 0:
+        raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number from 0 on")
     images = tuple(dict.fromkeys(names)), (sides[0], sides[1])
-    return Choice(task, int(num_envs), *images, action, autoreset, backend, int(seed), *_rest(limits), course)
+    return Choice(task, int(num_envs), *images, action, autoreset, backend, number, *_rest(limits), course)
 
 
 def fixed_settings(choice: Choice) -> dict[str, object]:

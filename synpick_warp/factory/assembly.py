@@ -158,7 +158,8 @@ def _add_picks(factory: Factory, progress: Progress) -> Factory:
 def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progress: Progress, renders: bool = True) -> Iterator[None]:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
 
-    A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left.
+    A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left. With a warm cache,
+    what launches compile is reported.
 
     Args:
         smallest: Builds the minimal factory, silently.
@@ -167,7 +168,8 @@ def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progre
         renders: Whether views are rendered.
     """
     if is_cache_warm(device):
-        yield
+        with make_compiler(None, progress):
+            yield
         return
     with sole_compiler(progress):
         if is_cache_warm(device):

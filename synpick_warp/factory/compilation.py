@@ -29,9 +29,12 @@ def sole_compiler(progress: Progress) -> AbstractContextManager[None]:
     return compilation_lock(lambda: progress.stage("waiting for another process, which compiles kernels"))
 
 
-def make_compiler(device: wp.Device, progress: Progress) -> Compiler:
-    """A compiler that reports "compiling kernels: 14 of 37 modules"; it compiles the kernel of `is_cache_warm` last."""
-    last = build_of(take_snapshot_kernel, device)
+def make_compiler(device: wp.Device | None, progress: Progress) -> Compiler:
+    """A compiler that reports "compiling kernels: 14 of 37 modules"; it compiles the kernel of `is_cache_warm` last.
+
+    Without a device it has no such kernel, and only reports what launches compile: a warm cache lacks kernels of other settings.
+    """
+    last = None if device is None else build_of(take_snapshot_kernel, device)
     return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"), last)
 
 

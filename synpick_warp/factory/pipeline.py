@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -24,6 +25,7 @@ from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.factory.attempts import EpisodeRecord
+from synpick_warp.factory.compilation import make_compiler
 from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
@@ -235,10 +237,14 @@ class _Run:
         self.progress.stage("loading kernels, dropping objects")
         done = False
         simulation, lead = self.factory.simulation, None if self.picks is None else self.picks.lead
-        with self.stop as stop, self.factory.stream.streams, TickLoop(simulation, lead) as ticks:
+        compiling = contextlib.ExitStack()
+        with self.stop as stop, self.factory.stream.streams, TickLoop(simulation, lead) as ticks, compiling:
+            compiling.enter_context(make_compiler(None, self.progress))
             while not (done or stop.number):
                 report, snapshot = ticks.advance()
                 self._hand_over(report, snapshot, ticks)
+                if self.summary.views:
+                    compiling.close()
                 if self.picks is not None and self.picks.is_due:
                     self._try_picks(self.picks)
                 phase = report.column("phase")

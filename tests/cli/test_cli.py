@@ -123,7 +123,8 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--set", "physics.stepp=1"], "there is no key physics.stepp, set on the command line; keys of physics: step, "),
         (["--set", "physics.step"], "--set physics.step has no value; "),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
-        (["extra"], "Unused Tokens: ['extra']."),
+        (["extra"], '"extra" is neither an option nor the value of one; see synpick-warp bake --help'),
+        (["--shard", "-1/4"], "--shard has no value; if -1/4 is one, write --shard=-1/4"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, bakes, monkeypatch, arguments, said):
@@ -319,7 +320,8 @@ def test_doctor(capsys, bakes):
     assert main(["doctor", "--worlds", "16", "--resolution", "640x360", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
     assert all(word in text for word in ("newton", "numpy", "warp-lang", "CPU cores", "kernel cache"))
-    assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00"))
+    assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00", "smaller arrays: 1"))
+    assert "Goals.goal" not in text
 
 
 def test_doctor_says_how_many_multiprocessors_can_be_reserved_or_why_none(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -81,14 +82,19 @@ def test_progress_displays(kind):
     progress: Progress = kind(console)
     with progress:
         progress.stage("baking [bold]")
+        for done in range(5):
+            progress.stage(f"compiling: {done} of 5 modules")
         for done in range(50):
             progress.update(episodes_done=done, episodes=50, worlds_active=4, views=done, views_per_s=3.0, seconds_left=90.0)
         progress.note("note [x]")
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "note [x]" in text
     assert "1:30 left" in text
+    if kind is LiveProgress:
+        plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text)
+        assert "episodes ━━━━━━━━━━━╸ 49/50 0:00:00 worlds 4 · views 49 · 3.0 views/s · 1:30 left" in plain
     if kind is PlainProgress:
-        lines = ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
+        lines = ["baking [bold]", "compiling: 0 of 5 modules", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
         assert text.splitlines() == [f"   0:00  {line}" for line in lines]
 
 

@@ -49,6 +49,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     ("given", "said"),
     [
         (("--engine", "dask"), "--engine is dask; allowed: ray, or ray://HOST:PORT"),
+        (("--engine", "dask", "--out", "DATA"), "--engine is dask; allowed: ray, or ray://HOST:PORT"),
         (("--engine", "ray://127.0.0.1:1"), "ray://127.0.0.1:1 does not answer ("),
         (("--engine", "ray://127.0.0.1:99999"), "ray://127.0.0.1:99999 does not answer ("),
         (("--engine", "ray", "--shard", "0/2"), "drop --devices and --shard"),

@@ -113,8 +113,8 @@ def test_commands_say_what_they_say_of_a_folder(sets, place, command):
 
 def test_outputs_of_commands_are_in_the_current_folder(sets, place):
     url, folder = sets
-    assert run("convert", url, "--to", "coco", "--processes", "1").code == 0
-    assert run("convert", folder, "--to", "coco", "--processes", "1", "--out", place / "local").code == 0
+    assert run("convert", url, "--to", "coco", "--threads", "1").code == 0
+    assert run("convert", folder, "--to", "coco", "--threads", "1", "--out", place / "local").code == 0
     assert files(place / "here" / "set-coco") == files(place / "local")
     assert list((place / "temporary").iterdir()) == []
 

@@ -243,7 +243,7 @@ def synpick_views(folder: Path):
 
 
 def test_command_says_what_it_made(sets, tmp_path, capsys):
-    assert main(["convert", str(sets["source"]), "--to", "shards", "--out", str(tmp_path / "out"), "--processes", "1"]) == 0
+    assert main(["convert", str(sets["source"]), "--to", "shards", "--out", str(tmp_path / "out"), "--threads", "1"]) == 0
     assert "2 episodes converted to shards" in capsys.readouterr().out
     mistake("convert", sets["source"], "--to", "shards,tar", "--out", tmp_path / "other")
     mistake("convert", tmp_path / "none", "--to", "shards", "--out", tmp_path / "other")

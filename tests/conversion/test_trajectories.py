@@ -30,7 +30,7 @@ def scripted(folder: Path) -> Path:
 
 def refusal(source: Path, tmp_path: Path, to: str, capsys) -> str:
     """The line with which a conversion ends that writes nothing."""
-    code = main(["convert", str(source), "--to", to, "--out", str(tmp_path / "out"), "--processes", "1"])
+    code = main(["convert", str(source), "--to", to, "--out", str(tmp_path / "out"), "--threads", "1"])
     line = capsys.readouterr().err
     assert (code, line.count("\n")) == (EXIT_MISTAKE, 1), line
     assert not (tmp_path / "out").exists()
@@ -43,7 +43,7 @@ def test_an_array_that_is_missing_is_one_line(source, tmp_path, assets, to, arra
     changed = shutil.copytree(source, tmp_path / "source")
     shutil.rmtree(changed / EPISODE / array)
     if to == "usd" and array in GRIPPER:
-        assert main(["convert", str(changed), "--to", to, "--out", str(tmp_path / "out"), "--processes", "1"]) == 0
+        assert main(["convert", str(changed), "--to", to, "--out", str(tmp_path / "out"), "--threads", "1"]) == 0
         return
     line = refusal(changed, tmp_path, to, capsys)
     assert "000001" in line
@@ -68,7 +68,7 @@ def test_a_group_without_metadata_or_with_others_ends_in_one_line_or_the_same_fi
         edit(changed / place / "zarr.json", change)
     else:
         (changed / place / "zarr.json").unlink()
-    code = main(["convert", str(changed), "--to", "lerobot", "--out", str(tmp_path / "out"), "--processes", "1"])
+    code = main(["convert", str(changed), "--to", "lerobot", "--out", str(tmp_path / "out"), "--threads", "1"])
     lines = capsys.readouterr().err
     assert (code, lines.count("\n")) in ((0, 0), (EXIT_MISTAKE, 1)), lines
 

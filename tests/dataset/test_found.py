@@ -229,7 +229,7 @@ def rows(view) -> dict:
 @pytest.mark.parametrize(("name", "to"), [("tless", "shards"), ("imagewise", "bop")])
 def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
     out = tmp_path / "new" / "out"
-    code, said, _ = run("convert", folders[name], "--to", f"{to},coco", "--out", out, "--processes", 1)
+    code, said, _ = run("convert", folders[name], "--to", f"{to},coco", "--out", out, "--threads", 1)
     assert code == 0
     assert f"3 scenes converted to {to}, coco" in said
     assert [path.name for path in out.parent.iterdir()] == ["out"]
@@ -248,7 +248,7 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
 
 
 def test_a_split_is_converted(folders, tmp_path):
-    words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--processes", 1)
+    words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--threads", 1)
     assert run(*words)[0] == 0
     assert [(view.episode, view.image_id) for view in synpick_warp.open(tmp_path / "out").views()] == [
         (scene, image) for scene in (48, 49, 50) for image in (1, 36)
@@ -259,7 +259,7 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path)
     shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
     for scene in (tmp_path / "set/val").iterdir():
         _rename_images(scene, {0: 1, 1: 36})
-    assert run("convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--processes", 1)[0] == 0
+    assert run("convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--threads", 1)[0] == 0
     for theirs, ours in zip(synpick_warp.open(tmp_path / "set").views(), synpick_warp.open(tmp_path / "out").views(), strict=True):
         assert ours.image_id in (1, 36)
         np.testing.assert_array_equal(theirs.rgb, ours.rgb)
@@ -280,7 +280,7 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path)
     ],
 )
 def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, name, to, said):
-    code, _, line = run("convert", folders[name], "--to", to, "--out", tmp_path / "out", "--processes", 1)
+    code, _, line = run("convert", folders[name], "--to", to, "--out", tmp_path / "out", "--threads", 1)
     assert code == 2
     assert re.search(said, line)
     assert line.count("\n") == 1
@@ -290,7 +290,7 @@ def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, name
 def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path):
     sorted(plain.glob("test/000002/depth/*"))[-1].write_bytes(b"")
     before = sorted(path.name for path in tmp_path.iterdir())
-    code, _, line = run("convert", plain, "--to", "shards", "--out", tmp_path / "out", "--processes", 1)
+    code, _, line = run("convert", plain, "--to", "shards", "--out", tmp_path / "out", "--threads", 1)
     assert code == 2
     assert "is not an image" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == before
@@ -342,7 +342,7 @@ def test_other_cameras_than_pinholes_are_named(plain):
 
 
 def test_folders_that_are_no_data_set_say_so(tmp_path, plain):
-    with pytest.raises(DatasetError, match="is not a data set: it has neither"):
+    with pytest.raises(DatasetError, match="is not a data set: it does not exist"):
         synpick_warp.open(tmp_path / "gone")
     with pytest.raises(DatasetError, match="is a split; name the data set, the folder above"):
         synpick_warp.open(plain / "test")

@@ -96,6 +96,7 @@ def test_pictures_have_no_memory(target):
         ({"resolution": (64,)}, r"resolution is \[64\]; allowed: width and height"),
         ({"resolution": (64, 0)}, "resolution is"),
         ({"seed": "a"}, 'seed is "a"; allowed: a whole number'),
+        ({"seed": -1}, "seed is -1; allowed: a whole number from 0 on"),
     ],
 )
 def test_bad_arguments_are_refused(changed, message):
@@ -116,7 +117,9 @@ def test_settings_are_those_given_but_for_what_an_environment_decides(target):
 
 def test_without_gymnasium_there_is_one_line(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"^make_env needs Gymnasium, which is not installed: pip install gymnasium$"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"^make_env needs Gymnasium, which is not installed: pip install 'synpick-warp\[environment\]'$"
+    ):
         synpick_warp.make_env(backend="numpy")
 
 

@@ -85,6 +85,19 @@ def test_a_table_is_written_to_a_file(folder, files, tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["table.tex"]
 
 
+def test_images_without_an_estimate_are_told(folder, files, tmp_path, capsys):
+    header, *rows = files[0].read_text().splitlines()
+    few, list_beside = tmp_path / "few.csv", tmp_path / "few-targets.json"
+    few.write_text("\n".join((header, *rows[:1])))
+    images = len({tuple(row.split(",")[:2]) for row in rows})
+    said = f"{few} has no estimate in {images - 1} of {images} images, whose objects count as missed"
+    assert run(folder, "--results", files[0], few, "--vertices", 50) == 0
+    assert capsys.readouterr().err == f"{said}\n"
+    list_beside.write_text("[]")
+    assert run(folder, "--results", few, "--vertices", 50) == 0
+    assert capsys.readouterr().err == f"{said}; --targets {list_beside} scores those that were estimated\n"
+
+
 def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, files):
     data = synpick_warp.open(folder)
     lines = toolkit_command(data, files).splitlines()
@@ -93,6 +106,7 @@ def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, file
     assert words[:3] == [f"BOP_PATH={folder.parent}", "python", "scripts/eval_bop19_pose.py"]
     assert "--result_filenames=icg_synpick-train-pbr.csv,bad_synpick-train-pbr.csv" in words
     assert "--targets_filename=test_targets_bop19.json" in words
+    assert f"--targets_filename={folder / 'few.json'}" in toolkit_command(data, files, folder / "few.json")
     other = write_evaluation_set(folder.parent / "my set_1")
     lines = toolkit_command(synpick_warp.open(other), files[:1]).splitlines()
     assert shlex.split(lines[1]) == ["ln", "-sfn", str(other), str(folder.parent / "myset1")]
@@ -163,6 +177,8 @@ def test_folders_that_are_no_data_sets_are_refused(files, tmp_path, capsys):
     assert "is not a data set" in capsys.readouterr().err
     assert run("--data", tmp_path) == 2
     assert run("--results", files[0]) == 2
+    assert run("--data", tmp_path, "--results") == 2
+    assert "--results has no value; name BOP result files" in capsys.readouterr().err
 
 
 def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, capsys):

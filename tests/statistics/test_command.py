@@ -164,7 +164,7 @@ def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, file, content, said
 
 
 def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path):
-    assert mistake("stats", tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set")
+    assert mistake("stats", tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set: it does not exist")
     (tmp_path / "empty").mkdir()
     assert mistake("stats", tmp_path / "empty").startswith(f"{tmp_path / 'empty'} is not a data set: it has neither manifest.json nor")
 

@@ -61,8 +61,8 @@ def data(tmp_path_factory) -> Path:
         ("explain {data} --out", "sheet.png"),
         ("report {data} --views 1 --out", "page.html"),
         ("stats {data} --csv", "tables"),
-        ("convert {data} --to coco --processes 1 --out", "set"),
-        ("convert {data} --to shards,lerobot --processes 1 --out", "set"),
+        ("convert {data} --to coco --threads 1 --out", "set"),
+        ("convert {data} --to shards,lerobot --threads 1 --out", "set"),
         ("merge {data} --out", "set"),
     ],
 )
@@ -89,7 +89,7 @@ def test_a_path_that_is_too_long_with_a_file_is_one_line(data, here):
     out = "/".join(["d"] * 2030)
     for arguments in (
         ["merge", str(data)],
-        *(["convert", str(data), "--to", to, "--processes", "1"] for to in ("shards", "lerobot", "coco")),
+        *(["convert", str(data), "--to", to, "--threads", "1"] for to in ("shards", "lerobot", "coco")),
     ):
         mistake(*arguments, "--out", out)
         assert list(here.iterdir()) == []

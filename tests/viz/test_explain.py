@@ -340,7 +340,7 @@ def test_a_damaged_record_is_one_clear_line(dataset, line, said):
         (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
         (
             lambda folder: (folder / "attempts.jsonl").unlink(),
-            r"has no attempts\.jsonl: it has no pick attempts; .*mode pick, target or mixed",
+            r"has no attempts\.jsonl: it has no pick attempts; .*mode pick, target, mixed or cycle",
         ),
         (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl, line 1, is damaged: JSON is malformed"),
         (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),

@@ -107,7 +107,7 @@ def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
         if len(worthy) == count:
             break
     if not worthy and not others:
-        raise DatasetError(f"{path} has no attempt; explain draws those of a bake with mode pick, target or mixed")
+        raise DatasetError(f"{path} has no attempt; explain draws those of a bake with mode pick, target, mixed or cycle")
     rows = [*worthy, *others][:count]
     return [(worthy | others)[row] for row in sorted(rows)]
 
@@ -121,7 +121,7 @@ def _read_lines(dataset: Path) -> tuple[Path, list[bytes]]:
     path = dataset / ATTEMPTS_FILE
     if not path.exists():
         raise DatasetError(
-            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
+            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target, mixed or cycle"
         )
     return path, read_file(path, MAX_JSON, DatasetError).splitlines()
 

@@ -28,7 +28,7 @@ def convert(
         ),
     ] = None,
     split: Annotated[str | None, Parameter(help="Split to convert, of a BOP data set from another source (default: the only one).")] = None,
-    processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
+    threads: Annotated[WholeNumber, Parameter(name=("--threads", "--processes"), help="Processes that convert; 0: one per core.")] = 0,
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
@@ -36,7 +36,7 @@ def convert(
     would have written, but for LeRobot's videos from JPEG images. BOP data sets from other sources become bop, shards, coco or yolo, with
     their own ids; interrupted, they are converted again from the start. Exit codes: 0, converted; 2, an error.
     """
-    check_range("--processes", processes, 0, MAX_THREADS)
+    check_range("--threads", threads, 0, MAX_THREADS)
     from synpick_warp.apps.conversion.run import convert as run_conversion
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
@@ -45,7 +45,7 @@ def convert(
     folder = find_data_set(folder, "synpick-warp convert DIR")
     out = out or beside(folder, f"-{'-'.join(name for name in names if name in FORMATS) or 'converted'}")
     with CountProgress(make_console()) as counter:
-        converted = run_conversion(folder, out, names, processes, counter.report, split)
+        converted = run_conversion(folder, out, names, threads, counter.report, split)
     unit = "episodes" if (folder / MANIFEST_FILE).exists() else "scenes"
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
     print(f"{converted.episodes:,} {unit} converted to {', '.join(names)}{before}")

@@ -22,6 +22,8 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.green_contexts import SmPartition, count_reserved
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
+_SMALL = 1e-3
+"""Share of the plan below which an array has no row of its own."""
 MIB = 1024**2
 GIB = 1024**3
 
@@ -40,7 +42,9 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 
 def memory_report(config: Config) -> Table:
-    """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
+    """Table of shape, unit and size of the arrays in the memory plan of a bake with these settings, and their sum. Small arrays, of less
+    than `_SMALL` of it, share a row.
+    """
     from synpick_warp.exporters.registry import Needs
     from synpick_warp.factory.memory_plan import plan_memory
     from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
@@ -52,10 +56,13 @@ def memory_report(config: Config) -> Table:
     size = ", ".join(dict.fromkeys(f"{width}x{height}" for width, height in config.rig.sizes))
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {size}", show_footer=True)
     table.columns[3].justify = "right"
-    for name, shape, unit, size in sorted(rows, key=lambda row: -row[3]):
+    total = sum(row[3] for row in rows)
+    small = [row[3] for row in rows if row[3] < _SMALL * total]
+    for name, shape, unit, size in sorted(rows, key=lambda row: -row[3])[: len(rows) - len(small)]:
         table.add_row(name, " x ".join(map(str, shape)), unit, f"{size / MIB:.2f}")
+    table.add_row(f"smaller arrays: {len(small)}", "", "", f"{sum(small) / MIB:.2f}")
     table.columns[0].footer = "the whole plan"
-    table.columns[3].footer = f"{sum(row[3] for row in rows) / MIB:.2f}"
+    table.columns[3].footer = f"{total / MIB:.2f}"
     return table
 
 

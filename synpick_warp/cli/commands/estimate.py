@@ -32,7 +32,9 @@ _MAX_RANGE = 10**6
 
 DataOption = Annotated[
     Path | None,
-    Parameter(help="A data set in the format bop or shards, with masks (bop.masks; default: the last one in the current folder)."),
+    Parameter(
+        name="--data", help="A data set in the format bop or shards, with masks (bop.masks; default: the last one in the current folder)."
+    ),
 ]
 OutOption = Annotated[
     Path | None,
@@ -44,8 +46,8 @@ OutOption = Annotated[
 
 
 def estimate(
-    *,
     data: DataOption = None,
+    *,
     out: OutOption = None,
     method: Annotated[
         str,
@@ -84,7 +86,7 @@ def estimate(
 
     selection = make_selection(method, every, targets, modes, cameras, episodes)
     options = make_options(method, depth, masks, visib_min, seed, batch, threads)
-    data = find_data_set(data, "synpick-warp estimate --data DIR", has_images)
+    data = find_data_set(data, "synpick-warp estimate DIR", has_images)
     out = Path(f"{method}_{toolkit_ending(open_data_set(data))}.csv") if out is None else out
     check_output(out, selection)
     check_output_file(out, "--out", data)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
 
@@ -33,7 +33,10 @@ _FIRST_SENSOR = "awk -F, -v OFS=, 'NR == 1 || $1 %% %d == 0 { if (NR > 1) $1 /= 
 _TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
 
-DataOption = Annotated[Path | None, Parameter(help="A data set in the format bop or shards (default: the last one in the current folder).")]
+DataOption = Annotated[
+    Path | None,
+    Parameter(name="--data", help="A data set in the format bop or shards (default: the last one in the current folder)."),
+]
 
 
 PlotsOption = Annotated[
@@ -43,8 +46,8 @@ PlotsOption = Annotated[
 
 
 def evaluate(
-    *,
     data: DataOption = None,
+    *,
     results: Annotated[
         list[Path],
         Parameter(negative=(), consume_multiple=True, help="BOP result files, one per method; methods stand side by side in the table."),
@@ -79,7 +82,7 @@ def evaluate(
     Instances without an estimate count as missed. BOP's own scores come from the BOP toolkit, by the command that is printed.
     """
     check_options(results, format_, out, visib_min, convention, top, vertices)
-    data = find_data_set(data, "synpick-warp eval --data DIR", has_images)
+    data = find_data_set(data, "synpick-warp eval DIR", has_images)
     if out is not None:
         check_output_file(out, "--out", data, [*results, *([] if targets is None else [targets])])
     if plots is not None:
@@ -98,7 +101,9 @@ def evaluate(
         print(f"table: {escape(str(out))}")
     else:
         print(table, end="\n" if format_ == "text" else "")
-    show_rest(toolkit_command(data_set, results), plots, pictures, sys.stdout if format_ == "text" or out is not None else sys.stderr)
+    show_rest(
+        toolkit_command(data_set, results, targets), plots, pictures, sys.stdout if format_ == "text" or out is not None else sys.stderr
+    )
     return 0
 
 
@@ -156,13 +161,13 @@ def make_table(
     files = [read_results(path) for path in results]
     truth = read_truth(data_set)
     models = read_models(data_set.folder, truth.poses.object_id.tolist(), vertices)
-    known = set(data_set.models_info) | set(models)
     for file in files:
-        check_results(file, truth, known)
+        check_results(file, truth, set(data_set.models_info) | set(models))
     if targets is not None:
         truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.sensors))
     if not truth.shown(visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
+    print(*describe_gaps(files, truth, listed=targets is not None), sep="", end="", file=sys.stderr)
     methods = make_methods(results, files, alpha)
     scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
     # Modes are those of a bake.
@@ -172,6 +177,20 @@ def make_table(
         return table, {}
     pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, attempt_frames(data_set))
     return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
+
+
+def describe_gaps(files: Sequence[ResultFile], truth: Truth, *, listed: bool) -> Iterator[str]:
+    """A line for each result file without any estimate in an image that has targets. `listed`: images are those of a target list."""
+    from synpick_warp.cli.commands.estimate import targets_file
+
+    wanted = set(zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), strict=True))
+    for file in files:
+        missing = len(wanted - set(zip(file.poses.scene.tolist(), file.poses.image.tolist(), strict=True)))
+        own = targets_file(file.path)
+        advice = f"; --targets {own} scores those that were estimated" if not listed and own.is_file() else ""
+        if missing:
+            text = f"{file.path} has no estimate in {missing:,} of {len(wanted):,} images, whose objects count as missed{advice}"
+            yield f"{escape(text)}\n"
 
 
 def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
@@ -246,6 +265,8 @@ def check_options(
     for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
         if value not in allowed:
             raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
+    if not results:
+        raise ConfigError("--results has no value; name BOP result files, such as those that estimate writes")
     check_range("--visib-min", visib_min, 0, 1)
     if not -1 <= top <= 2**31 - 1:
         raise ConfigError(f"--top is {top}; allowed: -1 for as many as instances, 0 for all, or a number of estimates")
@@ -314,10 +335,11 @@ def toolkit_ending(data_set: DataSet) -> str:
     return f"{toolkit_name(data_set)}-{split}{f'-{kind}' if kind else ''}"
 
 
-def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
+def toolkit_command(data_set: DataSet, results: Sequence[Path], targets: Path | None = None) -> str:
     """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise.
 
-    For several sensors, results of the first one get the data set's scene ids, and VSD, which the toolkit does not compute, is left out.
+    A target list replaces that of the data set. For several sensors, results of the first one get the data set's scene ids, and VSD, which
+    the toolkit does not compute, is left out.
     """
     cameras = len(data_set.sensors)
     folder = data_set.folder.absolute()
@@ -339,8 +361,9 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
             lines.append(f"{_FIRST_SENSOR % (cameras, cameras)} {source} > {target}" if cameras else f"cp {source} {target}")
         files.append(file)
     where, year = shlex.quote(str(place)), "24" if cameras else "19"
+    listed = f"test_targets_bop{year}.json" if targets is None else shlex.quote(str(targets.absolute()))
     lines.append(
         f"BOP_PATH={shlex.quote(str(folder.parent))} python scripts/eval_bop{year}_pose.py --results_path={where} --eval_path={where}"
-        f" --result_filenames={shlex.quote(','.join(files))} --targets_filename=test_targets_bop{year}.json"
+        f" --result_filenames={shlex.quote(','.join(files))} --targets_filename={listed}"
     )
     return "\n".join(map(escape, lines))

@@ -110,7 +110,7 @@ def commands(folder: Path, scratch: Path) -> Iterator[tuple[str, tuple[int, str]
         ("preview", "--views", 2, "--out", scratch / "sheet.png"),
         ("explain", "--episode", 0, "--out", scratch / "explained.png"),
         ("merge", "--out", scratch / "merged"),
-        ("convert", "--to", "shards", "--processes", 1, "--out", scratch / "converted"),
+        ("convert", "--to", "shards", "--threads", 1, "--out", scratch / "converted"),
     ):
         yield name, told(name, folder, *options)
         for out in ("merged", "converted"):
@@ -137,7 +137,7 @@ def test_a_list_plants_no_file(narrow, tmp_path, entry, name):
     before = snapshot(tmp_path)
     with pytest.raises(DatasetError, match=f'{entry}.sha256 names "{name}", which none of its formats writes; remove manifest/'):
         merge([folder], out)
-    code, error = told("convert", folder, "--to", "shards", "--processes", 1, "--out", out)
+    code, error = told("convert", folder, "--to", "shards", "--threads", 1, "--out", out)
     assert (code, "none of its formats writes" in error) == ((2, True) if entry == CONSTANTS else (0, False))
     assert not (out / name).exists() or (out / name).read_bytes() != b"evil"  # Shards have a README.md of their own.
     shutil.rmtree(out)
@@ -325,7 +325,7 @@ def test_episodes_in_the_settings_are_not_believed(narrow, tmp_path):
     replace(folder / "config.toml", text.replace("episodes = 2", f"episodes = {2**31 - 1}").encode())
     shared = LerobotExporter.shared_files(dataclasses.replace(DataLayout.of(settings()), episodes=2**31 - 1))
     assert len(shared.folders) < 20
-    assert told("convert", folder, "--to", "lerobot", "--processes", 1, "--out", tmp_path / "new") == (0, "")
+    assert told("convert", folder, "--to", "lerobot", "--threads", 1, "--out", tmp_path / "new") == (0, "")
     assert told("stats", folder)[0] == 0
 
 
