@@ -19,6 +19,9 @@ WORKERS := 3
 # Neighbours in one process, which makes what they share once.
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
+# Processes that tests start need not compile the sources again, whatever the shell says.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-slow checks pytest clean
 .DELETE_ON_ERROR:
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -222,13 +223,13 @@ def make_folder(folder: Path, *sides: float) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("own", "surfaces", "count"), [(True, 0, len(procedural_objects())), (False, 0, len(solids())), (True, 1, len(solids(True)))]
+    ("own", "surfaces", "embedded"), [(True, 0, procedural_objects), (False, 0, solids), (True, 1, functools.partial(solids, True))]
 )
-def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, surfaces, count):
+def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, surfaces, embedded):
     models = str(make_folder(tmp_path / "own", 0.05)) if own else ""
     loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2, "randomize.surfaces": surfaces}))
     assert {body.name for body in loaded.entries}.isdisjoint(body.name for body in loaded.distractors)
-    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(count)]
+    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(len(embedded()))]
 
 
 @pytest.mark.parametrize(("textured", "largest"), [(False, 0.2), (True, 0.32)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import re
 import sys
 import threading
@@ -45,6 +46,7 @@ def chains(section: str) -> list[list[list[str]]]:
     return items
 
 
+@functools.cache
 def device_imports() -> nx.DiGraph:
     """Files of device code, and which they import."""
     graph = nx.DiGraph()
@@ -54,9 +56,6 @@ def device_imports() -> nx.DiGraph:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("synpick_warp.kernels."):
                 graph.add_edge(place, node.module.removeprefix("synpick_warp.").replace(".", "/"))
     return graph
-
-
-IMPORTS = device_imports()
 
 
 class CallGraph:
@@ -100,7 +99,8 @@ class CallGraph:
         begin = [name for name in self.graph if name == first or name.startswith(f"{first}:")]
         reached = set(begin).union(*(nx.descendants(self.graph, name) for name in begin))
         files = {name.partition(":")[0] for name in reached}
-        imported = set().union(*(nx.descendants(IMPORTS, name) for name in files if name in IMPORTS))
+        imports = device_imports()
+        imported = set().union(*(nx.descendants(imports, name) for name in files if name in imports))
         return second in reached | files | imported
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from synpick_warp.configs.cell.gripper import Gripper
@@ -20,8 +22,9 @@ FOLDS = 3
 """Folds of the bellows."""
 
 
+@functools.lru_cache(maxsize=16)
 def make_head(gripper: Gripper) -> Head:
-    """Build the head of one cup."""
+    """Build the head of one cup: plan, scene, physics and stages ask for the same one, and nobody changes it."""
     return Head(cup_fixture(gripper), (cup_collider(gripper),), rod_inertia(gripper.cup_mass, gripper.cup_length))
 
 

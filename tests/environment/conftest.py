@@ -15,9 +15,10 @@ from tests.worlds.small_worlds import COARSE, QUICK
 
 SIZE = (64, 48)
 BRIEF = {key.replace("__", "."): value for key, value in COARSE.items()} | {
-    "pick.appear_height": 0.25,
-    "pick.lift_height": 0.3,
-    "pick.lift_speed": 1.0,
+    "pick.appear_height": 0.2,
+    "pick.near_speed": 0.5,
+    "pick.lift_height": 0.2,
+    "pick.lift_speed": 1.2,
     "physics.guide_height": 0.4,
 }
 SETTINGS = {key: value for key, value in QUICK.items() if key.split(".")[0] in ("arrangement", "settle", "move")} | BRIEF

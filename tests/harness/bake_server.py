@@ -40,9 +40,10 @@ TINY = {
 TINY_PICKS = {
     "bake.mode": "pick",
     "bake.formats": ["bop", "picks"],
-    "pick.appear_height": 0.3,
-    "pick.lift_height": 0.3,
-    "pick.lift_speed": 1.0,
+    "pick.appear_height": 0.2,
+    "pick.near_speed": 0.5,
+    "pick.lift_height": 0.2,
+    "pick.lift_speed": 1.2,
     "pick.failures": 1,
     "perception.resolution": [160, 90],
     "picks.states": 1,

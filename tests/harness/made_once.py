@@ -6,7 +6,7 @@ import functools
 import hashlib
 import os
 import pickle
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -18,7 +18,7 @@ from synpick_warp.apps.viz import explain
 from synpick_warp.dataset.commit import merge
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
-from synpick_warp.stages.render import scene
+from synpick_warp.stages.render import light_tables, scene
 from tests.harness.charts import render_here
 
 MOST_MAPS = 50
@@ -27,13 +27,9 @@ KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_
 """Functions by which Newton generates kernels anew for each collision pipeline."""
 
 
-@contextmanager
-def made_once() -> Iterator[None]:
-    """Tables of environment maps, and Newton's kernels of the narrow phase, are made once a process and its forks.
-
-    Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
-    """
-    tables, make = {}, scene.precompute_environment
+def remembered(make: Callable[..., object]) -> Callable[..., object]:
+    """A function of arrays that keeps its results, by the digests of their arguments."""
+    tables: dict[bytes, object] = {}
 
     def remember(*arguments: object) -> object:
         key = hashlib.sha256(pickle.dumps(arguments)).digest()
@@ -43,8 +39,18 @@ def made_once() -> Iterator[None]:
             tables[key] = make(*arguments)
         return tables[key]
 
+    return remember
+
+
+@contextmanager
+def made_once() -> Iterator[None]:
+    """Tables of environment maps, and Newton's kernels of the narrow phase, are made once a process and its forks.
+
+    Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "precompute_environment", remember)
+        for module, name in ((scene, "precompute_environment"), (light_tables, "environment_cdf")):
+            patch.setattr(module, name, remembered(getattr(module, name)))
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
         patch.setattr(os, "fsync", lambda handle: None)

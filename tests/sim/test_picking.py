@@ -11,7 +11,7 @@ import pytest
 from synpick_warp.codes import Ending, Outcome, Phase, Task
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
-from tests.worlds.sights import SHORT, picking
+from tests.worlds.sights import CALM, SHORT, picking
 from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings
 
 COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 8}
@@ -38,7 +38,7 @@ def column(reports: list[TickReport], name: str, world: int = 0) -> np.ndarray:
 def emptied(device):
     """One world from two objects to none, at the paper's step, and what it was made of."""
     objects = catalog(BOX, CUBE)
-    config = settings(arrangement__max_objects=2, **SHORT)
+    config = settings(arrangement__max_objects=2, **SHORT | CALM)
     simulation = picking(config, objects, device)
     return run(simulation), objects
 

@@ -11,7 +11,7 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep as kernels
 from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.sights import brief
+from tests.worlds.sights import CALM, brief
 from tests.worlds.small_worlds import report
 from tools.checks.states import Rows, check_arrays, check_branches, differing
 
@@ -74,7 +74,7 @@ def moved_to(simulation: Simulation, places: dict[int, tuple[float, float, float
 @pytest.fixture(scope="module")
 def stack(device):
     """Simulation whose world 0 has a cube asleep on a box, beside an L, while the gripper waits; and its checkpoint."""
-    simulation = brief(device, 3, bake__mode="pick", pick__failures=1000, **SLEEP)
+    simulation = brief(device, 3, bake__mode="pick", pick__failures=1000, **SLEEP | CALM)
     while simulation.state.phase.numpy()[0] != Phase.ACT:
         simulation.tick(perceives=False)
     set_rows(simulation, [0], physics__joint_q=moved_to(simulation, STACK), physics__joint_qd=0.0, sleep__asleep=0, sleep__quiet=0)

@@ -13,7 +13,7 @@ from synpick_warp.errors import StateError
 from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.sights import brief
+from tests.worlds.sights import CALM, brief
 from tests.worlds.small_worlds import BOX, CUBE, catalog
 from tools.checks.states import Rows, check_arrays, check_branches, differing, find_arrays, watch
 
@@ -54,7 +54,7 @@ class Scene:
 
 def test_a_branch_continues_as_its_episode_does(device):
     """To the bit, in other worlds and among fewer of them, beside worlds that do other things, from the drop to the next look."""
-    changed = {"bake__mode": "cycle"}
+    changed = CALM | {"bake__mode": "cycle"}
     result = check_branches(brief(device, WORLDS, **changed), brief(device, 2, **changed), states=28, moments=7, ticks=TICKS, apart=5)
     assert result.differences == []
     assert result.compared > 100

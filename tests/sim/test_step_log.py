@@ -15,7 +15,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
 from tests.twins import gripper as twin
 from tests.twins.raycast import rotation_of
-from tests.worlds.sights import SHORT, picking
+from tests.worlds.sights import CALM, SHORT, picking
 from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, settings
 
 LONGEST = 200
@@ -268,7 +268,7 @@ def test_four_cups_pick_a_box_and_share_its_weight(device):
     objects = catalog(((0.2, 0.16, 0.05),))
     array = {"gripper__kind": "suction_array", "gripper__cups": cups, "gripper__cup_width": 0.036}
     array |= {"arrangement__max_objects": 1, "arrangement__volume": 2e-3}
-    log = Log(picking(settings(**SHORT, **array), objects, device, records_physics=True))
+    log = Log(picking(settings(**SHORT | CALM, **array), objects, device, records_physics=True))
     (end,) = np.flatnonzero(log.column("outcome"))
     assert [log.column(name)[end] for name in ("outcome", "hits", "sealed")] == [Outcome.TARGET_PICKED, 40, 0b1111]
     assert log.reports[end].attached.tolist() == [[1]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,6 @@ from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
 from synpick_warp.apps.validation.subjects import TreeSubject
 from synpick_warp.apps.validation.target_lists import TargetLists
 from synpick_warp.apps.validation.tasks import CheckModel, CheckPicks, CheckRig, CheckScene, State, Task
-from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.keyed import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.commit.manifest import committed_episodes, read_manifest, read_settings
@@ -85,7 +85,9 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     for violation in _check_folders(layout, lists):
         yield _finish(violation, layout, summary)
     models = list(_plan_models(layout, summary))
-    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes), *_plan_picks(layout)]
+    cameras, picks = _read_plan(layout)
+    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(cameras, scenes)]
+    tasks += map(CheckPicks, committed_episodes(layout.root)) if picks else ()
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
     for checked in map_ordered(WorkerProgram(partial(State, layout.root, options.tolerance), "process that validates"), tasks, processes):
         summary.views += checked.views
@@ -157,9 +159,8 @@ def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, 
         start += len(images)
 
 
-def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[Task]:
+def _plan_rigs(cameras: int, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[Task]:
     """Yield tasks for scenes that belong together: those of the cameras of an episode, or of the sensors of one scene."""
-    cameras = _count_cameras(layout)
     groups: dict[tuple[str, int], list[SceneRef]] = {}
     sensors: dict[tuple[str, int], list[SceneRef]] = {}
     for ref, _ in scenes:
@@ -173,22 +174,11 @@ def _plan_rigs(layout: Layout, scenes: list[tuple[SceneRef, np.ndarray]]) -> Ite
             yield CheckRig(tuple(refs), cameras)
 
 
-def _plan_picks(layout: Layout) -> Iterator[Task]:
-    """Yield a task for each committed episode of a data set with picks."""
-    config = _read_config(layout)
-    if config is not None and "picks" in config.bake.formats:
-        yield from map(CheckPicks, committed_episodes(layout.root))
-
-
-def _count_cameras(layout: Layout) -> int:
-    """Number of cameras of a data set of this program; 1 for other data sets."""
-    config = _read_config(layout)
-    return 1 if config is None else len(config.rig)
-
-
-def _read_config(layout: Layout) -> Config | None:
-    """Settings of a data set of this program; None: it is from another source, or they are damaged."""
-    try:
-        return read_settings(layout.root, read_manifest(layout.root)) if layout.ours else None
-    except SynpickError:
-        return None
+def _read_plan(layout: Layout) -> tuple[int, bool]:
+    """Number of cameras of a data set of this program, and whether it has picks; 1 and False: it is from another source, or its settings
+    are damaged."""
+    if layout.ours:
+        with suppress(SynpickError):
+            config = read_settings(layout.root, read_manifest(layout.root))
+            return len(config.rig), "picks" in config.bake.formats
+    return 1, False
