@@ -197,7 +197,7 @@ def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
     return float((taken > slots).any(axis=1).mean())
 
 
-@hypothesis_settings(max_examples=8)
+@hypothesis_settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**32 - 1),
     size=st.sampled_from((0.5e-3, 1.5e-3, 6e-3)),
@@ -338,7 +338,7 @@ def sizes_of_boxes(budget: float) -> st.SearchStrategy[float]:
     return st.one_of(near, cubes, st.floats(1e-9, 4 * budget))
 
 
-@hypothesis_settings(max_examples=fuzz_examples(40), deadline=None)
+@hypothesis_settings(max_examples=fuzz_examples(100), deadline=None)
 @given(
     data=st.data(),
     budget=st.sampled_from((1e-3, 3e-3, 7e-3, 1e-4)),

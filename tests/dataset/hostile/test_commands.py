@@ -240,7 +240,7 @@ def test_the_set_itself_is_read_by_every_command(sandbox):
 
 @pytest.mark.parametrize("reader", READERS)
 @settings(
-    max_examples=fuzz_examples(12),
+    max_examples=fuzz_examples(20),
     deadline=None,
     phases=(Phase.explicit, Phase.generate),
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
