@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 PARKED_HEIGHT = wp.constant(-100.0)
 # Samples of the random stream that one drop uses: x, y and three for the rotation.
 DROP_SAMPLES = wp.constant(5)
-# Places among which a scattered object takes the lowest.
+# Candidate positions of a scattered object; it begins to fall at the lowest.
 PLACES = wp.constant(24)
 
 

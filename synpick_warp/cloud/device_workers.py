@@ -5,14 +5,13 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import FrameType
 
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.ray_worker import Job
-from synpick_warp.cloud.run import bake_into_store
+from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.errors import DeviceError
 from synpick_warp.exporters.registry import Needs
@@ -29,6 +28,18 @@ from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.system.stores.opening import open_store, probe
 
 _PROGRAM = "from synpick_warp.cloud.device_workers import run_worker; from synpick_warp.factory.worker import main; main(run_worker)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Share(Job):
+    """Job of one worker, with what is its own."""
+
+    folder: str
+    """Folder for temporary files."""
+    processes: int
+    """Workers on this host, which share its memory."""
+    own: Mapping[str, object]
+    """Full key -> value of settings of the worker alone: device, writers."""
 
 
 def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> BakeSummary:
@@ -61,9 +72,9 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> B
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             with DeviceProcesses(names, _PROGRAM, handle) as processes:
-                common = replace(job, config=config, folder=folder, processes=len(names))
+                common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
-                lost = processes.run([replace(common, own=each) for each in own], summary, progress)
+                lost = processes.run([_Share(**common, own=each) for each in own], summary, progress)
         finally:
             os.close(handle)
     if lost and not summary.stopped and not ledger.finished():
@@ -116,7 +127,7 @@ class _Relay(SilentProgress):
         given = {"worlds_active": worlds_active, "views": views, "views_per_s": views_per_s, "seconds_left": None}
         self._link.update(episodes_done=done, episodes=episodes, **given)
 
-    def bake(self, job: Job, bake: Callable[..., BakeSummary], _: object, *given: object) -> BakeSummary:
+    def bake(self, job: _Share, bake: Callable[..., BakeSummary], _: object, *given: object) -> BakeSummary:
         """Bake a chunk with the worker's own settings, and add its summary."""
         self.busy = True
         try:
@@ -128,7 +139,7 @@ class _Relay(SilentProgress):
         return part
 
 
-def run_worker(job: Job, _: Sequence[int], link: BakeLink) -> BakeSummary:
+def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
     """Claim and bake chunks on one device, in its process, until all episodes are done; arguments as of `pipeline.generate_share`."""
     tempfile.tempdir = job.folder  # The main process removes it, however this one ends.
     if job.own["bake.device"] == "cpu":

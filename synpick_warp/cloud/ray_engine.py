@@ -21,7 +21,8 @@ from typing import Any
 from synpick_warp import __version__
 from synpick_warp.cloud.claims import Chunks, Claims, default_chunk
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.ray_worker import Board, Job, Report, Worker
+from synpick_warp.cloud.ray_worker import Board, Report, Worker
+from synpick_warp.cloud.run import Job
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.errors import DeviceError, StoreError
 from synpick_warp.factory.episodes import BakeSummary
@@ -39,7 +40,7 @@ _POLL = 1.0
 _WINDOW = 60.0
 """Time over which the rate is averaged, since workers pause between chunks [s]."""
 _ANSWER = 5.0
-"""Longest time that an address may take to accept a connection [s]."""
+"""Connection timeout [s]."""
 _ENDING, _STOPPING = 30.0, 120.0
 """Longest wait for workers: once one has found that all is done, and once they are asked to stop, and upload what is finished [s]."""
 MAX_DEATHS = 5
@@ -50,7 +51,7 @@ STORE_BYTES = 100 << 20
 """Size of a local cluster's object store [B]: workers send counts."""
 _ENGINE, _PLACE = re.compile(r"ray(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{1,5})?"), re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
-"""Environment variables of Ray: usage statistics and warnings are off."""
+"""Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
 
 
 @dataclass
@@ -60,7 +61,7 @@ class Crew:
     engine: str = ENGINE
     """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client."""
     workers: int = 0
-    """Number of workers; 0: one a GPU of the cluster, or one a CPU core with `bake.device` cpu, growing with the cluster."""
+    """Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu."""
     price: float = 0.0
     """Price of a worker an hour."""
     alive: int = 0
@@ -322,7 +323,7 @@ class _Driver:
             self._reports[number] = report
 
     def _show(self) -> None:
-        """Report sums, rate, remaining time and costs."""
+        """Update the display: totals over all workers, rate, remaining time and cost."""
         alive, now, (before, planned) = self._alive, time.monotonic(), self._counts
         self._crew.alive = len(alive)
         self._crew.seconds += len(alive) * (now - self._seen[-1][0])

@@ -1,4 +1,4 @@
-"""Ray actors of a bake: claiming workers, one a GPU or CPU core, and the board on which they report. Nothing here imports Ray.
+"""Ray actors of a bake: claiming workers, one a GPU or CPU core, and the board on which they report. Only running actors import Ray.
 
 Claims in the store deal the chunks out, and done marks commit episodes; what workers report is for the display and the summary alone.
 """
@@ -9,14 +9,12 @@ import contextlib
 import pickle
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import LEASE
-from synpick_warp.cloud.run import Baker, bake_into_store
-from synpick_warp.configs.schema import Config
+from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.kept import keeping_baker
@@ -25,23 +23,6 @@ from synpick_warp.system.progress import SilentProgress
 
 REPORT_INTERVAL = 1.0
 """Minimum time between two reports of a worker [s]."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """What all workers bake: settings, prefix in a store, splits; `bake` and `lease` as of `run.bake_into_store`."""
-
-    config: Config
-    url: str
-    splits: tuple[str, ...] = ()
-    bake: Baker | None = None
-    lease: float = LEASE
-    folder: str | None = None
-    """Folder for temporary files; None: the system's."""
-    processes: int = 1
-    """Workers on this host, which share its memory."""
-    own: Mapping[str, object] = field(default_factory=dict)
-    """Full key -> value of settings of the worker alone: device, writers."""
 
 
 @dataclass
@@ -105,7 +86,7 @@ class Reporter(SilentProgress):
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Report counts, at most every REPORT_INTERVAL. See `Progress`."""
+        """Post counts, at most once in REPORT_INTERVAL. See `Progress`."""
         before = self._ended
         self._now.episodes, self._now.views = before[0] + episodes_done, before[1] + views
         self._now.worlds = worlds_active

@@ -7,6 +7,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +31,17 @@ MAX_CHUNK = 10_000
 
 Baker = Callable[..., BakeSummary]
 """Function that bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Parameters of a bake that all of its claiming workers share; as the arguments of `bake_into_store`."""
+
+    config: Config
+    url: str
+    splits: tuple[str, ...] = ()
+    bake: Baker | None = None
+    lease: float = LEASE
 
 
 def bake_into_store(

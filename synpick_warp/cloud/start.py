@@ -10,8 +10,7 @@ from dataclasses import replace
 
 from synpick_warp.cloud.device_workers import bake_with_devices
 from synpick_warp.cloud.ray_engine import Crew, bake_with_ray
-from synpick_warp.cloud.ray_worker import Job
-from synpick_warp.cloud.run import bake_into_store
+from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import Progress

@@ -247,7 +247,7 @@ class Exporter(Protocol):
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield what an episode adds to index files that are lists of lines, so that `finalize` only joins them if `out` has LINES.
+        """Yield the lines that an episode adds to index files; `finalize` concatenates them where `out` has the folder LINES.
 
         Args:
             out: Folder of the data set, with the committed episode.
@@ -255,7 +255,7 @@ class Exporter(Protocol):
             names: Files of the episode, of all formats, relative to `out`.
 
         Returns:
-            Names of parts, relative to LINES, and whole lines; those of one name are joined in order of the episodes.
+            Pairs of a path relative to LINES and complete lines. Lines of the same path are appended to one file, in order of the episodes.
         """
         ...
 

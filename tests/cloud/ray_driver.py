@@ -11,7 +11,8 @@ from pathlib import Path
 from rich.console import Console
 
 from synpick_warp.cli.display import make_progress
-from synpick_warp.cloud.ray_engine import Crew, Job, bake_with_ray
+from synpick_warp.cloud.ray_engine import Crew, bake_with_ray
+from synpick_warp.cloud.run import Job
 from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
 

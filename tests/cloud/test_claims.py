@@ -18,7 +18,7 @@ from synpick_warp.cloud import claims, finish, run
 from synpick_warp.cloud.claims import Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.device_workers import bake_with_devices
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.ray_worker import Job
+from synpick_warp.cloud.run import Job
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store

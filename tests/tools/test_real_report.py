@@ -98,7 +98,7 @@ def test_augmentation_moves_labels_with_the_image():
 
 @pytest.mark.parametrize("quality", [30, 75])
 def test_jpeg_is_opencvs(quality):
-    """Rounding to bytes before the transform moves some coefficients to the next step: less than half of what compression changes."""
+    """OpenCV rounds YCbCr to 8 bits before the DCT: coefficients differ by less than half of the compression error."""
     image = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8), (5, 5), 1.0)
     image = cv2.resize(image, (128, 96))
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

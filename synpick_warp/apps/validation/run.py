@@ -175,8 +175,8 @@ def _plan_rigs(cameras: int, scenes: list[tuple[SceneRef, np.ndarray]]) -> Itera
 
 
 def _read_plan(layout: Layout) -> tuple[int, bool]:
-    """Number of cameras of a data set of this program, and whether it has picks; 1 and False: it is from another source, or its settings
-    are damaged."""
+    """Number of cameras, and whether the data set has picks, by its settings; 1 and False for data sets from other sources, and where
+    the settings are damaged."""
     if layout.ours:
         with suppress(SynpickError):
             config = read_settings(layout.root, read_manifest(layout.root))

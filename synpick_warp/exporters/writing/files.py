@@ -18,8 +18,8 @@ PARTIAL = ".partial"
 The name is reserved beside a manifest, which is written first and removed last; a folder of this name without a manifest is not ours, and
 is neither used nor removed."""
 LINES = ".lines"
-"""Folder of index lines that were made when each episode was committed: LINES/INDEX/NUMBER for parts of an index file, in order of their
-numbers. It exists where the indices of a store are joined."""
+"""Folder of index lines made by the worker of each episode: LINES/INDEX/NUMBER are the parts of the file INDEX, which are concatenated
+by their numbers. It exists only where a data set in an object store is finalized."""
 MANIFEST_FILE = "manifest.json"
 """Marks a folder as a data set."""
 _JOIN_BYTES = 1 << 20

@@ -216,15 +216,15 @@ class ObjectStore:
 
 @functools.cache
 def _process() -> int:
-    """Process that sent the first request, which started the threads of obstore; its forks have none, and would wait forever."""
+    """Id of the process that sent the first request and so started obstore's threads; forked processes lack them and would hang."""
     return os.getpid()
 
 
 def _find_endpoint() -> str:
-    """Address of the S3 server that the environment names; empty: Amazon's. Variables that are empty are unset, as to boto: obstore panics.
+    """Endpoint URL of S3 by the environment variables; empty: Amazon's. Unsets empty variables, which make obstore panic.
 
     Raises:
-        StoreError: It is no address.
+        StoreError: A variable is not an HTTP URL.
     """
     found = {name: os.environ[name] for name in _ENDPOINTS if name in os.environ}
     for name, address in found.items():

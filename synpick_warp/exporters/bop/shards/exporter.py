@@ -69,7 +69,7 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """See `Exporter`: the keys of each shard, by the million of its index, and its size and number of views."""
+        """See `Exporter`: for each shard keys of its views, in parts of MAX_SHARD_SCENES shards; its size [B] and number of views."""
         splits = ShardsExporter.folders(settings.layout)
         shards = filter(lambda path: path.parent in splits and path.suffix == ".tar", map(Path, names))
         for shard in sorted(shards, key=shard_index):
