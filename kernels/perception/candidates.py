@@ -29,7 +29,7 @@ NOWHERE = wp.constant(wp.vec2i(-1, -1))
 
 @wp.struct
 class Pool:
-    """Drawn pixels of each view and their scores (POOL of phase one, the uniform share, the planned grasp's), and pixel counts."""
+    """Sample buffer: drawn pixels of each view (POOL of phase one, the uniform share, the planned grasp's), scores, pixel counts."""
 
     row_first: wp.array2d[int]
     """(view, image row): number of labelled pixels in the rows above (exclusive prefix sum)."""
@@ -49,7 +49,7 @@ class Pool:
 
 @wp.struct
 class Candidates:
-    """Sampling data of grasp candidates: share, weight, pixel, instance, normal and scores; candidates of a state are consecutive."""
+    """Sampling design of grasp candidates: `Share`, inverse probability, pixel, object, normal, scores. A state's are consecutive."""
 
     share: wp.array[int]
     """(grasp): `Share`."""
@@ -141,7 +141,7 @@ def count_rows_kernel(
     # Out:
     pool_inout: Pool,
 ):
-    """Count the labelled pixels of each image row, and set `visible`, which must be zero before. Launched over view, image row."""
+    """Count the labelled pixels of each image row, and set `visible` of its instances to 1; 0 before. Launched over view, image row."""
     view, row = wp.tid()
     if views.world[view] < 0:
         return
@@ -181,7 +181,10 @@ def sum_rows_kernel(
 
 @wp.func
 def pixel_of_rank(pool: Pool, component: wp.array3d[int], view: int, rank: int) -> wp.vec2i:
-    """Labelled pixel of a rank, counted from 0 in row-major order: binary search for the row in the prefix sums, then a scan of the row."""
+    """Rank selection: column and row of the labelled pixel of a rank, from 0 in row-major order; (-1, -1): none.
+
+    By binary search for the row in the prefix sums, then a scan of the row.
+    """
     low = int(0)
     high = int(component.shape[1] - 1)
     while low < high:

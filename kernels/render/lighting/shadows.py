@@ -112,7 +112,10 @@ def hash_pixel(row: int, column: int) -> wp.uint32:
 
 @wp.func
 def point_direction(lights: Lights, which: int, heading: wp.vec2, lamp: int, rays: int, ray: int, row: int, column: int) -> wp.vec3:
-    """Unit vector, in the world, to the sample point of the ray `ray` of `rays` from a pixel to a lamp.
+    """Stratified sampling of a lamp: unit vector, in the world, to the sample point of the ray `ray` of `rays` from a pixel to it.
+
+    `which`: index of the environment map; `heading`: cosine and sine of the map's yaw. The part of the lamp follows from the pixel's place
+    in Morton order, the point in the part from a hash of the pixel.
 
     Pixels that follow each other in Morton order take consecutive runs of `rays` parts of the lamp, so that a square of 4 x 4 of them,
     or of 2 x 2 with four rays each, takes all.
@@ -182,7 +185,7 @@ def faces_lamp(lights: Lights, which: int, heading: wp.vec2, ray: int, normal: w
 
 @wp.func
 def visible_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, instances: int, ray: wp.vec3) -> wp.vec3:
-    """Geometric unit normal of a hit, in the world, on the side from which a `ray` comes."""
+    """Geometric unit normal of a hit, in the world, on the side from which a `ray` comes (its direction, in the world)."""
     normal = face_normal(meshes, bodies, view, hit, instances)
     return wp.where(wp.dot(normal, ray) > 0.0, -normal, normal)
 
@@ -191,7 +194,7 @@ def visible_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, inst
 def is_shadowed(
     meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, position: wp.vec3, normal: wp.vec3, direction: wp.vec3
 ) -> bool:
-    """Whether a unit `direction` points below the surface, or a shadow ray in it is blocked; `tote` as in `is_blocked`."""
+    """Shadow test: whether a unit `direction`, in the world, points below the surface or is blocked; `tote`: row of its body, -1: none."""
     if wp.dot(normal, direction) <= 0.0:
         return True
     return is_blocked(meshes, table, bodies, view, tote, position + RAY_OFFSET * normal, direction, FAR)
@@ -204,7 +207,7 @@ def last_rays(
     """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
 
     They may if the history contains that frame, the pixel showed the same body, the body is calm (`is_calm`), and the pixel is not
-    refreshed in this frame (`is_refreshed`).
+    refreshed in this frame (`is_refreshed`). `slot`: row of the history.
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return False, 0

@@ -44,7 +44,7 @@ def aim_cameras_kernel(
     # Out:
     views_inout: AnyViews,
 ):
-    """Set the camera of each view that is in use. Launched over view."""
+    """Gather camera parameters: copy intrinsics, pose and lens of row `slot` of `Cameras` to each used view. Launched over view."""
     view = wp.tid()
     if views_inout.camera[view] >= 0:
         camera = views_inout.slot[view]
@@ -184,7 +184,7 @@ def bin_bodies_kernel(
     # Out:
     bodies_inout: ViewBodies,
 ):
-    """Tile binning: `body_mask` of each tile, the bodies whose oriented bounding box the tile's central ray intersects.
+    """Tile binning: `body_mask` of each tile, by place in `order`: bodies whose oriented bounding box the tile's central ray intersects.
 
     Boxes are enlarged by the tile's radius at the body's far side, so that the mask is conservative for all rays of the tile. A screen box
     is tested first. Launched over view, tile.

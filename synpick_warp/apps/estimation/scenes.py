@@ -125,7 +125,7 @@ _INPUTS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images", "depth"
 
 
 def _check_inputs(source: SceneFiles) -> None:
-    """Check that a scene of a data set from another source has what poses are estimated with."""
+    """Check that a scene of a data set from another source has the inputs of pose estimation: keys of _INPUTS. Raises DatasetError."""
     for name, what in _INPUTS.items():
         if not source.has(name):
             raise DatasetError(f"{source.place} has no {what}, which poses are estimated with")

@@ -94,7 +94,9 @@ def _read_entry(entry: TargetEntry) -> list[Target]:
 
 
 def in_layout(targets: Sequence[Target], sensors: Sequence[str]) -> list[Target]:
-    """The inverse of `TargetList.in_classic_layout`: targets with a scene for each camera, as the data set's own lists have them."""
+    """Convert targets from the classic layout, a scene for each camera, to scenes with `sensors`: the inverse of `in_classic_layout`.
+
+    Without sensors the lists are alike."""
     if not sensors:
         return list(targets)
     count = len(sensors)

@@ -46,7 +46,7 @@ class CoverageCounts(Counts):
     """Views by obj_id and bin."""
 
     def add_scene(self, scene: SceneTruth) -> None:
-        """Count the viewing directions of a scene's visible instances."""
+        """Count the viewing directions of a scene's instances of which at least MIN_VISIBILITY is visible, or of which this is unknown."""
         # Instances of which it is not known count as seen.
         seen = ~(scene.visibility < MIN_VISIBILITY)
         code = scene.object_id[seen] * BINS + direction_bins(scene.direction[seen])

@@ -97,7 +97,8 @@ def label_texts(truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) ->
 
 
 def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors: Sequence[tuple[int, int, int]]) -> None:
-    """Draw the labels of boxes on their instances' colours, in place; a line leads from a label outside of its box to it."""
+    """Draw labels of boxes on their instances' colours, in place; a line leads from a label outside its box to it. Those without room are
+    left out."""
     sizes = [(width + 2 * _PAD, height + 2 * _PAD) for width, height in (text_size(text, LABEL) for text in texts)]
     for box, place, text, color in zip(boxes, place_labels(boxes, sizes, image.shape[1::-1]), texts, colors, strict=True):
         if place is None:
@@ -138,7 +139,7 @@ def draw_legend(
     truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]],
     names: Mapping[int, str],
 ) -> Image:
-    """Draw the legend of a view: facts, then label, name and visible fraction of each instance, hidden ones last.
+    """Draw the legend of a view, a new image: facts, then label, name and visible fraction of each instance, the most visible first.
 
     Args:
         size: Width and height [px]; what does not fit is counted.

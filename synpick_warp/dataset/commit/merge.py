@@ -124,7 +124,11 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
 
 
 def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
-    """Choose the part that each manifest entry is taken from: entry -> part. All entries and checksum lists are read, and so checked."""
+    """Choose the part that each manifest entry is taken from, the first that has it: entry -> part.
+
+    Raises:
+        DatasetError: Parts differ in an entry, an entry or a checksum list is damaged, or no part has a committed episode.
+    """
     sources: dict[Path, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
@@ -186,7 +190,7 @@ def _later_paths(out: Path, shared: SharedFiles) -> list[Path]:
 
 
 class _Added:
-    """Files and folders that the merge adds to the output folder, which an error removes again; nothing else is removed."""
+    """Rollback list: files and folders that the merge adds to the output folder, and the folder. An error removes them, nothing else."""
 
     def __init__(self, out: Path) -> None:
         self.paths: list[Path] = []

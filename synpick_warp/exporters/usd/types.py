@@ -14,8 +14,8 @@ from synpick_warp.views.frames import EpisodeEnd
 
 @dataclass(frozen=True)
 class StageLight:
-    """Environment map as a dome light, and its sun as a distant light: direction towards the sun in the map's frame [°], irradiance (None:
-    no sun), angular diameter [°].
+    """Environment map as a dome light, and its sun as a distant light: azimuth and polar angle of the sun in the map's frame [°],
+    irradiance (None: no sun), angular diameter [°].
     """
 
     name: str
@@ -116,5 +116,5 @@ def bin_asset(sizes: BinSizes) -> str:
 
 
 def object_asset(obj_id: int) -> str:
-    """Name of an object's asset: stem of its file, and name of its root prim. Distractors are numbered from 0."""
+    """Name of an object's asset: stem of its file, and name of its root prim. Distractors have obj_ids from FIRST_DISTRACTOR downwards."""
     return f"obj_{obj_id:06d}" if obj_id >= 0 else f"distractor_{FIRST_DISTRACTOR - obj_id:06d}"

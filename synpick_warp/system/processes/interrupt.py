@@ -30,7 +30,7 @@ class KeptInterrupt:
 
     Libraries import others by `try: ... except BaseException`, as trimesh does, and take an interrupt there for a missing package. So it
     waits until the import has ended; a second SIGINT does not wait. One that is swallowed elsewhere is raised again, until it
-    arrives here. `finally` blocks and handlers that it passes on its way are not disturbed.
+    arrives here. `finally` blocks and handlers that it passes on its way are not disturbed. It uses SIGALRM and ITIMER_REAL.
 
     Where SIGINT is ignored or handled otherwise, and in any thread but the main one, it does nothing.
     """
@@ -104,7 +104,7 @@ class KeptInterrupt:
 
 
 class StopRequest:
-    """Context manager that records the first of SIGNALS; after it the previous handlers are restored.
+    """Graceful shutdown: context manager that records the first of SIGNALS, as `number`; after it the previous handlers are restored.
 
     In any thread but the main one it does nothing: Python allows signal handlers there alone.
     """

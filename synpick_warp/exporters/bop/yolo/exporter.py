@@ -18,7 +18,8 @@ from synpick_warp.exporters.writing.notes import note_files, write_notes
 
 
 class YoloExporter(SceneExporter):
-    """`Exporter` of YOLO labels. A scene is a folder of images, one of each kind of labels, and a list of its images."""
+    """`Exporter` of YOLO labels. A scene is a folder of images, one of each kind of labels, and a list of its images. The index of a class
+    is the rank of its obj_id."""
 
     writes_depth = False
     staging = "yolo"
