@@ -104,14 +104,14 @@ def _ious(table: np.ndarray) -> np.ndarray:
     return table.diagonal() / np.maximum(union, 1)
 
 
-def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
-    """Scores of a network on the views of a pool, at their own size."""
+def score_pool(network: nn.Module, pool: Pool, classes: int, channels: int) -> Scores:
+    """Scores of a network, which sees the first `channels` of images, on the views of a pool, at their own size."""
     images, classified = pool.tensors()
 
     def pairs() -> Iterable[tuple[str, np.ndarray, np.ndarray]]:
         for index in range(pool.count):
             with torch.no_grad():
-                found = network(images[index : index + 1]).argmax(1)[0]
+                found = network(images[index : index + 1, :channels]).argmax(1)[0]
             yield str(index), found.cpu().numpy().astype(np.uint8), classified[index].cpu().numpy()
 
     return score(pairs(), classes, MIN_PIXELS)
