@@ -204,9 +204,9 @@ def test_a_worker_starts_anew_after_a_run_that_ends_it(monkeypatch, tmp_path):
 
     monkeypatch.setattr(worker, "_CONTEXT", multiprocessing.get_context("fork"))
     monkeypatch.setattr(worker, "_serve", serve)
-    one, log, ended = worker.Worker(["a"]), tmp_path / "log", []
-    for action in ("work", "fail", "work", "hang"):
-        ended.append((one.run([action], log, 0.5 if action == "hang" else 20.0), one.ready, log.read_text()))
+    one, log = worker.Worker(["a"]), tmp_path / "log"
+    limits = {"work": 20.0, "fail": 20.0, "hang": 0.5}
+    ended = [(one.run([action], log, limits[action]), one.ready, log.read_text()) for action in ("work", "fail", "work", "hang")]
     assert ended == [(True, True, "a 0"), (False, False, "a 1"), (True, True, "a 0"), (False, False, "a 1")]
 
 

@@ -48,6 +48,8 @@ DETECTOR = 60.0
 """Training of the detector [s]."""
 SLACK = 1.15
 """Safety factor on expected times: a run starts only if so much time is left."""
+MAX_FAILURES = 3
+"""Failures in succession after which a GPU is given no more runs."""
 METRICS = {
     "mean_iou": ("mIoU", "", 1.0),
     "found": ("instances with IoU above 0.5", "%", 100.0),
@@ -62,8 +64,8 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
-MOST = ("--capacity", "40000", "--network", "residual", "--width", "64", "--batch", "32")
-"""Arguments of the rows with the most views."""
+CHOICE = "--network residual --width 64 --batch 32"
+"""Network of the rows with the most views."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
@@ -143,8 +145,9 @@ def _settings(*assignments: str) -> tuple[str, ...]:
     return tuple(word for one in assignments for word in ("--set", one))
 
 
-def plan(views: int, main_views: int) -> Iterator[Run]:
-    """All rows in the order of priority."""
+def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
+    """All rows in the order of priority, with numbers of views, and arguments of those with the most."""
+    most = ("--capacity", "40000", *choice.split())
     detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
     yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
@@ -161,12 +164,12 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, MOST, passes=2.0, limit=450.0, least=300.0)
+    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=450.0, least=300.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
     yield Run("2,000 views, path-traced", 2000, traced, 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
-    yield Run("up to 200,000 views, colour and depth", 200_000, (*MOST, "--depth"), passes=2.0, limit=450.0, least=300.0)
+    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=450.0, least=300.0)
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
@@ -217,15 +220,16 @@ class Execution:
         return time.monotonic() - self.started
 
     def _serve(self, gpu: int) -> None:
-        """Carry out runs on a GPU until none is left that fits."""
+        """Carry out runs on a GPU until none is left that fits, or several have failed in succession."""
         options = self.options
         shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
-        worker = Worker([*shared, *options.pass_on])
+        worker, failures = Worker([*shared, *options.pass_on]), 0
         try:
-            while job := self._take(worker.ready):
+            while failures < MAX_FAILURES and (job := self._take(worker.ready)):
                 run, seed = job
                 stem, begun, ready = self.stem(*job), self.now, worker.ready
                 done = worker.run(run.command(seed, stem), stem.with_suffix(".log"), options.deadline - begun)
+                failures = 0 if done else failures + 1
                 self._finish(f"gpu {gpu}  seed {seed}  {run.name}", done)
                 beside = self.now - begun - spent(stem.with_suffix(".json")) - run.detector
                 self.start[ready] = max(self.start[ready], beside)
@@ -297,10 +301,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
     parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
     parser.add_argument("--first", default="", metavar="NAME", help="row that starts before all others")
+    parser.add_argument(
+        "--choice", default=CHOICE, metavar="ARGUMENTS", help="network of the rows with the most views (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="existing folder to write to; without it the plan is printed")
     parser.add_argument("pass_on", nargs="*", help="more arguments of tools.reports.real for all runs, after --")
     options = parser.parse_args(arguments)
-    rows = list(plan(options.views, options.main_views))
+    rows = list(plan(options.views, options.main_views, options.choice))
     jobs, names = order(rows, options.first), [run.name for run in rows]
     if options.first and options.first not in names:
         print(f"reports.real.ablation: --first is {options.first}; rows: {'; '.join(names)}", file=sys.stderr)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 from contextlib import ExitStack
-from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 _CONTEXT = multiprocessing.get_context("spawn")
 """A process that uses CUDA cannot be forked."""
@@ -21,8 +22,8 @@ class Worker:
     def __init__(self, shared: list[str]) -> None:
         """`shared`: arguments of all runs, by whose settings views are held out."""
         self.shared = shared
-        self._process: multiprocessing.process.BaseProcess | None = None
-        self._connection: Connection | None = None
+        self._process: BaseProcess | None = None
+        self._connection: Any = None
 
     @property
     def ready(self) -> bool:
@@ -36,7 +37,6 @@ class Worker:
             self._process = _CONTEXT.Process(target=_serve, args=(other, self.shared), daemon=True)
             self._process.start()
             other.close()
-        assert self._connection is not None
         try:
             self._connection.send((arguments, log))
             if self._connection.poll(max(seconds, 0.0)):
@@ -53,7 +53,7 @@ class Worker:
             self._process.join()
 
 
-def _serve(connection: Connection, shared: list[str]) -> None:
+def _serve(connection: Any, shared: list[str]) -> None:
     """Loop of the process until its parent has ended. An error ends it, with a traceback in the log."""
     with ExitStack() as stack:
         bench = None
