@@ -34,7 +34,8 @@ class Worker:
         """Carry out a run; False: it failed, or was stopped after so many seconds. Its output goes to the file `log`."""
         if not self.ready:
             self._connection, other = _CONTEXT.Pipe()
-            self._process = _CONTEXT.Process(target=_serve, args=(other, self.shared), daemon=True)
+            # No daemon: it may start processes of its own, as CoACD's.
+            self._process = _CONTEXT.Process(target=_serve, args=(other, self.shared))
             self._process.start()
             other.close()
         try:
