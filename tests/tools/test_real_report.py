@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
 import json
+import multiprocessing
 import time
 
 import cv2
@@ -17,8 +19,8 @@ scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
 from synpick_warp.errors import SynpickError  # noqa: E402
 from tools.options import Row  # noqa: E402
-from tools.reports.real import OBJECT, ablation, interval  # noqa: E402
-from tools.reports.real.__main__ import PRESET  # noqa: E402
+from tools.reports.real import OBJECT, ablation, interval, training, worker  # noqa: E402
+from tools.reports.real.__main__ import PRESET, make_options, recipe_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS  # noqa: E402
 from tools.reports.real.training import Recipe, compress_views, halve_views, segmentation_loss, train, warp_views  # noqa: E402
@@ -138,21 +140,22 @@ def test_a_pool_replaces_views_once_it_is_full():
     pool = Pool(4, 0)
     batches = iter([(torch.full((3, 3, 2, 2), index, dtype=torch.uint8), torch.full((3, 2, 2), index)) for index in range(6)])
     assert pool.fill(batches, 4)
-    assert pool.count == pool.seen == 4
+    assert (pool.count, pool.seen) == (4, 6)
     assert not pool.fill(batches, 40)
-    assert pool.count == 4
-    assert pool.seen > 4
-    assert pool.draw(9)[0].shape == (9, 3, 2, 2)
+    assert (pool.count, pool.seen) == (4, 18)
+    images, classes = pool.draw(9)
+    assert images.shape == (9, 3, 2, 2)
+    assert torch.equal(images[:, 0], classes)
 
 
 class Drawn:
-    """Synthetic data source: batches of images of a bright square, each after a delay of `pause` seconds."""
+    """Synthetic data source: batches of four images of a bright square, each after a delay of `pause` seconds."""
 
-    def __init__(self, pause: float = 0.0, most: int | None = None, channels: int = 3):
-        self.pause, self.most, self.channels = pause, most, channels
+    def __init__(self, pause: float = 0.0, channels: int = 3):
+        self.pause, self.channels = pause, channels
 
-    def batches(self):
-        for _ in itertools.count() if self.most is None else range(self.most):
+    def batches(self, views):
+        for _ in range(views // 4):
             time.sleep(self.pause)
             classes = torch.zeros(4, 16, 16, dtype=torch.uint8)
             classes[:, 4:12, 4:12] = 1
@@ -169,10 +172,42 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
-    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", dice=1.0, depth=True, half=0.5)
-    trained, _ = train(Drawn(most=4, channels=4), recipe, 2, torch.device("cpu"), 0)
+    recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, network="residual", depth=True, half=0.5)
+    trained, _ = train(Drawn(channels=4), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
     assert trained.samples == 16
+
+
+def test_views_keep_ahead_of_samples(monkeypatch):
+    """An eighth of the views comes first, then a batch of four for each 16 samples."""
+    steps, step = [], training._Trainer.step
+    monkeypatch.setattr(training._Trainer, "step", lambda self, pool: (steps.append(pool.seen), step(self, pool)))
+    recipe = dataclasses.replace(RECIPE, views=40, capacity=40, width=2, seconds=60.0, passes=5.0)
+    train(Drawn(), recipe, 2, torch.device("cpu"), 0)
+    assert steps == [min(40, 8 + 4 * (1 + step // 4)) for step in range(50)]
+
+
+def test_the_command_lines_defaults_are_the_recipes():
+    made = recipe_of(make_options().parse_args(["--real", "frames"]))
+    assert made == Recipe(views=24_000, passes=4.0, batch=16, width=48, seconds=280.0, capacity=48_000, half=0.7, dice=1.0)
+
+
+def test_a_worker_starts_anew_after_a_run_that_ends_it(monkeypatch, tmp_path):
+    def serve(connection, shared):
+        for count in itertools.count():
+            (action,), log = connection.recv()
+            log.write_text(f"{shared[0]} {count}")
+            if action != "work":
+                time.sleep(60.0 if action == "hang" else 0.0)
+                raise SystemExit(1)
+            connection.send(True)
+
+    monkeypatch.setattr(worker, "_CONTEXT", multiprocessing.get_context("fork"))
+    monkeypatch.setattr(worker, "_serve", serve)
+    one, log = worker.Worker(["a"]), tmp_path / "log"
+    limits = {"work": 20.0, "fail": 20.0, "hang": 0.5}
+    ended = [(one.run([action], log, limits[action]), one.ready, log.read_text()) for action in ("work", "fail", "work", "hang")]
+    assert ended == [(True, True, "a 0"), (False, False, "a 1"), (True, True, "a 0"), (False, False, "a 1")]
 
 
 @pytest.mark.parametrize("name", ablation.LEVERS)
@@ -192,6 +227,13 @@ def test_the_first_row_trains_for_less_rather_than_not_at_all():
     assert other.fit(start + ablation.SLACK * other.training + 1, ablation.START) is not None
 
 
+def results(value):
+    """Results of one seed, as `tools.reports.real` writes them."""
+    rows = [{"name": "obj_id 2: IoU", "value": value, "part": OBJECT}, {"name": "views", "value": 8.0, "part": ""}]
+    entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", "limit", *ablation.METRICS), value)
+    return json.dumps({"more": {"seeds": [entry]}, "rows": rows})
+
+
 def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, capsys):
     jobs = ablation.order(list(ablation.plan(8000, 24_000)))
     assert len({ablation.stem_of(*job) for job in jobs}) == len(jobs)
@@ -200,12 +242,40 @@ def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, caps
     assert len(lines) == len(jobs)
     assert lines[-1].endswith("(left out)")
     for seed, value in enumerate((0.4, 0.6)):
-        rows = [{"name": "obj_id 2: IoU", "value": value, "part": OBJECT}, {"name": "views", "value": 8.0, "part": ""}]
-        entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", "limit", *ablation.METRICS), value)
-        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(json.dumps({"more": {"seeds": [entry]}, "rows": rows}))
+        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(results(value))
     made = ablation.collect(tmp_path, jobs)
     assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
     assert made["rows"][-1] == dataclasses.asdict(Row("obj_id 2: IoU", 0.5, part="all levers"))
     assert made["rows"][0]["name"] == "all levers: mIoU"
     assert made["rows"][0]["unit"].endswith("shortest time limit 0 s")
     assert made["more"]["seeds"]["all levers"]["mean_iou"] == [0.4, 0.6]
+
+
+def test_rows_go_on_after_one_that_fails(monkeypatch, tmp_path, capsys):
+    """Rows that have results or do not fit are left out; each worker is of a GPU."""
+    commands = []
+
+    class Fake:
+        ready = False
+
+        def __init__(self, shared):
+            self.device = shared[shared.index("--device") + 1]
+
+        def run(self, arguments, log, seconds):
+            commands.append((self.device, log.stem))
+            if "fails" not in log.stem:
+                log.with_suffix(".json").write_text(results(0.5))
+            return "fails" not in log.stem
+
+        def stop(self):
+            commands.append((self.device, "stop"))
+
+    monkeypatch.setattr(ablation, "Worker", Fake)
+    names = ("there", "fails", "long", "goes on")
+    jobs = [(ablation.Run(name, 8, seeds=1, rate=1e-3 if name == "long" else 1e3, limit=1e4), 0) for name in names]
+    (tmp_path / "there_0.json").write_text(results(0.5))
+    options = argparse.Namespace(real="R", models="M", lights="L", gpus=1, deadline=200.0, out=tmp_path, pass_on=[])
+    assert ablation.Execution(jobs, options).run() == 1
+    assert commands == [("cuda:0", "fails_0"), ("cuda:0", "goes_on_0"), ("cuda:0", "stop")]
+    assert "left out: seed 0 of long" in capsys.readouterr().out
+    assert {row["part"] for row in json.loads((tmp_path / "real_ablation.json").read_text())["rows"]} == {"there", "goes on"}

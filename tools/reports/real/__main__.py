@@ -1,7 +1,7 @@
 """Sim-to-real semantic segmentation: trains on synthetic views only, evaluates on annotated photographs (mIoU, recall, background).
 
-Each seed has its own piles, pictures and network; values are means over seeds with 95 % intervals. Held-out synthetic views are evaluated
-too, for comparison. Needs PyTorch; the defaults are for a GPU.
+Each seed has its own piles, pictures and network; values are means over seeds with 95 % intervals. The same held-out synthetic views are
+evaluated for all seeds, for comparison. Needs PyTorch; the defaults are for a GPU.
 
     python -m tools.reports.real --real REAL --models YCB --lights HDRI --views 24000 --seeds 3 --json real.json --pictures OUT
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -69,21 +70,52 @@ class Outcome:
     """AP at an IoU of 0.5 of the detector; NaN: none was trained."""
 
 
-def run_seed(options: argparse.Namespace, seed: int, frames: list[RealFrame], device: Any) -> Iterator[Outcome]:
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all runs of a process share: photographs, held-out views with depth, and the device."""
+
+    frames: list[RealFrame]
+    held: Pool
+    device: Any
+
+    @property
+    def target(self) -> torch.device:
+        """The device for PyTorch."""
+        return torch.device(self.device.alias)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the views [px]."""
+        height, width = self.held.tensors()[0].shape[2:]
+        return int(width), int(height)
+
+
+@contextmanager
+def open_bench(options: argparse.Namespace) -> Iterator[Bench]:
+    """Read the photographs and hold out views of the settings of `options`; within, PyTorch works on a stream of its own.
+
+    Raises:
+        SynpickError: A setting is wrong, or photographs, models or lights cannot be used.
+    """
+    frames, device = read_frames(options.real), pick_device(options.device)
+    # Work on CUDA's default stream would wait for all that the renderer has queued.
+    with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
+        source = source_of(options, 0, device)
+        few = replace(source.config, bake=replace(source.config.bake, worlds=min(options.worlds, FEW_WORLDS)))
+        yield Bench(frames, hold_out(replace(source, config=few, episodes=HELD_OUT, cameras=None, depth=True), options.held_out), device)
+
+
+def run_seed(options: argparse.Namespace, seed: int, bench: Bench) -> Iterator[Outcome]:
     """Train and score with one seed; with --detector, the outcome comes again with its precision.
 
     Raises:
         SynpickError: A setting is wrong, or models or lights cannot be used.
     """
-    source, held_source = sources(options, seed, device)
-    target = torch.device(device.alias)
-    held = hold_out(held_source, options.held_out)
-    trained, pool = train(source, recipe_of(options), 1 + MODELS, target, seed)
-    outcome = measure(trained, frames, held, target)
+    trained, pool = train(source_of(options, seed, bench.device), recipe_of(options), 1 + MODELS, bench.target, seed)
+    outcome = measure(trained, options.depth, bench)
     yield outcome
     if options.detector:
-        height, width = held.tensors()[0].shape[2:]
-        yield replace(outcome, precision=_detector(options, pool, frames, (int(width), int(height)), target))
+        yield replace(outcome, precision=_detector(options, pool, bench))
 
 
 def recipe_of(options: argparse.Namespace) -> Recipe:
@@ -91,41 +123,40 @@ def recipe_of(options: argparse.Namespace) -> Recipe:
     return Recipe(**{name: getattr(options, name) for name in Recipe.__dataclass_fields__})
 
 
-def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: Any) -> Outcome:
-    """Scores of a network on real frames, and on held-out views."""
-    height, width = held.tensors()[0].shape[2:]
-    size = (int(width), int(height))
-    depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if held.tensors()[0].shape[1] > 3 else None for frame in frames]
+def measure(trained: Trained, depth: bool, bench: Bench) -> Outcome:
+    """Scores of a network, which sees colour or colour and depth, on real frames and on held-out views."""
+    depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if depth else None for frame in bench.frames]
 
     def scored(scales: tuple[float, ...]) -> tuple[Scores, list[np.ndarray]]:
-        found = [predict(trained.network, frame.color, size, device, depth, scales) for frame, depth in zip(frames, depths, strict=True)]
-        return score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS), found
+        shown = zip(bench.frames, depths, strict=True)
+        found = [predict(trained.network, frame.color, bench.size, bench.target, measured, scales) for frame, measured in shown]
+        return score([(frame.name, one, frame.label) for frame, one in zip(bench.frames, found, strict=True)], 1 + MODELS), found
 
     real, found = scored((1.0,))
-    overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
-    return Outcome(trained, real, scored(SCALES)[0], score_pool(trained.network, held, 1 + MODELS), overlay)
+    overlay = [(frame.color, frame.label, one) for frame, one in zip(bench.frames, found, strict=True)]
+    return Outcome(trained, real, scored(SCALES)[0], score_pool(trained.network, bench.held, 1 + MODELS, 3 + depth), overlay)
 
 
-def sources(options: argparse.Namespace, seed: int, device: Any) -> tuple[Source, Source]:
-    """Sources of training views, and of held-out views by all cameras.
+def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
+    """Source of the training views of a seed.
 
     Raises:
         ConfigError: A setting is wrong.
     """
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
-    config, few = configure(options, fixed), min(options.worlds, FEW_WORLDS)
-    source = Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
-    return source, replace(source, config=replace(config, bake=replace(config.bake, worlds=few)), episodes=HELD_OUT, cameras=None)
+    config = configure(options, fixed)
+    return Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
 
 
-def _detector(options: argparse.Namespace, pool: Pool, frames: list[RealFrame], size: tuple[int, int], device: Any) -> float:
+def _detector(options: argparse.Namespace, pool: Pool, bench: Bench) -> float:
     """AP at an IoU of 0.5 of a detector on real frames; NaN without torchvision, which is printed."""
-    network = train_detector(pool, 1 + MODELS, device, options.detector)
+    network = train_detector(pool, 1 + MODELS, bench.target, options.detector)
     if network is None:
         print("detector: torchvision is not installed or does not load; left out")
         return float("nan")
-    return average_precision([detect(network, frame.color, size, device) for frame in frames], [boxes_of(frame.label) for frame in frames])
+    found = [detect(network, frame.color, bench.size, bench.target) for frame in bench.frames]
+    return average_precision(found, [boxes_of(frame.label) for frame in bench.frames])
 
 
 def rows_of(outcomes: list[Outcome]) -> list[Row]:
@@ -161,26 +192,32 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     options = make_options().parse_args(arguments)
     try:
-        frames = read_frames(options.real)
-        device = pick_device(options.device)
         if options.pictures is not None and not options.pictures.is_dir():
             raise ConfigError(f"--pictures is {options.pictures}; name a folder that exists")
-        outcomes = []
-        # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
-        with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
-            for seed in range(options.first_seed, options.first_seed + options.seeds):
-                results = run_seed(options, seed, frames, device)
-                outcomes.append(next(results))
-                print(_line(seed, outcomes[-1]), flush=True)
-                _write(options, outcomes)
-                if options.pictures is not None:
-                    draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcomes[-1].overlay, 1 + MODELS)
-                for outcomes[-1] in results:
-                    _write(options, outcomes)
+        with open_bench(options) as bench:
+            carry_out(options, bench)
     except SynpickError as error:
         return fail("reports.real", error)
-    print_rows(Console(), "", "photographs", rows_of(outcomes))
     return 0
+
+
+def carry_out(options: argparse.Namespace, bench: Bench) -> None:
+    """Train and score with all seeds of a command line; results are written after each, and printed.
+
+    Raises:
+        SynpickError: A setting is wrong, or models or lights cannot be used.
+    """
+    outcomes: list[Outcome] = []
+    for seed in range(options.first_seed, options.first_seed + options.seeds):
+        results = run_seed(options, seed, bench)
+        outcomes.append(next(results))
+        print(_line(seed, outcomes[-1]), flush=True)
+        _write(options, outcomes)
+        if options.pictures is not None:
+            draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcomes[-1].overlay, 1 + MODELS)
+        for outcomes[-1] in results:
+            _write(options, outcomes)
+    print_rows(Console(), "", "photographs", rows_of(outcomes))
 
 
 def _line(seed: int, outcome: Outcome) -> str:
@@ -241,22 +278,23 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
         "passes": (4.0, "number of epochs"),
-        "seconds": (280.0, "time limit of a training with its stream, of which filling the pool takes at most half [s]"),
-        "scale": (1.5, "largest factor of augmentation by size; 1: no geometric augmentation"),
-        "rotation": (15.0, "half width of augmentation by rotation [°]"),
-        "jitter": (0.3, "strength of photometric augmentation; 0: none"),
-        "jpeg": (40.0, "lowest JPEG quality of augmentation; 0: none"),
-        "dice": (0.0, "weight of the Dice loss beside the cross entropy"),
-        "rate": (2e-3, "largest learning rate"),
-        "half": (0.0, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
+        "seconds": (280.0, "time limit of a training with its stream, of which the first views take at most half [s]"),
+        "scale": (Recipe.scale, "largest factor of augmentation by size; 1: no geometric augmentation"),
+        "rotation": (Recipe.rotation, "half width of augmentation by rotation [°]"),
+        "jitter": (Recipe.jitter, "strength of photometric augmentation; 0: none"),
+        "jpeg": (Recipe.jpeg, "lowest JPEG quality of augmentation; 0: none"),
+        "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
+        "rate": (Recipe.rate, "largest learning rate"),
+        "half": (Recipe.half, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():
         parser.add_argument(f"--{name}", type=RANGES.get(name, number_in(0.0)), default=default, help=f"{text} (default: {default:g})")
     parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
-    parser.add_argument("--network", choices=tuple(NETWORKS), default="unet", help="network (default: unet)")
+    parser.add_argument("--network", choices=tuple(NETWORKS), default=Recipe.network, help="network (default: unet)")
     parser.add_argument("--depth", action="store_true", help="train and measure on colour and depth")
     parser.add_argument("--compiled", action="store_true", help="compile network and loss by PyTorch")
+    parser.add_argument("--graphed", action="store_true", help="replay training steps as CUDA graphs")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")

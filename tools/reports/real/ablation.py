@@ -1,11 +1,10 @@
 """Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
-Each run is a process of `tools.reports.real` with one seed. Runs start in order of priority on the next free GPU, the first seed of all
-rows before the second. A run that cannot end by the deadline is skipped and printed as "left out". The rows with the most views are
-shortened instead, down to a minimum time; the results then name the time. The start-up time of runs is estimated from those that have
-ended. Runs with results in --out are not repeated, and the summary is written after each run. Without --out, only the schedule is
-printed. Synthetic scores are measured on held-out views of each row's own settings, so rows are comparable by their scores on photographs
-only.
+Each row is a run of `tools.reports.real` for each seed. Runs start in order of priority on the next free GPU, the first seed of all rows
+before the second; a GPU's runs share a process. A run that cannot end by the deadline is skipped and printed as "left out". The rows with
+the most views are shortened instead, down to a minimum time; the results then name the time. Times of runs beside their training are
+estimated from those that have ended. Runs with results in --out are not repeated, and the summary is written after each run. Without
+--out, only the schedule is printed. All rows are scored on the same photographs and on the same held-out views, those of all levers.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -16,10 +15,11 @@ import argparse
 import heapq
 import json
 import math
-import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,19 +30,26 @@ import numpy as np
 from tools.figures import describe_run
 from tools.options import Row, finite_seconds, make_parser, positive_count, write_json
 from tools.reports.real import OBJECT, interval
+from tools.reports.real.worker import Worker
 
 START = 60.0
-"""Time of a run beside its training [s]: imports, cached kernels, models and lights, held-out views, scores. 50 to 55 on an H200 host."""
-STREAM_RATE = 230.0
-"""Views/s of still piles at 320x240 with 512 worlds, the first piles counted: 8 views a pile, some 35 ticks to settle. On an H200."""
+"""Time of a process's first run beside its training [s]: imports, cached kernels, photographs, held-out views, scores."""
+BETWEEN = 15.0
+"""The same of a later run [s]: scores and files."""
+FIRST_VIEWS = 20.0
+"""Time from the start of a stream until views come [s]: models, lights, 512 worlds, and the first piles, which need some 35 ticks."""
+STREAM_RATE = 700.0
+"""Views/s of still piles after these, at 320x240 with 8 views a pile, on an H200."""
 REFERENCE_RATE = 30.0
 """Views/s of mode reference at 320x240 and 64 paths."""
-TRAIN_RATE = 600.0
-"""Samples/s of the U-Net of width 48 at 320x240 in bfloat16 on an H200: 0.17 TFLOP a sample."""
+TRAIN_RATE = 850.0
+"""Samples/s of the U-Net of width 48, 70 % at 160x120 and 30 % at 320x240, in bfloat16 on an H200."""
 DETECTOR = 60.0
 """Training of the detector [s]."""
 SLACK = 1.15
 """Safety factor on expected times: a run starts only if so much time is left."""
+MAX_FAILURES = 3
+"""Failures in succession after which a GPU is given no more runs."""
 METRICS = {
     "mean_iou": ("mIoU", "", 1.0),
     "found": ("instances with IoU above 0.5", "%", 100.0),
@@ -57,8 +64,8 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
-CHOICE = ("--network", "residual", "--width", "64", "--batch", "32", "--depth")
-"""Network of the row with the most views."""
+CHOICE = "--network residual --width 64 --batch 32"
+"""Network of the rows with the most views."""
 MIN_LIMIT = 150.0
 """Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
@@ -107,14 +114,14 @@ class Run:
     @property
     def training(self) -> float:
         """Expected time of rendering and training together [s]."""
-        return min(self.limit, self.views / self.rate + self.views * self.passes / TRAIN_RATE)
+        return min(self.limit, FIRST_VIEWS + self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
     def fit(self, left: float, start: float) -> Run | None:
         """Fit the run into the remaining time: shortened limit, and detector only if there is time for it.
 
         Args:
             left: Time until the deadline [s].
-            start: Start-up and scoring time of a run [s].
+            start: Time of the run beside its training [s].
 
         Returns:
             The run; None if the time is too short.
@@ -125,13 +132,12 @@ class Run:
         limit = min(self.limit, room)
         return replace(self, limit=limit, detector=self.detector if room - limit > self.detector else 0.0)
 
-    def command(self, options: argparse.Namespace, seed: int, gpu: int, stem: str) -> list[str]:
-        """Command line of one seed."""
+    def command(self, seed: int, stem: Path) -> list[str]:
+        """Arguments of one seed, beside those that all runs share."""
         own_detector = ["--detector", f"{self.detector:g}"] if self.detector else []
-        shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
         own = ["--views", str(self.views), "--passes", f"{self.passes:g}", "--seconds", f"{self.limit:g}", "--seeds", "1"]
-        files = ["--first-seed", str(seed), "--json", f"{stem}.json", "--name", Path(stem).name, "--pictures", str(Path(stem).parent)]
-        return [sys.executable, "-m", "tools.reports.real", *shared, *own, *files, *own_detector, *options.pass_on, *self.arguments]
+        files = ["--first-seed", str(seed), "--json", f"{stem}.json", "--name", stem.name, "--pictures", str(stem.parent)]
+        return [*own, *files, *own_detector, *self.arguments]
 
 
 def _settings(*assignments: str) -> tuple[str, ...]:
@@ -139,8 +145,9 @@ def _settings(*assignments: str) -> tuple[str, ...]:
     return tuple(word for one in assignments for word in ("--set", one))
 
 
-def plan(views: int, main_views: int) -> Iterator[Run]:
-    """All rows in the order of priority."""
+def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
+    """All rows in the order of priority, with numbers of views, and arguments of those with the most."""
+    most = ("--capacity", "40000", *choice.split())
     detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
     yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
@@ -157,80 +164,95 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, ("--capacity", "40000", *CHOICE), passes=2.0, limit=400.0, least=300.0)
+    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=450.0, least=300.0)
     yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
-    yield Run("2,000 views, path-traced", 2000, (*traced, "--held-out", "16"), 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
+    yield Run("2,000 views, path-traced", 2000, traced, 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
+    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=450.0, least=300.0)
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: the first row with all seeds, the others by seed; rows whose name begins so before all."""
+    """Runs in the order in which they start: the first row with all seeds, the others by seed; the row of this name before all."""
     first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
     rest = [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
-    return sorted(first + rest, key=lambda job: not (preferred and job[0].name.startswith(preferred)))
+    return sorted(first + rest, key=lambda job: job[0].name != preferred)
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
     """Print when each run would start and end on as many GPUs."""
-    free = [0.0] * gpus
+    free = [(0.0, START)] * gpus
     for run, seed in jobs:
-        start = heapq.heappop(free)
-        fits = run.fit(deadline - start, START)
-        ends = start + START + (fits or run).training + (fits.detector if fits else 0.0)
-        heapq.heappush(free, ends if fits else start)
-        print(f"{start:6.0f} to {ends:6.0f} s  {ends - start:4.0f} s  seed {seed}  {run.name}{'' if fits else ' (left out)'}")
+        begun, start = heapq.heappop(free)
+        fits = run.fit(deadline - begun, start)
+        ends = begun + start + (fits or run).training + (fits.detector if fits else 0.0)
+        heapq.heappush(free, (ends, BETWEEN) if fits else (begun, start))
+        print(f"{begun:6.0f} to {ends:6.0f} s  {ends - begun:4.0f} s  seed {seed}  {run.name}{'' if fits else ' (left out)'}")
 
 
-def execute(jobs: list[tuple[Run, int]], options: argparse.Namespace) -> int:
-    """Run all that fits before the deadline, one process a GPU; returns the number of runs that failed or were stopped at the deadline."""
-    waiting = [(run, seed) for run, seed in jobs if not (options.out / f"{stem_of(run, seed)}.json").exists()]
-    running = dict[int, tuple[subprocess.Popen[bytes], Run, int, Any]]()
-    try:
-        return _execute(waiting, running, jobs, options)
-    finally:
-        for process, *_ in running.values():
-            process.kill()
+class Execution:
+    """Parallel execution of all runs that fit before the deadline, by a thread and a worker for each GPU."""
 
+    def __init__(self, jobs: list[tuple[Run, int]], options: argparse.Namespace) -> None:
+        self.jobs, self.options, self.started = jobs, options, time.monotonic()
+        self.waiting = iter([job for job in jobs if not self.stem(*job).with_suffix(".json").exists()])
+        self.lock, self.failed = threading.Lock(), 0
+        """Number of runs that failed or were stopped at the deadline."""
+        self.start = {False: START, True: BETWEEN}
+        """Expected time of a run beside its training, in a process that is to be started and in one that runs [s]."""
 
-def _execute(
-    waiting: list[tuple[Run, int]],
-    running: dict[int, tuple[subprocess.Popen[bytes], Run, int, Any]],
-    jobs: list[tuple[Run, int]],
-    options: argparse.Namespace,
-) -> int:
-    """Loop of `execute` over the runs that wait and, by GPU, those that run."""
-    started, failed, start = time.monotonic(), 0, START
-    begun = dict[int, float]()
-    while waiting or running:
-        left = options.deadline - (time.monotonic() - started)
-        for gpu, (process, run, seed, log) in list(running.items()):
-            if left < 0:
-                process.kill()
-            if process.poll() is not None:
-                log.close()
-                failed += process.returncode != 0
-                start = max(start, time.monotonic() - begun[gpu] - spent(options.out / f"{stem_of(run, seed)}.json") - run.detector)
-                print(
-                    f"{time.monotonic() - started:6.0f} s  gpu {gpu}  seed {seed}  {run.name}: exit code {process.returncode}", flush=True
-                )
-                del running[gpu]
-                write_json(options.out / "real_ablation.json", collect(options.out, jobs))
-        for gpu in sorted(set(range(options.gpus)) - running.keys()):
-            if not waiting:
-                break
-            run, seed = waiting.pop(0)
-            fits = run.fit(left, start)
-            if fits is None:
-                print(f"left out: seed {seed} of {run.name} needs {start + run.training:.0f} s, {left:.0f} s are left", flush=True)
-                continue
-            run, begun[gpu] = fits, time.monotonic()
-            stem = str(options.out / stem_of(run, seed))
-            log = open(f"{stem}.log", "wb")  # noqa: SIM115
-            process = subprocess.Popen(run.command(options, seed, gpu, stem), stdout=log, stderr=subprocess.STDOUT)
-            running[gpu] = (process, run, seed, log)
-        time.sleep(0.5)
-    return failed
+    def run(self) -> int:
+        """Carry out the runs; returns how many failed or were stopped."""
+        with ThreadPoolExecutor(self.options.gpus) as threads:
+            try:
+                list(threads.map(self._serve, range(self.options.gpus)))
+            finally:
+                self.waiting = iter(())  # After an interruption, no thread starts another.
+        return self.failed
+
+    def stem(self, run: Run, seed: int) -> Path:
+        """Path of a run's files without suffix."""
+        return self.options.out / stem_of(run, seed)
+
+    @property
+    def now(self) -> float:
+        """Time since the start [s]."""
+        return time.monotonic() - self.started
+
+    def _serve(self, gpu: int) -> None:
+        """Carry out runs on a GPU until none is left that fits, or several have failed in succession."""
+        options = self.options
+        shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
+        worker, failures = Worker([*shared, *options.pass_on]), 0
+        try:
+            while failures < MAX_FAILURES and (job := self._take(worker.ready)):
+                run, seed = job
+                stem, begun, ready = self.stem(*job), self.now, worker.ready
+                done = worker.run(run.command(seed, stem), stem.with_suffix(".log"), options.deadline - begun)
+                failures = 0 if done else failures + 1
+                self._finish(f"gpu {gpu}  seed {seed}  {run.name}", done)
+                beside = self.now - begun - spent(stem.with_suffix(".json")) - run.detector
+                self.start[ready] = max(self.start[ready], beside)
+        finally:
+            worker.stop()
+
+    def _take(self, ready: bool) -> tuple[Run, int] | None:
+        """The next run that fits into the time left, as it fits; others are printed as left out."""
+        with self.lock:
+            for run, seed in self.waiting:
+                left = self.options.deadline - self.now
+                if fits := run.fit(left, self.start[ready]):
+                    return fits, seed
+                needed = self.start[ready] + run.training
+                print(f"left out: seed {seed} of {run.name} needs {needed:.0f} s, {left:.0f} s are left", flush=True)
+            return None
+
+    def _finish(self, name: str, done: bool) -> None:
+        """Print how a run ended, and write the summary."""
+        with self.lock:
+            self.failed += not done
+            print(f"{self.now:6.0f} s  {name}: {'done' if done else 'failed or stopped'}", flush=True)
+            write_json(self.options.out / "real_ablation.json", collect(self.options.out, self.jobs))
 
 
 def spent(path: Path) -> float:
@@ -278,19 +300,25 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--deadline", type=finite_seconds, default=1400.0, help="seconds after which nothing runs (default: 1400)")
     parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
     parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
-    parser.add_argument("--first", default="", metavar="NAME", help="rows whose name begins so start before all others")
+    parser.add_argument("--first", default="", metavar="NAME", help="row that starts before all others")
+    parser.add_argument(
+        "--choice", default=CHOICE, metavar="ARGUMENTS", help="network of the rows with the most views (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, help="existing folder to write to; without it the plan is printed")
     parser.add_argument("pass_on", nargs="*", help="more arguments of tools.reports.real for all runs, after --")
     options = parser.parse_args(arguments)
-    jobs = order(list(plan(options.views, options.main_views)), options.first)
+    rows = list(plan(options.views, options.main_views, options.choice))
+    jobs, names = order(rows, options.first), [run.name for run in rows]
+    if options.first and options.first not in names:
+        print(f"reports.real.ablation: --first is {options.first}; rows: {'; '.join(names)}", file=sys.stderr)
+        return 2
     if options.out is None:
         print_plan(jobs, options.gpus, options.deadline)
-    elif not options.out.is_dir():
+        return 0
+    if not options.out.is_dir():
         print(f"reports.real.ablation: --out is {options.out}; name a folder that exists", file=sys.stderr)
         return 2
-    else:
-        return 1 if execute(jobs, options) else 0
-    return 0
+    return 1 if Execution(jobs, options).run() else 0
 
 
 if __name__ == "__main__":

@@ -22,6 +22,8 @@ FOUND_IOU = 0.5
 """IoU above which an instance counts as found."""
 MIN_PIXELS = 20
 """Pixels of the network's image below which an instance of a synthetic view is not counted."""
+SCORED = 16
+"""Views of a pool that are scored together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +106,17 @@ def _ious(table: np.ndarray) -> np.ndarray:
     return table.diagonal() / np.maximum(union, 1)
 
 
-def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
-    """Scores of a network on the views of a pool, at their own size."""
+def score_pool(network: nn.Module, pool: Pool, classes: int, channels: int) -> Scores:
+    """Scores of a network, which sees the first `channels` of images, on the views of a pool, at their own size."""
     images, classified = pool.tensors()
 
     def pairs() -> Iterable[tuple[str, np.ndarray, np.ndarray]]:
-        for index in range(pool.count):
+        for start in range(0, pool.count, SCORED):
+            part = slice(start, min(start + SCORED, pool.count))
             with torch.no_grad():
-                found = network(images[index : index + 1]).argmax(1)[0]
-            yield str(index), found.cpu().numpy().astype(np.uint8), classified[index].cpu().numpy()
+                found = network(images[part, :channels]).argmax(1)
+            both = zip(found.to(torch.uint8).cpu().numpy(), classified[part].cpu().numpy(), strict=True)
+            yield from ((str(start + index), one, truth) for index, (one, truth) in enumerate(both))
 
     return score(pairs(), classes, MIN_PIXELS)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -25,14 +26,24 @@ LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
 YCC = (LUMA, (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
 """Y, Cb and Cr of red, green and blue (JFIF)."""
+MIDDLE = (128 / 255, 0.0, 0.0)
+"""Y, Cb and Cr that are coded by 0."""
 BLOCK = 8
 """Side of a JPEG block [px]."""
 LEAST_RATE = 0.01
 """Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
+FIRST = 0.125
+"""Fraction of the pool that is filled before the first step."""
 FILLING = 0.5
-"""Largest fraction of the time limit that passes before the first step, while the stream fills the pool."""
+"""Largest fraction of the time limit that passes before the first step."""
+PACE = 4.0
+"""Most samples that are trained on for each further view, until all are there; fewer if there are fewer epochs."""
+EAGER = 4
+"""Steps at each size before one is recorded as a CUDA graph: cuDNN finds its convolutions, the optimizer makes its state."""
+AHEAD = 8
+"""Replays of CUDA graphs that are queued, at most, so that the schedule's time is the device's."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,7 @@ class Recipe:
     """Strength of the photometric augmentation; 0: none."""
     jpeg: float = 40.0
     """Lowest JPEG quality of the photometric augmentation; 0: no JPEG."""
-    dice: float = 0.0
+    dice: float = 1.0
     """Weight of the Dice loss, which is added to the cross entropy."""
     rate: float = LEARNING_RATE
     """Peak learning rate of the schedule."""
@@ -66,10 +77,12 @@ class Recipe:
     """Architecture: a key of NETWORKS."""
     depth: bool = False
     """Whether the network sees depth beside colours."""
-    half: float = 0.0
+    half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
     compiled: bool = False
     """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
+    graphed: bool = False
+    """Whether steps are replayed as CUDA graphs, for which the host has next to nothing to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +121,7 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     def spread(channels: int, width: float) -> torch.Tensor:
         return torch.exp(width * strength * (torch.rand(len(images), channels, 1, 1, device=images.device) * 2 - 1))
 
-    luma = images.new_tensor(LUMA).view(1, 3, 1, 1)
+    luma = _constant(LUMA, images.device).view(1, 3, 1, 1)
     images = images * spread(1, 1.0) * spread(3, 0.4)
     mean = (images * luma).sum(1, keepdim=True).mean((2, 3), keepdim=True)
     images = mean + spread(1, 1.0) * (images - mean)
@@ -122,30 +135,36 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
 
 
 @cache
-def _jpeg_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Quantization tables (quality, 3, 8, 8) of levels 0..1, and the orthonormal DCT matrix (8, 8)."""
-    tables = np.empty((QUALITIES, 2, BLOCK * BLOCK), np.float32)
+def _constant(values: tuple[float | tuple[float, ...], ...], device: torch.device) -> torch.Tensor:
+    """Constants as float32 on a device, copied once: the host waits for each copy."""
+    return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+@cache
+def _jpeg_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Quantization tables (quality, 3, 8, 8) of levels 0..1, the orthonormal DCT matrix (8, 8), and the inverse of YCC (3, 3)."""
+    steps = np.empty((QUALITIES, 2, BLOCK * BLOCK), np.float32)
     for quality in range(QUALITIES):
-        tables[quality, :, zigzag_order()] = quantization(quality).T / 255.0
+        steps[quality, :, zigzag_order()] = quantization(quality).T / 255.0
     frequency, place = np.mgrid[:BLOCK, :BLOCK]
     matrix = np.cos((2 * place + 1) * frequency * np.pi / (2 * BLOCK)) * np.where(frequency, 0.5, 0.5**1.5)
-    channels = tables.reshape(QUALITIES, 2, BLOCK, BLOCK)[:, [0, 1, 1]]
-    return torch.from_numpy(channels).to(device), torch.from_numpy(matrix.astype(np.float32)).to(device)
+    made = (steps.reshape(QUALITIES, 2, BLOCK, BLOCK)[:, [0, 1, 1]], matrix, np.linalg.inv(YCC))
+    tables, dct, colors = (torch.from_numpy(one.astype(np.float32)).to(device) for one in made)
+    return tables, dct, colors
 
 
 def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
     """Images (B, 3, H, W) in 0..1 after JPEG compression of an integer `quality` each (B), without chroma subsampling: an image that a
     camera compresses at twice the size has chroma of full size once it is reduced. Sides are multiples of BLOCK [px]."""
-    tables, dct = _jpeg_tables(images.device)
+    tables, dct, colors = _jpeg_tables(images.device)
     count, _, height, width = images.shape
-    matrix = images.new_tensor(YCC)
-    values = torch.einsum("kc,bchw->bkhw", matrix, images) - images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
+    middle = _constant(MIDDLE, images.device).view(1, 3, 1, 1)
+    values = torch.einsum("kc,bchw->bkhw", _constant(YCC, images.device), images) - middle
     blocks = values.view(count, 3, height // BLOCK, BLOCK, width // BLOCK, BLOCK)
     steps = tables[quality].view(count, 3, 1, BLOCK, 1, BLOCK)
     levels = torch.einsum("ui,bkyixj,vj->bkyuxv", dct, blocks, dct).div(steps).round_().mul_(steps)
     values = torch.einsum("ui,bkyuxv,vj->bkyixj", dct, levels, dct).reshape(count, 3, height, width)
-    values = values + images.new_tensor((128 / 255, 0.0, 0.0)).view(1, 3, 1, 1)
-    return torch.einsum("ck,bkhw->bchw", torch.linalg.inv(matrix), values).clamp(0, 1)
+    return torch.einsum("ck,bkhw->bchw", colors, values + middle).clamp(0, 1)
 
 
 def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -174,9 +193,10 @@ def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) 
     over the objects that occur in it. `classes` (B, H, W) int64; class 0 is the background."""
     # A view where channels are last in memory; softmax then reads rows.
     rows, truth = logits.permute(0, 2, 3, 1).flatten(0, 2).float(), classes.flatten()
-    loss = functional.cross_entropy(rows, truth)
+    logs = rows.log_softmax(1)
+    loss = functional.nll_loss(logs, truth)
     if dice:
-        shares = rows.softmax(1)
+        shares = logs.exp()
         exact = torch.zeros_like(shares).scatter_(1, truth[:, None], 1.0)
         sizes = exact.sum(0)
         similar = 2 * (shares * exact).sum(0) / (shares.sum(0) + sizes).clamp(min=1.0)
@@ -185,21 +205,41 @@ def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) 
     return loss
 
 
+class _Graph:
+    """CUDA graph of an update: inputs, their recorded work, and its loss."""
+
+    def __init__(self, trainer: _Trainer, drawn: Sequence[torch.Tensor], half: bool) -> None:
+        self.inputs, self.graph = [part.clone() for part in drawn], torch.cuda.CUDAGraph()
+        # Other threads, as of the renderer, may work with the device meanwhile.
+        with torch.cuda.graph(self.graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
+            self.loss = trainer.update(self.inputs[0], self.inputs[1], half)
+
+    def update(self, drawn: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Train on a batch; returns its loss."""
+        for own, part in zip(self.inputs, drawn, strict=True):
+            own.copy_(part)
+        self.graph.replay()
+        return self.loss.clone()
+
+
 class _Trainer:
     """One training: network, optimizer and schedule."""
 
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
+        self.graphed = recipe.graphed and device.type == "cuda"
         self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
+        rate = torch.tensor(recipe.rate, device=device) if self.graphed else recipe.rate
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, fused=device.type == "cuda", capturable=self.graphed)
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network
         self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
+        self.eager, self.graphs, self.queued = [0, 0], dict[bool, _Graph](), list[torch.cuda.Event]()
         self.waited = 0.0
-        """Time before the first step, in which the stream filled the pool [s]."""
+        """Time before the first step, in which the first views came [s]."""
 
     @property
     def progress(self) -> float:
@@ -211,8 +251,17 @@ class _Trainer:
         """Train on a batch."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
-        self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, done < self.recipe.half)
+        rate, group, half = self.recipe.rate * max(factor, LEAST_RATE), self.optimizer.param_groups[0], done < self.recipe.half
+        drawn = pool.draw(self.recipe.batch)
+        if self.graphed:
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+        self.losses.append(self._replay(drawn, half) if self.graphed else self.update(*drawn, half))
+
+    def update(self, images: torch.Tensor, classes: torch.Tensor, half: bool) -> torch.Tensor:
+        """Update the network by a batch of a pool; returns its loss."""
+        images, classes = _prepare(images, classes, self.recipe, half)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.logits(images)
@@ -221,11 +270,25 @@ class _Trainer:
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
         self.optimizer.step()
-        self.losses.append(loss.detach())
+        return loss.detach()
+
+    def _replay(self, drawn: tuple[torch.Tensor, torch.Tensor], half: bool) -> torch.Tensor:
+        """Update the network by the graph of this size, which is recorded after the first steps."""
+        self.eager[half] += 1
+        if self.eager[half] <= EAGER:
+            return self.update(*drawn, half)
+        if half not in self.graphs:
+            self.graphs[half] = _Graph(self, drawn, half)
+        loss = self.graphs[half].update(drawn)
+        self.queued.append(torch.cuda.Event())
+        self.queued[-1].record()
+        if len(self.queued) > AHEAD:
+            self.queued.pop(0).synchronize()
+        return loss
 
 
 def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int, pool: Pool | None = None) -> tuple[Trained, Pool]:
-    """Train a network on views of a stream. The pool is filled first, for at most half of the time limit; the rest comes while training.
+    """Train a network on views of a stream: on the first of them once they are in the pool; the others come while it trains.
 
     A `pool` that is given goes on to be filled: one of `recipe.views` views or more is trained on as it is.
 
@@ -233,15 +296,14 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
         SynpickError: Settings, models or lights cannot be used.
     """
     pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
-    batches = source.batches()
-    pool.fill(batches, min(pool.capacity, recipe.views), FILLING * recipe.seconds)
-    more = pool.seen < recipe.views
-    if not more:
-        batches.close()
+    batches = source.batches(recipe.views - pool.seen)
+    pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
+    first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
-        if more and pool.seen < recipe.views and len(trainer.losses) >= pool.seen * trainer.total / recipe.views:
-            more = pool.fill(batches, min(pool.seen + recipe.batch, recipe.views))
+        # As many views as the samples so far are for, batch by batch, until the stream has ended.
+        while len(trainer.losses) * recipe.batch >= pace * (pool.seen - first) and pool.fill(batches, pool.seen + 1):
+            pass
         trainer.step(pool)
     batches.close()
     values = torch.stack(trainer.losses).tolist()

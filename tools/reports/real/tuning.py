@@ -15,13 +15,11 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from synpick_warp.errors import ConfigError, SynpickError
-from synpick_warp.system.hardware.device import pick_device
 from tools.options import fail, finite_seconds, number_in, positive_count, write_json
-from tools.reports.real.__main__ import MODELS, RANGES, Outcome, make_options, measure, recipe_of, sources, torch
+from tools.reports.real.__main__ import MODELS, RANGES, Outcome, make_options, measure, open_bench, recipe_of, source_of
 from tools.reports.real.networks import NETWORKS
 from tools.reports.real.training import Recipe, train
-from tools.reports.real.views import Pool, hold_out
-from tools.reports.real_frames import read_frames
+from tools.reports.real.views import Pool
 
 SLACK = 15.0
 """Time that a trial takes beside its training, for scores and files [s]."""
@@ -76,21 +74,17 @@ def main(arguments: list[str] | None = None) -> int:
         waiting = [text for text in recipes if not paths[text].exists()]
         if not waiting:
             return 0
-        frames, device = read_frames(options.real), pick_device(options.device)
-        target, seed = torch.device(device.alias), options.first_seed
-        with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
-            source, held_source = sources(options, seed, device)
-            held, pool = hold_out(held_source, options.held_out), Pool(options.views, seed)
-            batches = source.batches()
-            pool.fill(batches, options.views, options.seconds)
-            batches.close()
+        seed = options.first_seed
+        with open_bench(options) as bench:
+            source, pool = source_of(options, seed, bench.device), Pool(options.views, seed)
+            pool.fill(source.batches(options.views), options.views, options.seconds)
             print(f"{pool.seen} views after {time.perf_counter() - started:.0f} s (stream {pool.seconds:.1f})", flush=True)
             for text in waiting:
                 if time.perf_counter() - started + options.seconds + SLACK > options.deadline:
                     print(f"left out: {text}")
                     continue
-                trained, _ = train(source, replace(recipes[text], views=pool.seen), 1 + MODELS, target, seed, pool)
-                outcome = measure(trained, frames, held, target)
+                trained, _ = train(source, replace(recipes[text], views=pool.seen), 1 + MODELS, bench.target, seed, pool)
+                outcome = measure(trained, options.depth, bench)
                 write_json(paths[text], entry(text, outcome))
                 print(f"{options.prefix}{text}: {trained.samples} samples, loss {trained.losses[-1]:.3f}, ", end="")
                 print(f"synthetic mIoU {outcome.synthetic.mean_iou:.3f}, found {100 * outcome.synthetic.found:.0f} %", flush=True)

@@ -40,8 +40,10 @@ class Source:
     depth: bool = False
     """Whether images have depth as a fourth channel, by `code_depth`."""
 
-    def batches(self) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8, valid until the next are taken."""
+    def batches(self, views: int) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
+        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8 of so many views in all, valid until the next are taken."""
+        if views <= 0:
+            return
         fields = ("rgb", "classes", "depth") if self.depth else ("rgb", "classes")
         dataset = StreamDataset(self.config, fields=fields, episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
@@ -53,7 +55,10 @@ class Source:
             if self.depth:
                 depth = code_depth(batch["depth"])[:, :, half :: self.shrink, half :: self.shrink]
                 image = torch.cat((image, depth[:, :, : image.shape[2], : image.shape[3]]), dim=1)
-            yield image, classes
+            yield image[:views], classes[:views]
+            views -= len(image)
+            if views <= 0:
+                return
 
 
 @dataclass(eq=False)
@@ -84,31 +89,35 @@ class Pool:
         if self.images is None or self.classes is None:
             self.images = images.new_empty((self.capacity, *images.shape[1:]))
             self.classes = classes.new_empty((self.capacity, *classes.shape[1:]))
-        kept = self.tensors()
-        for image, classified in zip(images, classes, strict=True):
-            place = self.count
-            if place == self.capacity:
-                place = int(torch.randint(self.capacity, (1,), generator=self._random))
-            kept[0][place], kept[1][place] = image, classified
-            self.count = min(self.count + 1, self.capacity)
-            self.seen += 1
+        new = min(len(images), self.capacity - self.count)
+        replaced = torch.randperm(self.count if new < len(images) else 0, generator=self._random)[: len(images) - new]
+        places = self._on_device(torch.cat((torch.arange(self.count, self.count + new), replaced)))
+        for kept, added in zip(self.tensors(), (images, classes), strict=True):
+            kept[places] = added[: len(places)]
+        self.count += new
+        self.seen += len(images)
 
     def fill(self, batches: Iterator[tuple[torch.Tensor, torch.Tensor]], views: int, seconds: float = math.inf) -> bool:
-        """Add views until `views` have been added in all; False: the stream ended, or `seconds` passed before."""
+        """Add batches until `views` or more have been added in all; False: the stream ended, or `seconds` passed before."""
         started = time.perf_counter()
         while self.seen < views and time.perf_counter() - started < seconds:
             batch = next(batches, None)
             if batch is None:
                 break
-            self.add(*(part[: views - self.seen] for part in batch))
+            self.add(*batch)
         self.seconds += time.perf_counter() - started
         return self.seen >= views
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Batch of random views, drawn with replacement: images (size, 3 or 4, H, W) uint8, obj_ids (size, H, W) int64."""
         images, classes = self.tensors()
-        chosen = torch.randint(self.count, (size,), generator=self._random).to(images.device)
+        chosen = self._on_device(torch.randint(self.count, (size,), generator=self._random))
         return images[chosen], classes[chosen].long()
+
+    def _on_device(self, places: torch.Tensor) -> torch.Tensor:
+        """Copy of indices on the device of the pool, for which the host does not wait."""
+        device = self.tensors()[0].device
+        return places.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else places
 
     def tensors(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Images and obj_ids of all places, of which the first `count` are filled; the pool must have views."""
@@ -124,7 +133,5 @@ def hold_out(source: Source, views: int) -> Pool:
         SynpickError: Settings, models or lights cannot be used.
     """
     pool = Pool(views, 0)
-    batches = source.batches()
-    pool.fill(batches, views)
-    batches.close()
+    pool.fill(source.batches(views), views)
     return pool
