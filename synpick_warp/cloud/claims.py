@@ -179,11 +179,11 @@ def default_chunk(worlds: int, episodes: int) -> int:
 
 
 class Chunk(NamedTuple):
-    """Chunk of which this worker has the lease: its number, its episodes without done mark, its claim."""
+    """Chunk of a worker: its number, its episodes without done mark, its claim (None: workers of other chunks are not equal)."""
 
     number: int
     episodes: list[int]
-    claim: Claim
+    claim: Claim | None
 
 
 class Chunks:
@@ -216,21 +216,32 @@ class Chunks:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
-        count, pause = sum(1 for _ in self.sizes.bounds()), 0.0
+        pauses = self.pauses()
         while True:
-            over, leased = self._state()
-            if len(over) >= count:
+            chunk, are_over = self.take()
+            if are_over:
                 return
-            chunk = self._take_first([each for each in self._order() if each[0] not in over], leased)
             if chunk is None:
-                pause = min(2.0 * pause or FIRST_WAIT, self._claims.lease / BEATS)
-                time.sleep(pause * random.uniform(0.5, 1.0))
+                time.sleep(next(pauses))
                 continue
-            pause = 0.0
+            pauses = self.pauses()
             if chunk.episodes:
                 yield chunk
             else:
                 self.done(chunk)
+
+    def pauses(self) -> Iterator[float]:
+        """Yield the pauses between attempts that find no free chunk [s]: exponential back-off, up to the interval of heartbeats."""
+        pause = FIRST_WAIT
+        while True:
+            yield (pause := min(pause, self._claims.lease / BEATS)) * random.uniform(0.5, 1.0)
+            pause *= 2.0
+
+    def take(self) -> tuple[Chunk | None, bool]:
+        """Claim a free chunk, which may have no episodes left; None: there is none at present. Second: whether all have end marks."""
+        over, leased = self._state()
+        open_chunks = [each for each in self._order() if each[0] not in over]
+        return (self._take_first(open_chunks, leased), False) if open_chunks else (None, True)
 
     def _take_first(self, open_chunks: Sequence[tuple[int, tuple[int, int]]], leased: set[int]) -> Chunk | None:
         """Claim the first of these chunks that is free, by its lease's absence or age; None: none is, or other workers were faster.
@@ -258,7 +269,8 @@ class Chunks:
         try:
             self._ledger.store.put(f"{self._place}/done/{chunk.number:06d}", b"")
         finally:
-            chunk.claim.stop()
+            if chunk.claim is not None:
+                chunk.claim.stop()
 
     def count_over(self) -> int:
         """Number of episodes in the chunks that have end marks."""

@@ -157,7 +157,8 @@ def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
         if link.number:
             raise _Stopped
         bake = partial(relay.bake, job, job.bake or keeping_baker(job.processes, link))
-        return bake_into_store(job.config, job.url, relay, splits=job.splits, bake=bake, claim=True, lease=job.lease)
+        given = {"splits": job.splits, "lease": job.lease, "workers": job.processes}
+        return bake_into_store(job.config, job.url, relay, bake=bake, claim=True, **given)
     except _Stopped:
         relay.ended.stopped = link.number
         return relay.ended

@@ -28,6 +28,10 @@ from tests.cloud.mortal import Killed, MortalStore, stored
 from tests.harness import scripted_bake
 
 
+def chunk_key(held, number: int) -> str:
+    return held._chunks._key(number)
+
+
 def work(url: str, **given):
     return run.bake_into_store(tiny(), url, SilentProgress(), bake=given.pop("bake", scripted_bake.bake_episodes), claim=True, **given)
 
@@ -177,6 +181,57 @@ def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, mon
     work(memory, bake=bake, lease=0.5)
     assert len(baked) == EPISODES + 1
     assert stored(memory) == local
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
+    """Of four chunks of one episode, in one folder; the second lease is stolen, and its episode made in a second bake."""
+    store, baked, notes = open_store(memory), [], []
+
+    def bake(config, out, progress, episodes, devices=(), deliver=None):
+        baked.append(out)
+        more, asked = episodes.more, []
+
+        def steal(wait):
+            found = more(True)
+            asked.append(found)
+            if lost and len(baked) == 1 and len(asked) == 1:
+                key = next(key for key, _ in store.list(".store/claims") if key.endswith(f"/{found[0]:06d}") and "done" not in key)
+                data, tag = store.get_tagged(key)
+                assert store.replace(key, data.replace(b'"owner":"', b'"owner":"thief-'), tag) is not None
+                time.sleep(0.4)  # Longer than a heartbeat.
+            return found
+
+        episodes.more = steal
+        return scripted_bake.bake_episodes(config, out, progress, episodes, devices, deliver, grows=True)
+
+    progress = SilentProgress()
+    progress.note = notes.append
+    summary = run.bake_into_store(tiny(), memory, progress, bake=bake, claim=True, lease=0.5)
+    assert stored(memory) == local
+    assert (len(baked) > 1) == lost
+    assert summary.total == EPISODES
+    assert any("ran out" in note for note in notes) == lost
+    assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
+
+
+def test_a_worker_holds_its_share_of_the_plan_and_asks_again_after_a_pause(memory, tmp_path):
+    """Of 64 chunks of an episode three, or the half if it is one of two; what it holds at the end is free at once."""
+    store = open_store(memory)
+    ledger = Ledger(store, tiny(64), Probe(0.0, True))
+    for workers, most in ((0, claims_held := run.HELD_CHUNKS), (2, 32)):
+        (works,) = [run._works(ledger, tmp_path, Claims(store, 0.0), [range(64)], workers)]
+        with next(works) as held:
+            assert held.expected == most
+            found = list(held)
+            end = time.monotonic() + 1.0
+            while time.monotonic() < end and len(found) < most:
+                found += held.more(False)
+            time.sleep(0.05)
+            assert held.more(False) == []
+            assert len(set(found)) == len(found) == most >= claims_held
+        free = Claims(store, 0.0)
+        assert all(claim is not None and claim.stop() is None for claim in (free.take(chunk_key(held, each)) for each in held._held))
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # Its heartbeat dies, too.
