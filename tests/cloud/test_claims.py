@@ -28,10 +28,6 @@ from tests.cloud.mortal import Killed, MortalStore, stored
 from tests.harness import scripted_bake
 
 
-def chunk_key(held, number: int) -> str:
-    return held._chunks._key(number)
-
-
 def work(url: str, **given):
     return run.bake_into_store(tiny(), url, SilentProgress(), bake=given.pop("bake", scripted_bake.bake_episodes), claim=True, **given)
 
@@ -215,23 +211,22 @@ def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
     assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 
 
-def test_a_worker_holds_its_share_of_the_plan_and_asks_again_after_a_pause(memory, tmp_path):
-    """Of 64 chunks of an episode three, or the half if it is one of two; what it holds at the end is free at once."""
+@pytest.mark.parametrize(("workers", "most"), [(0, 2 * run.HELD_CHUNKS), (2, 32)])
+def test_a_worker_leaves_chunks_to_others_and_gives_up_what_it_holds(workers, most, memory, tmp_path):
+    """Of 64 episodes in chunks of two, at most; of a worker of two the half."""
     store = open_store(memory)
-    ledger = Ledger(store, tiny(64), Probe(0.0, True))
-    for workers, most in ((0, claims_held := run.HELD_CHUNKS), (2, 32)):
-        (works,) = [run._works(ledger, tmp_path, Claims(store, 0.0), [range(64)], workers)]
-        with next(works) as held:
-            assert held.expected == most
-            found = list(held)
-            end = time.monotonic() + 1.0
-            while time.monotonic() < end and len(found) < most:
-                found += held.more(False)
-            time.sleep(0.05)
-            assert held.more(False) == []
-            assert len(set(found)) == len(found) == most >= claims_held
-        free = Claims(store, 0.0)
-        assert all(claim is not None and claim.stop() is None for claim in (free.take(chunk_key(held, each)) for each in held._held))
+    works = run._works(Ledger(store, tiny(64), Probe(0.0, True)), tmp_path, Claims(store, 0.0), [range(64)], workers)
+    with next(works) as held:
+        found, end = list(held), time.monotonic() + 30.0
+        while len(found) < most and time.monotonic() < end:
+            found += held.more(False)
+        assert len(set(found)) == len(found) == most == held.expected
+        assert [held.more(False) for _ in range(3)] == [[]] * 3
+        keys = [held._chunks._key(number) for number in held._held]
+    taken = [Claims(store, 0.0).take(key) for key in keys]
+    assert None not in taken
+    for claim in taken:
+        claim.stop()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # Its heartbeat dies, too.

@@ -84,8 +84,8 @@ def bake_episodes(
     picks: bool = False,
     grows: bool = False,
 ) -> BakeSummary:
-    """Write these episodes as `factory.pipeline.bake_episodes` does; of the observer's methods, `stage` is called before each. With `grows`,
-    the episodes are an `EpisodeSource`, which is asked for others after each one."""
+    """Write these episodes as `factory.pipeline.bake_episodes` does; of the observer's methods, `stage` is called before each. With
+    `grows`, the episodes are an `EpisodeSource`, which is asked for others after each one."""
     needs = Needs.of(config)
     with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
