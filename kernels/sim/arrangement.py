@@ -56,7 +56,10 @@ def assign_episodes_kernel(
 
 
 @wp.kernel
-def free_idle_worlds_kernel(phase_inout: wp.array[int]):
+def free_idle_worlds_kernel(
+    # State:
+    phase_inout: wp.array[int],  # (world)
+):
     """Free the worlds that are idle: their phases become EMPTY, so that `assign_episodes_kernel` assigns episodes to them. Launched over
     world."""
     world = wp.tid()

@@ -65,7 +65,7 @@ class TickLoop:
         self.queue = TickQueue(simulation.record, self.max_lead + 1)
         self.stream = wp.Stream(self.device, priority=HIGH_PRIORITY) if self.device.is_cuda else None
         self._more, self._refilled, self._has_idle = more, 0, False
-        """The source of episodes, the first tick with the episodes that it returned last, and whether one since then had idle worlds."""
+        """The source of episodes, the first tick with the episodes that it returned last, and whether it or a later one had idle worlds."""
         self._parts: Iterator[None] | None = None
         """Remaining parts of the tick that is being enqueued, or None."""
         self._enqueued = self._simulated = self._taken = 0
