@@ -308,3 +308,13 @@ class Chunks:
             start, end = start - len(each), end - len(each)
         blocks = self._ledger.blocks_of(wanted)
         return sorted(set(wanted).difference(*(self._ledger.done(block) for block in blocks)))
+
+
+def plan_chunks(ledger: Ledger, ranges: Sequence[range], lease: float) -> Chunks:
+    """Chunks of a plan as they are by default, for a process that starts workers; raises StoreError if the store cannot have claims."""
+    if not ledger.probe.conditional:
+        raise StoreError(
+            f"{ledger.store.url} has no conditional writes, by which workers claim; share the episodes out by --shard i/n instead"
+        )
+    claims = Claims(ledger.store, ledger.probe.offset, lease)
+    return Chunks(ledger, claims, ranges, default_chunk(ledger.config.bake.worlds, sum(map(len, ranges))))

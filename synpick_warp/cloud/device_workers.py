@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from types import FrameType
 
-from synpick_warp.cloud.claims import Chunks, Claims, default_chunk
+from synpick_warp.cloud.claims import plan_chunks
 from synpick_warp.cloud.crew import Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Job, bake_into_store
@@ -63,15 +63,15 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew
     ranges = DataLayout.of(config).plan(job.splits)
     planned = sum(map(len, ranges))
     names = pick_processes(config, devices, planned)
-    if len(names) == 1 or job.url.startswith("memory:"):  # Such a store is this process's.
+    if job.url.startswith("memory:"):  # It is this process's.
         return bake_into_store(config, job.url, progress, splits=job.splits, devices=names[:1], bake=job.bake, claim=True, lease=job.lease)
     store = open_store(job.url)
     ledger = Ledger(store, config, probe(store))
+    chunks = plan_chunks(ledger, ranges, job.lease)
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
     needs, summary, crew = Needs.of(config), _Totals(planned), crew or Crew("")
-    chunks = Chunks(ledger, Claims(store, ledger.probe.offset, job.lease), ranges, default_chunk(config.bake.worlds, planned))
     crew.alive = len(names)
     shown = CrewProgress(progress, crew, chunks.count_over(), planned)
     writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))

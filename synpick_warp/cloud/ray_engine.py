@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import Chunks, Claims, default_chunk
+from synpick_warp.cloud.claims import plan_chunks
 from synpick_warp.cloud.crew import RAY, Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_worker import Board, Report, Worker
@@ -74,12 +74,10 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         raise StoreError(f"{url} is in the memory of one process, and Ray's workers have their own; name a store that all of them reach")
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
-    if not ledger.probe.conditional:
-        raise StoreError(f"{url} has no conditional writes, by which workers claim; share the episodes out by --shard i/n instead")
+    chunks = plan_chunks(ledger, ranges, job.lease)
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
-    chunks = Chunks(ledger, Claims(store, ledger.probe.offset, job.lease), ranges, default_chunk(config.bake.worlds, planned))
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
     with _cluster(ray, address, crew.workers):
         device, each = _resources(ray, config.bake.device, crew.workers)
