@@ -206,8 +206,7 @@ def bake(
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    crew = parse_engine(engine, workers, price, out, devices or shard, claim and bool(several))
-    run = partial(_bake, resolved, out, part, names, several, claim, crew)
+    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard, claim))
     return _profiled(run, profile_out, out) if profiles else run()
 
 

@@ -123,14 +123,14 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
 
 
 def parse_engine(engine: str | None, workers: int, price: float, out: Path, beside: str | None, claims: bool = False) -> Crew | None:
-    """Parse --engine, --workers and --price; None: none is named. `beside`: value of an option that an engine excludes; `claims`: whether
-    --claim and --devices are given, which have a price, too.
+    """Parse --engine, --workers and --price; None: none is named. `beside`: value of an option that an engine excludes; `claims`: --claim
+    is given, whose workers on --devices have a price, too.
 
     Raises:
         ConfigError: An option is out of range, or does not go with the others.
         DeviceError: There is no such engine.
     """
-    if engine is None and (workers or (price and not claims)):
+    if engine is None and (workers or (price and not (claims and beside))):
         raise ConfigError("--workers and --price go with --engine; name one, such as ray. --price also goes with --claim --devices")
     if engine is None and not price:
         return None

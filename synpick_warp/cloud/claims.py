@@ -32,7 +32,9 @@ BEATS = 4
 MARGIN = 0.1
 """Safety margin: last part of a lease in which its owner takes it for lost."""
 FIRST_WAIT = 0.5
-"""Back-off of a worker that waits for others: pause before it looks again, doubled up to the interval of heartbeats [s]."""
+"""Back-off of a worker that waits for others: pause before it looks again, which grows up to the interval of heartbeats [s]."""
+GROWTH = 1.25
+"""Growth of that pause: a worker that has waited notices the end at most a quarter of that time late."""
 CHECKS = 8
 """Leases that a worker tries to take after each listing: thousands of workers that wait then ask for less than the store answers."""
 CHUNK_WORLDS = 2
@@ -126,6 +128,13 @@ class Claims:
         """When leases of other workers will expire, as of their last look, by key [s since 1970, by the store's clock]."""
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
 
+    def pauses(self) -> Iterator[float]:
+        """Yield the pauses of a worker that waits for others [s]: exponential back-off, up to the interval of heartbeats."""
+        pause = FIRST_WAIT
+        while True:
+            yield (pause := min(pause, self.lease / BEATS)) * random.uniform(0.5, 1.0)
+            pause *= GROWTH
+
     def take(self, key: str) -> Claim | None:
         """Acquire the lease on a key: creates it, or takes over one that has expired. None: another worker has it."""
         store, until = self.store, time.time() + self.offset + self.lease
@@ -197,7 +206,7 @@ class Chunks:
             ranges: Episodes that the bake must deliver.
             chunk: Proposed number of episodes of a whole chunk; that of the worker that starts first counts for all.
         """
-        self._ledger, self._claims, self._ranges = ledger, claims, ranges
+        self._ledger, self.claims, self._ranges = ledger, claims, ranges
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
         self._place = f"{CLAIMS}/{name}"
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))
@@ -216,7 +225,7 @@ class Chunks:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
-        pauses = self.pauses()
+        pauses = self.claims.pauses()
         while True:
             chunk, are_over = self.take()
             if are_over:
@@ -224,18 +233,11 @@ class Chunks:
             if chunk is None:
                 time.sleep(next(pauses))
                 continue
-            pauses = self.pauses()
+            pauses = self.claims.pauses()
             if chunk.episodes:
                 yield chunk
             else:
                 self.done(chunk)
-
-    def pauses(self) -> Iterator[float]:
-        """Yield the pauses between attempts that find no free chunk [s]: exponential back-off, up to the interval of heartbeats."""
-        pause = FIRST_WAIT
-        while True:
-            yield (pause := min(pause, self._claims.lease / BEATS)) * random.uniform(0.5, 1.0)
-            pause *= 2.0
 
     def take(self) -> tuple[Chunk | None, bool]:
         """Claim a free chunk, which may have no episodes left; None: there is none at present. Second: whether all have end marks."""
@@ -250,11 +252,11 @@ class Chunks:
             open_chunks: Number and bounds of the chunks without end mark.
             leased: Numbers of those that had a lease when they were listed. Of those that are not known to last, CHECKS are looked at.
         """
-        now, seen = time.time() + self._claims.offset, self._claims.seen
+        now, seen = time.time() + self.claims.offset, self.claims.seen
         free = [each for each in open_chunks if each[0] not in leased]
         held = [each for each in open_chunks if each[0] in leased and seen.get(self._key(each[0]), 0.0) <= now]
         for number, (start, end) in free[:CHECKS] or random.sample(held, min(CHECKS, len(held))):
-            claim = self._claims.take(self._key(number))
+            claim = self.claims.take(self._key(number))
             if claim is None:
                 continue
             try:
@@ -293,7 +295,7 @@ class Chunks:
     def _order(self) -> Iterator[tuple[int, tuple[int, int]]]:
         """Order in which this worker tries the chunks, as (number, bounds): the larger before the smaller; those of a size cyclically from
         a hash of the worker's name, so that few workers collide."""
-        first = int(hashlib.sha256(self._claims.owner.encode()).hexdigest(), 16)
+        first = int(hashlib.sha256(self.claims.owner.encode()).hexdigest(), 16)
         for _, group in itertools.groupby(enumerate(self.sizes.bounds()), lambda each: each[1][1] - each[1][0]):
             chunks = list(group)
             turn = first % len(chunks)

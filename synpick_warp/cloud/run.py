@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import random
 import shutil
 import tempfile
 import threading
@@ -15,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, default_chunk
+from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, default_chunk
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
 from synpick_warp.cloud.finish import close_blocks, finalize_store
 from synpick_warp.cloud.ledger import Ledger
@@ -225,7 +224,7 @@ class _Work(EpisodeSource):
             return chunk.episodes
         if chunk is not None and chunk.claim is not None:  # Worlds may still run lost episodes, whose files have the same names.
             chunk.claim.release()
-        self._pauses = self._pauses or self._chunks.pauses()
+        self._pauses = self._pauses or self._chunks.claims.pauses()
         self._next = time.monotonic() + next(self._pauses)
         return []
 
@@ -261,6 +260,7 @@ def _works(ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[
 
 def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
     """Finalize under a lease, one worker at a time; the others wait, and take over if it dies. Returns as `finalize_store`."""
+    pauses = claims.pauses()
     while not ledger.finished():
         claim = claims.take(f"{CLAIMS}/indices")
         if claim is not None:
@@ -268,7 +268,7 @@ def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
                 return finalize_store(ledger, place)
             finally:
                 claim.release()
-        time.sleep(claims.lease / BEATS * random.uniform(0.5, 1.0))
+        time.sleep(next(pauses))
     return 0
 
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from synpick_warp.cloud.claims import BEATS, CHECKS, FIRST_WAIT, LEASE, Sizes, default_chunk
+from synpick_warp.cloud.claims import BEATS, CHECKS, FIRST_WAIT, GROWTH, LEASE, Sizes, default_chunk
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, WHOLE_BYTES
 from synpick_warp.cloud.ledger import BLOCK
 from synpick_warp.system.stores.object_store import PAGE, PART_BYTES
@@ -224,7 +224,7 @@ class Simulation:
                     break
                 seen[chunk] = self.until[chunk]
             else:
-                pause = min(2.0 * pause or FIRST_WAIT, LEASE / BEATS)
+                pause = min(GROWTH * pause or FIRST_WAIT, LEASE / BEATS)
                 yield pause * self._draw.uniform(0.5, 1.0)
                 begins = True
                 continue
