@@ -65,22 +65,22 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew
     names = pick_processes(config, devices, planned)
     if job.url.startswith("memory:"):  # It is this process's.
         return bake_into_store(config, job.url, progress, splits=job.splits, devices=names[:1], bake=job.bake, claim=True, lease=job.lease)
-    store = open_store(job.url)
-    ledger = Ledger(store, config, probe(store))
-    chunks = plan_chunks(ledger, ranges, job.lease)
-    if ledger.finished():
-        progress.note("all episodes are done")
-        return BakeSummary()
     needs, summary, crew = Needs.of(config), _Totals(planned), crew or Crew("")
-    crew.alive = len(names)
-    shown = CrewProgress(progress, crew, chunks.count_over(), planned)
     writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
     with tempfile.TemporaryDirectory(prefix="synpick-workers-") as folder:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            with DeviceProcesses(names, _PROGRAM, handle) as processes:
+            with DeviceProcesses(names, _PROGRAM, handle) as processes:  # They load their libraries meanwhile.
+                store = open_store(job.url)
+                ledger = Ledger(store, config, probe(store))
+                chunks = plan_chunks(ledger, ranges, job.lease)
+                if ledger.finished():
+                    progress.note("all episodes are done")
+                    return BakeSummary()
                 common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
+                crew.alive = len(names)
+                shown = CrewProgress(progress, crew, chunks.count_over(), planned)
                 lost = processes.run([_Share(**common, own=each) for each in own], summary, shown)
         finally:
             os.close(handle)
