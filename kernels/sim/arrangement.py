@@ -56,6 +56,18 @@ def assign_episodes_kernel(
 
 
 @wp.kernel
+def free_idle_worlds_kernel(
+    # State:
+    phase_inout: wp.array[int],  # (world)
+):
+    """Free the worlds that are idle: their phases become EMPTY, so that `assign_episodes_kernel` assigns episodes to them. Launched over
+    world."""
+    world = wp.tid()
+    if phase_inout[world] == Phase.IDLE:
+        phase_inout[world] = Phase.EMPTY
+
+
+@wp.kernel
 def sample_modes_kernel(
     # Scene:
     seed: wp.uint64,

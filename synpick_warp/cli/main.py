@@ -57,7 +57,7 @@ from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt
 
 if TYPE_CHECKING:
-    from synpick_warp.cloud.ray_engine import Crew
+    from synpick_warp.cloud.crew import Crew
     from synpick_warp.factory.episodes import BakeSummary
 
 NAME = "synpick-warp"
@@ -138,7 +138,9 @@ EngineOption = Annotated[
     ),
 ]
 WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
-PriceOption = Annotated[float, Parameter(help="Price of a worker of --engine an hour: the progress shows the cost so far.")]
+PriceOption = Annotated[
+    float, Parameter(help="Price an hour of a worker of --engine or --claim --devices: the progress shows the cost so far.")
+]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -204,7 +206,7 @@ def bake(
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard))
+    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard, claim))
     return _profiled(run, profile_out, out) if profiles else run()
 
 

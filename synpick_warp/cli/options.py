@@ -13,7 +13,7 @@ from synpick_warp.errors import ConfigError, escape, format_value
 from synpick_warp.system.inputs.urls import as_url
 
 if TYPE_CHECKING:
-    from synpick_warp.cloud.ray_engine import Crew
+    from synpick_warp.cloud.crew import Crew
 
 EXIT_INCOMPLETE = 1
 """Exit code if a data set is incomplete or damaged."""
@@ -122,22 +122,25 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
     return tuple(name.strip() for name in devices.split(","))
 
 
-def parse_engine(engine: str | None, workers: int, price: float, out: Path, beside: str | None) -> Crew | None:
-    """Parse --engine, --workers and --price; None: no engine is named. `beside`: value of an option that an engine excludes.
+def parse_engine(engine: str | None, workers: int, price: float, out: Path, beside: str | None, claims: bool = False) -> Crew | None:
+    """Parse --engine, --workers and --price; None: none is named. `beside`: value of an option that an engine excludes; `claims`: --claim
+    is given, whose workers on --devices have a price, too.
 
     Raises:
         ConfigError: An option is out of range, or does not go with the others.
         DeviceError: There is no such engine.
     """
-    if engine is None:
-        if workers or price:
-            raise ConfigError("--workers and --price go with --engine; name one, such as ray")
+    if engine is None and (workers or (price and not (claims and beside))):
+        raise ConfigError("--workers and --price go with --engine; name one, such as ray. --price also goes with --claim --devices")
+    if engine is None and not price:
         return None
     check_range("--workers", workers, 0, MAX_CREW)
     check_range("--price", price, 0.0, MAX_PRICE)
-    from synpick_warp.cloud.ray_engine import Crew
+    from synpick_warp.cloud.crew import Crew
 
-    crew = Crew(engine, workers, price)
+    crew = Crew(engine or "", workers, price)
+    if engine is None:
+        return crew
     if as_url(out) is None:
         raise ConfigError("--engine has workers claim episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
     if beside is not None:

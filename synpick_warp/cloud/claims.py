@@ -32,7 +32,9 @@ BEATS = 4
 MARGIN = 0.1
 """Safety margin: last part of a lease in which its owner takes it for lost."""
 FIRST_WAIT = 0.5
-"""Back-off of a worker that waits for others: pause before it looks again, doubled up to the interval of heartbeats [s]."""
+"""Back-off of a worker that waits for others: pause before it looks again, which grows up to the interval of heartbeats [s]."""
+GROWTH = 1.25
+"""Growth of that pause: a worker that has waited notices the end at most a quarter of that time late."""
 CHECKS = 8
 """Leases that a worker tries to take after each listing: thousands of workers that wait then ask for less than the store answers."""
 CHUNK_WORLDS = 2
@@ -126,6 +128,13 @@ class Claims:
         """When leases of other workers will expire, as of their last look, by key [s since 1970, by the store's clock]."""
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
 
+    def pauses(self) -> Iterator[float]:
+        """Yield the pauses of a worker that waits for others [s]: exponential back-off, up to the interval of heartbeats."""
+        pause = FIRST_WAIT
+        while True:
+            yield (pause := min(pause, self.lease / BEATS)) * random.uniform(0.5, 1.0)
+            pause *= GROWTH
+
     def take(self, key: str) -> Claim | None:
         """Acquire the lease on a key: creates it, or takes over one that has expired. None: another worker has it."""
         store, until = self.store, time.time() + self.offset + self.lease
@@ -179,11 +188,11 @@ def default_chunk(worlds: int, episodes: int) -> int:
 
 
 class Chunk(NamedTuple):
-    """Chunk of which this worker has the lease: its number, its episodes without done mark, its claim."""
+    """Chunk of a worker: its number, its episodes without done mark, its claim (None: workers of other chunks are not equal)."""
 
     number: int
     episodes: list[int]
-    claim: Claim
+    claim: Claim | None
 
 
 class Chunks:
@@ -197,7 +206,7 @@ class Chunks:
             ranges: Episodes that the bake must deliver.
             chunk: Proposed number of episodes of a whole chunk; that of the worker that starts first counts for all.
         """
-        self._ledger, self._claims, self._ranges = ledger, claims, ranges
+        self._ledger, self.claims, self._ranges = ledger, claims, ranges
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
         self._place = f"{CLAIMS}/{name}"
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))
@@ -216,21 +225,25 @@ class Chunks:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
-        count, pause = sum(1 for _ in self.sizes.bounds()), 0.0
+        pauses = self.claims.pauses()
         while True:
-            over, leased = self._state()
-            if len(over) >= count:
+            chunk, are_over = self.take()
+            if are_over:
                 return
-            chunk = self._take_first([each for each in self._order() if each[0] not in over], leased)
             if chunk is None:
-                pause = min(2.0 * pause or FIRST_WAIT, self._claims.lease / BEATS)
-                time.sleep(pause * random.uniform(0.5, 1.0))
+                time.sleep(next(pauses))
                 continue
-            pause = 0.0
+            pauses = self.claims.pauses()
             if chunk.episodes:
                 yield chunk
             else:
                 self.done(chunk)
+
+    def take(self) -> tuple[Chunk | None, bool]:
+        """Claim a free chunk, which may have no episodes left; None: there is none at present. Second: whether all have end marks."""
+        over, leased = self._state()
+        open_chunks = [each for each in self._order() if each[0] not in over]
+        return (self._take_first(open_chunks, leased), False) if open_chunks else (None, True)
 
     def _take_first(self, open_chunks: Sequence[tuple[int, tuple[int, int]]], leased: set[int]) -> Chunk | None:
         """Claim the first of these chunks that is free, by its lease's absence or age; None: none is, or other workers were faster.
@@ -239,11 +252,11 @@ class Chunks:
             open_chunks: Number and bounds of the chunks without end mark.
             leased: Numbers of those that had a lease when they were listed. Of those that are not known to last, CHECKS are looked at.
         """
-        now, seen = time.time() + self._claims.offset, self._claims.seen
+        now, seen = time.time() + self.claims.offset, self.claims.seen
         free = [each for each in open_chunks if each[0] not in leased]
         held = [each for each in open_chunks if each[0] in leased and seen.get(self._key(each[0]), 0.0) <= now]
         for number, (start, end) in free[:CHECKS] or random.sample(held, min(CHECKS, len(held))):
-            claim = self._claims.take(self._key(number))
+            claim = self.claims.take(self._key(number))
             if claim is None:
                 continue
             try:
@@ -258,7 +271,8 @@ class Chunks:
         try:
             self._ledger.store.put(f"{self._place}/done/{chunk.number:06d}", b"")
         finally:
-            chunk.claim.stop()
+            if chunk.claim is not None:
+                chunk.claim.stop()
 
     def count_over(self) -> int:
         """Number of episodes in the chunks that have end marks."""
@@ -281,7 +295,7 @@ class Chunks:
     def _order(self) -> Iterator[tuple[int, tuple[int, int]]]:
         """Order in which this worker tries the chunks, as (number, bounds): the larger before the smaller; those of a size cyclically from
         a hash of the worker's name, so that few workers collide."""
-        first = int(hashlib.sha256(self._claims.owner.encode()).hexdigest(), 16)
+        first = int(hashlib.sha256(self.claims.owner.encode()).hexdigest(), 16)
         for _, group in itertools.groupby(enumerate(self.sizes.bounds()), lambda each: each[1][1] - each[1][0]):
             chunks = list(group)
             turn = first % len(chunks)
@@ -296,3 +310,13 @@ class Chunks:
             start, end = start - len(each), end - len(each)
         blocks = self._ledger.blocks_of(wanted)
         return sorted(set(wanted).difference(*(self._ledger.done(block) for block in blocks)))
+
+
+def plan_chunks(ledger: Ledger, ranges: Sequence[range], lease: float) -> Chunks:
+    """Chunks of a plan as they are by default, for a process that starts workers; raises StoreError if the store cannot have claims."""
+    if not ledger.probe.conditional:
+        raise StoreError(
+            f"{ledger.store.url} has no conditional writes, by which workers claim; share the episodes out by --shard i/n instead"
+        )
+    claims = Claims(ledger.store, ledger.probe.offset, lease)
+    return Chunks(ledger, claims, ranges, default_chunk(ledger.config.bake.worlds, sum(map(len, ranges))))

@@ -17,6 +17,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from synpick_warp.cloud.bundles import make_bundle
+from synpick_warp.cloud.claims import LeaseLostError
 from synpick_warp.cloud.ledger import INDEX, Ledger
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
@@ -65,16 +66,21 @@ def send_file(store: Store, path: Path, name: str, digest: str) -> None:
 class Delivery:
     """Uploader of one folder: a context manager that owns its threads. The first error stops the uploads; `check` and `finish` raise it."""
 
-    def __init__(self, ledger: Ledger, folder: Path, permit: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        folder: Path,
+        permit: Callable[[int], None] = lambda _: None,
+        delivered: Callable[[int], None] = lambda _: None,
+    ) -> None:
         """
         Args:
             ledger: Commit log of the data set.
             folder: Local data set that a bake fills.
-            permit: Called before an episode's upload and before its mark; raises what forbids it.
+            permit: Called with an episode before its upload and before its mark; raises LeaseLostError to drop it.
+            delivered: Called with an episode after its mark. Both are called by several threads.
         """
-        self.delivered: list[int] = []
-        """Episodes whose done mark is written."""
-        self._ledger, self._folder, self._permit = ledger, folder, permit
+        self._ledger, self._folder, self._permit, self._delivered = ledger, folder, permit, delivered
         self._settings, self._kinds = ExportSettings.of(ledger.config), load_exporter_classes(ledger.layout.formats)
         self._shared = shared_files(self._kinds, ledger.layout).folders
         self._fault: BaseException | None = None
@@ -169,19 +175,19 @@ class Delivery:
                 each.cancel()
 
     def _deliver(self, episode: int) -> None:
-        """Task: upload and commit an episode, and delete its local copy."""
+        """Task: upload and commit an episode, unless its lease is lost, and delete its local copy."""
         if self._fault is not None:
             return
         try:
-            self._permit()
             entry, folder, store = episode_entry(episode), self._folder, self._ledger.store
             names = read_checksums(folder, entry)
-            self._send_files(names)
-            store.put(f"{INDEX}/{episode:06d}.tar.gz", make_bundle(folder, episode, self._settings, self._kinds))
-            self._permit()
-            self._ledger.commit(episode, (folder / f"{entry}.sha256").read_bytes(), (folder / f"{entry}.json").read_bytes())
-            with self._lock:
-                self.delivered.append(episode)
+            with contextlib.suppress(LeaseLostError):
+                self._permit(episode)
+                self._send_files(names)
+                store.put(f"{INDEX}/{episode:06d}.tar.gz", make_bundle(folder, episode, self._settings, self._kinds))
+                self._permit(episode)
+                self._ledger.commit(episode, (folder / f"{entry}.sha256").read_bytes(), (folder / f"{entry}.json").read_bytes())
+                self._delivered(episode)
             self._remove(episode, names)
             self._waiting.pop(episode, None)
         except BaseException as error:

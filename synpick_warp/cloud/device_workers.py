@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from types import FrameType
 
+from synpick_warp.cloud.claims import plan_chunks
+from synpick_warp.cloud.crew import Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -42,13 +44,14 @@ class _Share(Job):
     """Full key -> value of settings of the worker alone: device, writers."""
 
 
-def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> BakeSummary:
+def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew: Crew | None = None) -> BakeSummary:
     """Bake a data set into an object store by a claiming worker on each device; other claiming workers may take part.
 
     Args:
         job: What to bake.
         devices: As in `pipeline.run_bake`.
         progress: Observer.
+        crew: Receives the number of workers and their time, for a price; None: there is none.
 
     Returns:
         Summary of the chunks of these workers.
@@ -57,24 +60,28 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> B
         SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
     """
     config = with_measures(job.config, devices)
-    planned = sum(map(len, DataLayout.of(config).plan(job.splits)))
+    ranges = DataLayout.of(config).plan(job.splits)
+    planned = sum(map(len, ranges))
     names = pick_processes(config, devices, planned)
-    if len(names) == 1 or job.url.startswith("memory:"):  # Such a store is this process's.
+    if job.url.startswith("memory:"):  # It is this process's.
         return bake_into_store(config, job.url, progress, splits=job.splits, devices=names[:1], bake=job.bake, claim=True, lease=job.lease)
-    store = open_store(job.url)
-    ledger = Ledger(store, config, probe(store))
-    if ledger.finished():
-        progress.note("all episodes are done")
-        return BakeSummary()
-    needs, summary = Needs.of(config), _Totals(planned)
+    needs, summary, crew = Needs.of(config), _Totals(planned), crew or Crew("")
     writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
     with tempfile.TemporaryDirectory(prefix="synpick-workers-") as folder:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
-            with DeviceProcesses(names, _PROGRAM, handle) as processes:
+            with DeviceProcesses(names, _PROGRAM, handle) as processes:  # They load their libraries meanwhile.
+                store = open_store(job.url)
+                ledger = Ledger(store, config, probe(store))
+                chunks = plan_chunks(ledger, ranges, job.lease)
+                if ledger.finished():
+                    progress.note("all episodes are done")
+                    return BakeSummary()
                 common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
-                lost = processes.run([_Share(**common, own=each) for each in own], summary, progress)
+                crew.alive = len(names)
+                shown = CrewProgress(progress, crew, chunks.count_over(), planned)
+                lost = processes.run([_Share(**common, own=each) for each in own], summary, shown)
         finally:
             os.close(handle)
     if lost and not summary.stopped and not ledger.finished():
@@ -122,7 +129,7 @@ class _Relay(SilentProgress):
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Pass counts on; the remaining time is that of a chunk, and left out. See `Progress`."""
+        """Pass counts on; the remaining time is that of a bake, and left out. See `Progress`."""
         done, views = len(self.ended.episodes) + episodes_done, self.ended.views + views
         given = {"worlds_active": worlds_active, "views": views, "views_per_s": views_per_s, "seconds_left": None}
         self._link.update(episodes_done=done, episodes=episodes, **given)
@@ -157,7 +164,8 @@ def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
         if link.number:
             raise _Stopped
         bake = partial(relay.bake, job, job.bake or keeping_baker(job.processes, link))
-        return bake_into_store(job.config, job.url, relay, splits=job.splits, bake=bake, claim=True, lease=job.lease)
+        given = {"splits": job.splits, "lease": job.lease, "workers": job.processes}
+        return bake_into_store(job.config, job.url, relay, bake=bake, claim=True, **given)
     except _Stopped:
         relay.ended.stopped = link.number
         return relay.ended

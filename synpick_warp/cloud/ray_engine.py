@@ -12,14 +12,14 @@ import shutil
 import socket
 import tempfile
 import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import Chunks, Claims, default_chunk
+from synpick_warp.cloud.claims import plan_chunks
+from synpick_warp.cloud.crew import RAY, Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_worker import Board, Report, Worker
 from synpick_warp.cloud.run import Job
@@ -32,13 +32,10 @@ from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
-ENGINE = "ray"
 VERSIONS = ((2, 52), (3,))
 """Versions of Ray, from the first one, which has token authentication, to before the second one."""
 _POLL = 1.0
 """Interval of reports [s]."""
-_WINDOW = 60.0
-"""Time over which the rate is averaged, since workers pause between chunks [s]."""
 _ANSWER = 5.0
 """Connection timeout [s]."""
 _ENDING, _STOPPING = 30.0, 120.0
@@ -49,33 +46,9 @@ _SAID = 300
 """Maximum length of an error message of Ray that is shown; longer ones are cut [characters]."""
 STORE_BYTES = 100 << 20
 """Size of a local cluster's object store [B]: workers send counts."""
-_ENGINE, _PLACE = re.compile(r"ray(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{1,5})?"), re.compile(r"([^/]+):([0-9]{1,5})$")
+_PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 """Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
-
-
-@dataclass
-class Crew:
-    """Options of a bake on Ray, and what its workers have cost. Raises DeviceError if there is no such engine."""
-
-    engine: str = ENGINE
-    """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client."""
-    workers: int = 0
-    """Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu."""
-    price: float = 0.0
-    """Price of a worker an hour."""
-    alive: int = 0
-    """Number of running workers."""
-    seconds: float = 0.0
-    """Accumulated running time of all workers [s]."""
-
-    def __post_init__(self) -> None:
-        if _ENGINE.fullmatch(self.engine) is None:
-            raise DeviceError(f"--engine is {self.engine}; allowed: ray, or ray://HOST:PORT of a Ray Client, such as ray://head:10001")
-
-    def __str__(self) -> str:
-        cost = f" · cost {self.price * self.seconds / 3600.0:,.2f}" if self.price else ""
-        return f"{self.alive} worker{'s' * (self.alive != 1)}{cost}"
 
 
 def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
@@ -101,12 +74,10 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         raise StoreError(f"{url} is in the memory of one process, and Ray's workers have their own; name a store that all of them reach")
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
-    if not ledger.probe.conditional:
-        raise StoreError(f"{url} has no conditional writes, by which workers claim; share the episodes out by --shard i/n instead")
+    chunks = plan_chunks(ledger, ranges, job.lease)
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
-    chunks = Chunks(ledger, Claims(store, ledger.probe.offset, job.lease), ranges, default_chunk(config.bake.worlds, planned))
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
     with _cluster(ray, address, crew.workers):
         device, each = _resources(ray, config.bake.device, crew.workers)
@@ -140,7 +111,7 @@ def find_address(engine: str) -> str | None:
     Raises:
         DeviceError: Nobody answers there.
     """
-    address = engine if engine != ENGINE else os.environ.get("RAY_ADDRESS") or None
+    address = engine if engine != RAY else os.environ.get("RAY_ADDRESS") or None
     if address is not None and (match := _PLACE.search(address)) is not None:
         try:
             socket.create_connection((match[1].strip("[]"), int(match[2])), _ANSWER).close()
@@ -228,7 +199,7 @@ class _Driver:
             device, each: Device and resources of a worker.
             counts: Episodes that are done, and all.
         """
-        self._ray, self._crew, self._progress, self._counts = ray, crew, progress, counts
+        self._ray, self._crew, self._progress = ray, crew, CrewProgress(progress, crew, *counts)
         self._resource = "GPU" if "num_gpus" in each else "CPU"
         self._board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
         self._make = partial(ray.remote(Worker).options(**each).remote, self._board, __version__, job, device, int(each["num_cpus"]))
@@ -238,8 +209,6 @@ class _Driver:
         self._reports: dict[int, Report] = {}
         """Last report of each actor, also of those that have ended."""
         self._summary, self._noted, self._stop = BakeSummary(), set[str](), StopRequest()
-        self._seen = deque([(time.monotonic(), 0)])
-        """Times, and the number of views at these."""
 
     def run(self) -> BakeSummary:
         """Bake; returns the summary. At the end it waits for workers that run, after a request to stop for those that bake.
@@ -323,20 +292,9 @@ class _Driver:
             self._reports[number] = report
 
     def _show(self) -> None:
-        """Update the display: totals over all workers, rate, remaining time and cost."""
-        alive, now, (before, planned) = self._alive, time.monotonic(), self._counts
+        """Update the display: totals over all workers."""
+        alive = self._alive
         self._crew.alive = len(alive)
-        self._crew.seconds += len(alive) * (now - self._seen[-1][0])
         done, views = (sum(getattr(report, name) for report in self._reports.values()) for name in ("episodes", "views"))
-        self._seen.append((now, views))
-        while now - self._seen[0][0] > _WINDOW:
-            self._seen.popleft()
-        rate = (views - self._seen[0][1]) / max(_POLL, now - self._seen[0][0])
-        self._progress.update(
-            episodes_done=min(planned, before + done),
-            episodes=planned,
-            worlds_active=sum(report.worlds for report in alive.values()),
-            views=views,
-            views_per_s=rate,
-            seconds_left=max(0, planned - before - done) * views / done / rate if done and rate > 0.0 else None,
-        )
+        worlds = sum(report.worlds for report in alive.values())
+        self._progress.update(episodes_done=done, episodes=0, worlds_active=worlds, views=views, views_per_s=0.0, seconds_left=None)

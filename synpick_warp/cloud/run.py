@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import random
+import contextlib
 import shutil
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
-from synpick_warp.cloud.claims import BEATS, CLAIMS, LEASE, Chunks, Claims, LeaseLostError, default_chunk
+from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, default_chunk
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
 from synpick_warp.cloud.finish import close_blocks, finalize_store
 from synpick_warp.cloud.ledger import Ledger
@@ -21,13 +24,16 @@ from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.kept import keeping_baker
+from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.system.progress import Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
 MAX_CHUNK = 10_000
 """Chunk size of a bake without claims [episodes], to within a block; each chunk starts the worlds anew."""
-
+HELD_CHUNKS = 3
+"""Whole chunks whose number of episodes a claiming worker has at most, before it claims another one: a worker that starts early leaves some
+to others. Workers of known number have their share of the plan instead, if it is larger."""
 
 Baker = Callable[..., BakeSummary]
 """Function that bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
@@ -55,6 +61,7 @@ def bake_into_store(
     *,
     claim: bool = False,
     lease: float = LEASE,
+    workers: int = 0,
 ) -> BakeSummary:
     """Bake a data set into an object store: simulates, renders and uploads it, or the remaining episodes of one.
 
@@ -68,9 +75,10 @@ def bake_into_store(
         bake: Bakes episodes into a folder; None: one that keeps objects, lights, worlds and kernels from chunk to chunk.
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
         lease: Time to live of a claim without heartbeat [s].
+        workers: Number of claiming workers, which begin at about the same time; 0: unknown.
 
     Returns:
-        Summary of this run's episodes, without those that were done before, and those of chunks that were lost to other workers.
+        Summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their chunks.
 
     Raises:
         SynpickError: An error that the user can correct; done episodes stay, and the same bake resumes.
@@ -84,14 +92,14 @@ def bake_into_store(
     summary = BakeSummary()
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
-        baking = partial(_bake_chunk, ledger, place, progress=progress, devices=devices, bake=bake or keeping_baker())
         claims = Claims(store, ledger.probe.offset, lease) if claim else None
-        if claims is None:
-            for episodes in _chunks(ledger, ranges):
-                if _take(summary, baking(episodes)):
+        if claims is None or not ledger.finished():
+            baker = bake or keeping_baker()
+            for work in _works(ledger, place, claims, ranges, workers):
+                with work:
+                    part = _bake(ledger, place, work, progress, devices, baker)
+                if _take(summary, part):
                     return summary
-        elif not ledger.finished() and _bake_claims(ledger, claims, ranges, baking, summary, progress):
-            return summary
         if not summary.total:
             progress.note("all episodes are done")
         progress.stage("finishing files")
@@ -101,48 +109,158 @@ def bake_into_store(
     return summary
 
 
+class _Work(EpisodeSource):
+    """Source of the episodes of one bake into the store: a chunk, and with claims others while worlds are idle, before it has drained.
+
+    A chunk is done when its own episodes have done marks, and is dropped when its lease is lost. Leaving the context gives the others up.
+    """
+
+    def __init__(self, ledger: Ledger, place: Path, first: Chunk, chunks: Chunks | None = None, limit: int = 0) -> None:
+        """
+        Args:
+            ledger: Ledger of the data set.
+            place: Folder for temporary files.
+            first: The chunk to begin with.
+            chunks: Where to claim others; None: nowhere.
+            limit: Number of episodes without done mark from which on no other chunk is claimed.
+        """
+        super().__init__(first.episodes, limit)
+        self.lost: set[int] = set()
+        """Episodes that were lost with the leases of their chunks."""
+        self._ledger, self._place, self._chunks, self._limit = ledger, place, chunks, limit
+        self._held: dict[int, tuple[Chunk, set[int]]] = {}
+        """Chunks by number, each with its episodes without done mark."""
+        self._numbers: dict[int, int] = {}
+        """Numbers of the chunks of these episodes."""
+        self._notes: list[str] = []
+        self._lock, self._closing = threading.Lock(), threading.Lock()
+        self._asker = ThreadPoolExecutor(1, "claim")
+        self._asked: Future[tuple[Chunk | None, bool]] | None = None
+        self._pauses: Iterator[float] | None = None
+        self._next = 0.0
+        self._hold(first)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Release the leases of unfinished chunks; after an error that is unknown they expire by themselves."""
+        held = [chunk for chunk, _ in self._held.values()]
+        if self._asked is not None:
+            with contextlib.suppress(BaseException):
+                held += filter(None, [self._asked.result()[0]])
+        self._asker.shutdown()
+        for chunk in held:
+            if chunk.claim is not None and (error is None or isinstance(error, SynpickError)):
+                chunk.claim.release()
+            elif chunk.claim is not None:
+                chunk.claim.stop()
+
+    def report(self, progress: Progress) -> None:
+        """Report the leases that were lost since the last call, in the thread of the bake."""
+        while self._notes:
+            progress.note(self._notes.pop(0))
+
+    def permit(self, episode: int) -> None:
+        """Check the lease of an episode's chunk; raises LeaseLostError, and drops the chunk, if others may have it."""
+        with self._lock:
+            chunk, left = self._held.get(self._numbers.get(episode, -1), (None, set[int]()))
+            try:
+                if chunk is None:
+                    raise LeaseLostError(f"episode {episode} was lost with the claim of its chunk")
+                if chunk.claim is not None:
+                    chunk.claim.check()
+                return
+            except LeaseLostError as error:
+                if chunk is None:
+                    raise
+                del self._held[chunk.number]
+                self.lost |= left
+                self._notes.append(str(error))
+                lost = error
+        assert chunk.claim is not None
+        chunk.claim.stop()
+        raise lost
+
+    def delivered(self, episode: int) -> None:
+        """Count an episode that has its done mark; after the last one of a chunk write the batched marks that are due, and the end mark."""
+        with self._lock:
+            chunk, left = self._held.get(self._numbers.pop(episode), (None, set[int]()))
+            left.discard(episode)
+            if left or chunk is None:
+                return
+            del self._held[chunk.number]
+        with self._closing:
+            try:
+                # So that the last worker does not read the index files of all episodes, one after the other.
+                close_blocks(self._ledger, self._place, self._ledger.blocks_of(chunk.episodes))
+            except BaseException:
+                if chunk.claim is not None:
+                    chunk.claim.release()
+                raise
+            if self._chunks is not None:
+                self._chunks.done(chunk)
+
+    def more(self, wait: bool) -> list[int]:
+        """Claim another chunk, in a thread: this call returns the episodes of the one that was asked for earlier. See `EpisodeSource`."""
+        if self._chunks is None:
+            return []
+        if self._asked is None:
+            with self._lock:
+                count = sum(len(left) for _, left in self._held.values())
+            if not wait and (count >= self._limit or time.monotonic() < self._next):
+                return []
+            self._asked = self._asker.submit(self._chunks.take)
+        if not (wait or self._asked.done()):
+            return []
+        asked, self._asked = self._asked, None
+        chunk, _ = asked.result()
+        if chunk is not None and self.lost.isdisjoint(chunk.episodes):
+            self._pauses = None
+            if chunk.episodes:
+                self._hold(chunk)
+            else:
+                self._chunks.done(chunk)
+            return chunk.episodes
+        if chunk is not None and chunk.claim is not None:  # Worlds may still run lost episodes, whose files have the same names.
+            chunk.claim.release()
+        self._pauses = self._pauses or self._chunks.claims.pauses()
+        self._next = time.monotonic() + next(self._pauses)
+        return []
+
+    def _hold(self, chunk: Chunk) -> None:
+        """Add a chunk to those that this worker has."""
+        with self._lock:
+            self._held[chunk.number] = chunk, set(chunk.episodes)
+            self._numbers |= dict.fromkeys(chunk.episodes, chunk.number)
+
+
 def _take(summary: BakeSummary, part: BakeSummary) -> bool:
-    """Add the summary of a chunk to that of the run; returns whether a signal stopped the bake."""
+    """Add the summary of a bake to that of the run; returns whether a signal stopped it."""
+    seconds = summary.wall_seconds + part.wall_seconds
     summary.total += part.total
     summary.take_summary(part)
-    summary.wall_seconds += part.wall_seconds
+    summary.wall_seconds = seconds
     summary.stopped = part.stopped
     return summary.stopped != 0
 
 
-def _bake_claims(
-    ledger: Ledger,
-    claims: Claims,
-    ranges: Sequence[range],
-    baking: Callable[..., BakeSummary],
-    summary: BakeSummary,
-    progress: Progress,
-) -> bool:
-    """Worker loop: claims and bakes chunks until all of the plan are done; returns whether a signal stopped this worker."""
-    size = default_chunk(ledger.config.bake.worlds, sum(map(len, ranges)))
-    chunks = Chunks(ledger, claims, ranges, size)
+def _works(ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[range], workers: int) -> Iterator[_Work]:
+    """Yield the work of one bake after the other; arguments as of `bake_into_store`. With claims it ends when all of the plan are done."""
+    if claims is None:
+        for number, episodes in enumerate(_chunks(ledger, ranges)):
+            yield _Work(ledger, place, Chunk(number, episodes, None))
+        return
+    planned = sum(map(len, ranges))
+    chunks = Chunks(ledger, claims, ranges, default_chunk(ledger.config.bake.worlds, planned))
+    limit = max(HELD_CHUNKS * chunks.sizes.chunk, -(-planned // workers) if workers else 0)
     for chunk in chunks:
-        try:
-            part = baking(chunk.episodes, permit=chunk.claim.check)
-        except LeaseLostError as error:
-            progress.note(str(error))
-            chunk.claim.stop()
-            continue
-        except SynpickError:
-            chunk.claim.release()
-            raise
-        except BaseException:
-            chunk.claim.stop()
-            raise
-        if _take(summary, part):
-            chunk.claim.release()
-            return True
-        chunks.done(chunk)
-    return False
+        yield _Work(ledger, place, chunk, chunks, min(limit, planned))
 
 
 def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
     """Finalize under a lease, one worker at a time; the others wait, and take over if it dies. Returns as `finalize_store`."""
+    pauses = claims.pauses()
     while not ledger.finished():
         claim = claims.take(f"{CLAIMS}/indices")
         if claim is not None:
@@ -150,7 +268,7 @@ def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
                 return finalize_store(ledger, place)
             finally:
                 claim.release()
-        time.sleep(claims.lease / BEATS * random.uniform(0.5, 1.0))
+        time.sleep(next(pauses))
     return 0
 
 
@@ -166,25 +284,22 @@ def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
         yield held
 
 
-def _bake_chunk(
-    ledger: Ledger,
-    place: Path,
-    episodes: Sequence[int],
-    progress: Progress,
-    devices: Sequence[str],
-    bake: Baker,
-    permit: Callable[[], None] = lambda: None,
-) -> BakeSummary:
-    """Bake and upload a chunk of episodes in a new temporary folder; messages of errors name the store in its place."""
+def _bake(ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], bake: Baker) -> BakeSummary:
+    """Bake and upload episodes in a new temporary folder; messages of errors name the store in its place."""
     folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)
+
+    def check() -> None:
+        work.report(progress)
+        delivery.check()
+
     try:
-        with Delivery(ledger, folder, permit) as delivery:
-            watched = WatchedProgress(progress, delivery.check)
-            summary = bake(ledger.config, folder, watched, episodes, devices, delivery.finish)
-        if not summary.stopped:  # So that the last worker does not read the index files of all episodes, one after the other.
-            close_blocks(ledger, place, ledger.blocks_of(episodes))
+        with Delivery(ledger, folder, work.permit, work.delivered) as delivery:
+            summary = bake(ledger.config, folder, WatchedProgress(progress, check), work, devices, delivery.finish)
+        work.report(progress)
+        summary.total -= len(work.lost)
+        summary.episodes = [row for row in summary.episodes if row.episode not in work.lost]
         return summary
     except (StoreError, LeaseLostError):
         raise

@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from synpick_warp.cloud.crew import Crew
 from synpick_warp.cloud.device_workers import bake_with_devices
-from synpick_warp.cloud.ray_engine import Crew, bake_with_ray
+from synpick_warp.cloud.ray_engine import bake_with_ray
 from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.episodes import BakeSummary
@@ -30,19 +31,20 @@ def start_bake(
 
     Args:
         job: What to bake; `splits` take the place of its own.
-        crew: Options of a bake on Ray; None: on this machine.
+        crew: Options of a bake on Ray; or receives number and time of claiming workers on these devices; None: neither.
 
     Raises:
         ConfigError: Claims share out the episodes, and so does `shard`; a cluster's devices are its own.
         SynpickError: As `run.bake_into_store`.
     """
     job = replace(job, splits=tuple(splits))
-    if (claim or crew is not None) and shard != (0, 1):
+    engine = crew is not None and crew.engine != ""
+    if (claim or engine) and shard != (0, 1):
         raise ConfigError("workers that claim share out the episodes among them; drop the shard")
-    if crew is not None:
+    if crew is not None and engine:
         if devices:
             raise ConfigError("an engine places one worker a GPU or core of its cluster; drop the devices")
         return bake_with_ray(job, crew, progress)
     if claim and devices:
-        return bake_with_devices(job, devices, progress)
+        return bake_with_devices(job, devices, progress, crew)
     return bake_into_store(job.config, job.url, progress, shard, splits, devices, claim=claim)

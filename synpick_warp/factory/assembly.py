@@ -120,6 +120,7 @@ def build_factory(
     needs_images: bool = True,
     processes: int = 1,
     longest_first: bool = False,
+    expected: int = 0,
 ) -> Factory:
     """Load assets and build the stages on the device.
 
@@ -130,12 +131,13 @@ def build_factory(
         records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
         processes: Processes of the bake, which share the host's memory.
         longest_first: Whether the episodes are reordered by `order_longest_first`.
+        expected: Number of episodes to choose worlds for, if it is larger than that of `episodes`.
 
     Raises:
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
-    planned = DataLayout.of(config).planned if episodes is None else len(episodes)
+    planned = DataLayout.of(config).planned if episodes is None else max(expected, len(episodes))
     needs = Needs.of(config)
     writers = count_writers(config.bake.writers, needs.slot_bytes)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)

@@ -44,15 +44,19 @@ class KeptStages:
         self._most = 0
         """Number of episodes that it was built for."""
 
-    def __call__(self, config: Config, progress: Progress, episodes: Sequence[int], *needs: bool, longest_first: bool) -> Factory:
+    def __call__(
+        self, config: Config, progress: Progress, episodes: Sequence[int], *needs: bool, longest_first: bool, expected: int = 0
+    ) -> Factory:
         """Build the factory, or have the kept one begin other episodes; arguments and errors as of `assembly.build_factory`."""
         given, factory = (config, needs, longest_first), self._factory
-        grown = not config.bake.worlds and len(episodes) > self._most
+        expected = max(expected, len(episodes))
+        grown = not config.bake.worlds and expected > self._most
         if factory is None or self._given != given or grown or not _has_ended(factory):
             self._factory = factory = None
             gc.collect()  # Frees its arrays before the memory for others is planned.
-            self._factory = build_factory(config, progress, episodes, *needs, longest_first=longest_first, processes=self._processes)
-            self._given, self._most = given, len(episodes)
+            chosen = {"longest_first": longest_first, "processes": self._processes, "expected": expected}
+            self._factory = build_factory(config, progress, episodes, *needs, **chosen)
+            self._given, self._most = given, expected
             return self._factory
         if longest_first:
             episodes = order_longest_first(factory.config, factory.catalog, episodes, factory.simulation.device)

@@ -30,6 +30,7 @@ from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
 from synpick_warp.factory.meter import ThroughputMeter
+from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
@@ -108,7 +109,7 @@ def bake_episodes(
         config: All settings, with measures (`with_measures`).
         out: As in `run_bake`.
         progress: Observer.
-        episodes: Indices, sorted.
+        episodes: Indices, sorted; of an `EpisodeSource` one device takes further ones, too.
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
         build: Builds the stages of one device; None: `build_factory`.
@@ -117,7 +118,7 @@ def bake_episodes(
     Raises:
         SynpickError: As `run_bake`.
     """
-    needs = Needs.of(config)
+    needs, source = Needs.of(config), episodes if isinstance(episodes, EpisodeSource) else EpisodeSource(episodes)
     with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
@@ -132,7 +133,7 @@ def bake_episodes(
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
                 if build is None and (advice := advise_processes(config, names, len(output.remaining))):
                     progress.note(advice)
-                _fill(output, needs, names, summary, progress, deliver, build or build_factory, stop or StopRequest())
+                _fill(output, source, needs, names, summary, progress, deliver, build or build_factory, stop or StopRequest())
         except OutputError as error:
             if out.exists():
                 raise
@@ -142,6 +143,7 @@ def bake_episodes(
 
 def _fill(
     output: OutputFolder,
+    source: EpisodeSource,
     needs: Needs,
     names: Sequence[str],
     summary: BakeSummary,
@@ -150,14 +152,15 @@ def _fill(
     build: Callable[..., Factory],
     stop: StopRequest | BakeLink,
 ) -> None:
-    """Generate the remaining episodes, then the indices over all, or deliver the episodes."""
+    """Generate the remaining episodes, and those of the source, then the indices over all, or deliver the episodes."""
     config, factory = output.config, None
     settings = ExportSettings.of(config)
     if len(names) > 1:
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            factory = build(config, progress, output.remaining, needs.physics, needs.images, longest_first=True)
+            own = {"longest_first": True, "expected": source.expected}
+            factory = build(config, progress, output.remaining, needs.physics, needs.images, **own)
     else:
         catalog = load_catalog(config, report=progress.note)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
@@ -170,7 +173,7 @@ def _fill(
             exporters = Exporters(needs.classes, context)
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
-                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, stop).run()
+                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, stop, source.more).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
@@ -225,8 +228,9 @@ class _Run:
         summary: BakeSummary,
         progress: Progress,
         stop: StopRequest | BakeLink,
+        more: Callable[[bool], Sequence[int]] = lambda _: (),
     ) -> None:
-        self.stop = stop
+        self.stop, self.source = stop, more
         self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
@@ -238,7 +242,7 @@ class _Run:
         done = False
         simulation, lead = self.factory.simulation, None if self.picks is None else self.picks.lead
         compiling = contextlib.ExitStack()
-        with self.stop as stop, self.factory.stream.streams, TickLoop(simulation, lead) as ticks, compiling:
+        with self.stop as stop, self.factory.stream.streams, TickLoop(simulation, lead, self._more) as ticks, compiling:
             compiling.enter_context(make_compiler(None, self.progress))
             while not (done or stop.number):
                 report, snapshot = ticks.advance()
@@ -249,12 +253,18 @@ class _Run:
                     self._try_picks(self.picks)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
-                done = bool((phase == Phase.IDLE).all())
+                done = bool((phase == Phase.IDLE).all()) and not ticks.refill()
             for views in self.factory.stream.drain():
                 self._write(views)
             if self.picks is not None and done:
                 self._try_picks(self.picks)
         self.summary.stopped = 0 if done else stop.number
+
+    def _more(self, wait: bool) -> Sequence[int]:
+        """Further episodes, which count in the summary; see `TickLoop`."""
+        episodes = self.source(wait)
+        self.summary.total += len(episodes)
+        return episodes
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, render its views, write views and episode ends; enqueue physics between parts of these."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -42,18 +42,20 @@ class TickLoop:
     On a GPU physics has its own CUDA stream. While episodes wait for a free world it is at most one tick ahead, which suffices to overlap
     the two. Once none waits and a world is idle, or from the start if all episodes fit, it may be ahead by up to `max_lead` ticks: worlds
     fall idle one by one, and a tick has fewer views to render, but takes physics nearly as long, so that the renderer needs a backlog. On
-    a CPU physics and renderer alternate.
+    a CPU physics and renderer alternate. Idle worlds run what `more` returns, and the lead is one tick again.
 
     Before the next `advance`, which releases the snapshot on the device's current stream, make that stream wait for every other stream that
     still reads it.
     """
 
-    def __init__(self, simulation: Simulation, max_lead: int | None = None) -> None:
+    def __init__(self, simulation: Simulation, max_lead: int | None = None, more: Callable[[bool], Sequence[int]] = lambda _: ()) -> None:
         """Allocate the queue.
 
         Args:
             simulation: The worlds.
             max_lead: Maximum number of ticks by which physics may ever be ahead; None: by `queue_lead`.
+            more: Called before a tick begins while worlds are idle: further episodes, or none at present. True: all worlds are idle in the
+                tick last taken, and it may wait.
         """
         self.simulation, self.device = simulation, simulation.device
         self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if max_lead is None else max_lead
@@ -62,6 +64,8 @@ class TickLoop:
             self.lead = self.max_lead
         self.queue = TickQueue(simulation.record, self.max_lead + 1)
         self.stream = wp.Stream(self.device, priority=HIGH_PRIORITY) if self.device.is_cuda else None
+        self._more, self._refilled, self._has_idle = more, 0, False
+        """The source of episodes, the first tick with the episodes that it returned last, and whether it or a later one had idle worlds."""
         self._parts: Iterator[None] | None = None
         """Remaining parts of the tick that is being enqueued, or None."""
         self._enqueued = self._simulated = self._taken = 0
@@ -143,10 +147,12 @@ class TickLoop:
         """Update the counters and the lead from the ticks that the device has completed since the last call."""
         while self._simulated < self._enqueued and (phase := self.queue.phase(self._simulated)) is not None:
             self._simulated += 1
+            if self._simulated <= self._refilled:
+                continue
             is_idle = phase == Phase.IDLE
             self._busy_worlds = int((~is_idle).sum())
             if is_idle.any():
-                self.lead = self.max_lead
+                self.lead, self._has_idle = self.max_lead, True
 
     def _may_begin(self) -> bool:
         """Whether physics may begin another tick: a world is busy, and the renderer is at most `lead` ticks behind."""
@@ -160,6 +166,8 @@ class TickLoop:
 
     def _enqueue_part(self) -> None:
         """Enqueue the next part of a tick; after the last part, also the copy of its record into the queue."""
+        if self._parts is None and self._has_idle:
+            self._refill(self._more(False))
         self._parts = self._parts or self.simulation.tick_parts()
         if next(self._parts, ENDED) is ENDED:
             self.queue.put(self._enqueued)
@@ -168,3 +176,19 @@ class TickLoop:
         if self.stream is not None:
             event = self._spare.pop() if self._spare else wp.Event(self.device)
             self._running.append(self.stream.record_event(event))
+
+    def refill(self) -> bool:
+        """Whether worlds that are all idle in the tick last taken have further episodes to run: those of `more`, which may wait here."""
+        if self._taken > self._refilled:
+            with self._physics_scope():
+                while self._parts is not None:
+                    self._enqueue_part()
+                self._refill(self._more(True))
+        return self._taken <= self._refilled
+
+    def _refill(self, episodes: Sequence[int]) -> None:
+        """Have idle worlds run these episodes from the next tick to be enqueued on; there are none left of the earlier ones."""
+        if len(episodes):
+            self.simulation.restart(episodes)
+            self._refilled, self._has_idle, self._busy_worlds = self._enqueued, False, self.simulation.layout.worlds
+            self.lead = min(1, self.max_lead)

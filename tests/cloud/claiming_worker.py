@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 
 from synpick_warp.cloud import run
 from synpick_warp.system.progress import SilentProgress
@@ -10,5 +11,5 @@ from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
 
 if __name__ == "__main__":
-    given = {"bake": scripted_bake.bake_episodes, "claim": True, "lease": float(sys.argv[3])}
+    given = {"bake": partial(scripted_bake.bake_episodes, grows=True), "claim": True, "lease": float(sys.argv[3])}
     run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), **given)

@@ -179,6 +179,56 @@ def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, mon
     assert stored(memory) == local
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
+    """Of four chunks of one episode, in one folder; the second lease is stolen, and its episode made in a second bake."""
+    store, baked, notes = open_store(memory), [], []
+
+    def bake(config, out, progress, episodes, devices=(), deliver=None):
+        baked.append(out)
+        more, asked = episodes.more, []
+
+        def steal(wait):
+            found = more(True)
+            asked.append(found)
+            if lost and len(baked) == 1 and len(asked) == 1:
+                key = next(key for key, _ in store.list(".store/claims") if key.endswith(f"/{found[0]:06d}") and "done" not in key)
+                data, tag = store.get_tagged(key)
+                assert store.replace(key, data.replace(b'"owner":"', b'"owner":"thief-'), tag) is not None
+                time.sleep(0.4)  # Longer than a heartbeat.
+            return found
+
+        episodes.more = steal
+        return scripted_bake.bake_episodes(config, out, progress, episodes, devices, deliver, grows=True)
+
+    progress = SilentProgress()
+    progress.note = notes.append
+    summary = run.bake_into_store(tiny(), memory, progress, bake=bake, claim=True, lease=0.5)
+    assert stored(memory) == local
+    assert (len(baked) > 1) == lost
+    assert summary.total == EPISODES
+    assert any("ran out" in note for note in notes) == lost
+    assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
+
+
+@pytest.mark.parametrize(("workers", "most"), [(0, 2 * run.HELD_CHUNKS), (2, 32)])
+def test_a_worker_leaves_chunks_to_others_and_gives_up_what_it_holds(workers, most, memory, tmp_path):
+    """Of 64 episodes in chunks of two, at most; of a worker of two the half."""
+    store = open_store(memory)
+    works = run._works(Ledger(store, tiny(64), Probe(0.0, True)), tmp_path, Claims(store, 0.0), [range(64)], workers)
+    with next(works) as held:
+        found, end = list(held), time.monotonic() + 30.0
+        while len(found) < most and time.monotonic() < end:
+            found += held.more(False)
+        assert len(set(found)) == len(found) == most == held.expected
+        assert [held.more(False) for _ in range(3)] == [[]] * 3
+        keys = [held._chunks._key(number) for number in held._held]
+    taken = [Claims(store, 0.0).take(key) for key in keys]
+    assert None not in taken
+    for claim in taken:
+        claim.stop()
+
+
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # Its heartbeat dies, too.
 def test_a_dead_workers_chunk_is_done_by_another(memory, local, monkeypatch):
     with monkeypatch.context() as patch:

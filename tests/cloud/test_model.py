@@ -27,6 +27,11 @@ def test_one_worker_takes_the_sum_of_its_chunks():
     assert (done.views, done.wasted, done.losses, done.refused) == (50_000.0, 0.0, 0, 0.0)
 
 
+def test_worlds_that_take_the_next_chunk_start_and_drain_once_a_worker():
+    done = Simulation(1, 1_000, PLAIN._replace(drains=False), INSTANT, chunk=100).run()
+    assert done.seconds == pytest.approx(5.0 + 10.0 + 1_000 * 50.0 / 100.0)
+
+
 @pytest.mark.parametrize("workers", [4, 32])
 def test_workers_share_the_plan(workers):
     alone, done = (Simulation(count, 8_000, PLAIN, INSTANT, chunk=100).run() for count in (1, workers))

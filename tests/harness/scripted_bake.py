@@ -18,6 +18,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd
@@ -81,8 +82,10 @@ def bake_episodes(
     deliver: Callable[[], None] | None = None,
     stop_after: int | None = None,
     picks: bool = False,
+    grows: bool = False,
 ) -> BakeSummary:
-    """Write these episodes as `factory.pipeline.bake_episodes` does; of the observer's methods, `stage` is called before each."""
+    """Write these episodes as `factory.pipeline.bake_episodes` does; of the observer's methods, `stage` is called before each. With
+    `grows`, the episodes are an `EpisodeSource`, which is asked for others after each one."""
     needs = Needs.of(config)
     with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
@@ -93,10 +96,17 @@ def bake_episodes(
         with WriterPool(0, needs.slot_bytes, output.lock) as pool:
             exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
             output.prepare(exporters, INPUTS, pool)
-            for episode in output.remaining[:stop_after]:
+            queue = output.remaining[:stop_after]
+            while queue:
+                episode = queue.pop(0)
                 if progress is not None:
                     progress.stage(f"episode {episode}")
                 _write_episode(output, exporters, pool, episode, picks)
+                if grows:
+                    assert isinstance(episodes, EpisodeSource)
+                    found = episodes.more(not queue)
+                    queue += found
+                    summary.total += len(found)
             pool.wait()
             exporters.close()
             if deliver is not None:

@@ -10,6 +10,8 @@ import pytest
 from synpick_warp.codes import Phase
 from synpick_warp.factory import kept
 from synpick_warp.factory.kept import KeptStages, keeping_baker
+from synpick_warp.factory.order import EpisodeSource
+from synpick_warp.factory.pipeline import bake_episodes
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKED, boxes
 from tests.harness.exporter_contract import digests
@@ -24,6 +26,20 @@ def test_chunks_in_kept_worlds_have_the_bytes_of_one_bake(picked_set, tmp_path, 
         monkeypatch.setattr(kept, "build_factory", None)
         bake(config, tmp_path / "set", quiet, [0])
     assert digests(tmp_path / "set") == digests(picked_set)
+
+
+@pytest.mark.slow
+def test_episodes_that_come_while_worlds_are_idle_have_the_bytes_of_one_bake(picked_set, tmp_path):
+    class Source(EpisodeSource):
+        def more(self, wait: bool) -> list[int]:
+            return [rest.pop()] if rest else []
+
+    rest = [0]
+    with boxes():
+        summary = bake_episodes(settings(**PICKED), tmp_path / "grown", SilentProgress(), Source([1]))
+    assert not rest
+    assert (summary.total, len(summary.episodes)) == (2, 2)
+    assert digests(tmp_path / "grown") == digests(picked_set)
 
 
 @pytest.mark.parametrize("worlds", [0, 2])

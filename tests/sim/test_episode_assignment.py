@@ -66,6 +66,16 @@ def test_busy_worlds_keep_their_episodes(device):
     assert assign(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, tries=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
 
 
+def test_idle_worlds_that_are_freed_take_episodes_of_another_list(device):
+    worlds = arrangement_worlds(device, 3)
+    worlds.set(worlds.state.phase, [Phase.IDLE, Phase.ACT, Phase.IDLE])
+    worlds.set(worlds.state.arrangement_id, [[-1, 0], [4, 1], [-1, 0]])
+    arrange.free_idle_worlds(worlds.state)
+    arrange.assign_episodes(worlds.state, wp.array([8], dtype=wp.int32, device=device), 1)
+    assert worlds.state.arrangement_id.numpy().tolist() == [[8, 0], [4, 1], [-1, 0]]
+    assert worlds.state.phase.numpy().tolist() == [Phase.START, Phase.ACT, Phase.IDLE]
+
+
 @given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), tries=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
 def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     """With random endings, each episode is delivered or given up exactly once; then all worlds are idle."""

@@ -126,6 +126,54 @@ def values(snapshot: Snapshot) -> set[int]:
     return {getattr(snapshot, name).value for name in NAMES}
 
 
+class RefilledSimulation(ModelSimulation):
+    """Model whose worlds run episodes of given lengths [ticks], from a list after another."""
+
+    def __init__(self, device: ModelDevice, worlds: int, episodes: list[int], parts: int) -> None:
+        super().__init__(device, [0] * worlds, 0, parts)
+        self.episodes, self.left, self.ran, self.past = list(episodes), [0] * worlds, 0, []
+
+    def restart(self, episodes: list[int]) -> None:
+        assert not self.episodes
+        self.episodes = list(episodes)
+
+    def tick_parts(self) -> Iterator[None]:
+        for world, left in enumerate(self.left):
+            if not left and self.episodes:
+                left, self.ran = self.episodes.pop(0), self.ran + 1
+            self.left[world] = max(0, left - 1)
+            self.past.append(Phase.ACT if left else Phase.IDLE)
+        yield from super().tick_parts()
+
+    def phases(self, tick: int) -> np.ndarray:
+        worlds = self.layout.worlds
+        return np.array(self.past[tick * worlds : (tick + 1) * worlds])
+
+
+def test_idle_worlds_run_further_lists_whenever_they_come(make_device):
+    """Each list comes at a random time after it was asked for, at last when the loop waits; every episode runs once, to its end."""
+    for seed in range(TRIALS):
+        device = make_device(seed)
+        chance = device.chance
+        lists = [[chance.randint(1, 8) for _ in range(chance.randint(1, 5))] for _ in range(chance.randint(1, 4))]
+        simulation = RefilledSimulation(device, chance.randint(1, 4), lists[0], chance.choice((1, 2, 30)))
+        rest, lead, busy = lists[1:], chance.choice((0, 1, 7, 50)), 0
+
+        def more(wait: bool, chance=chance, rest=rest) -> list[int]:
+            return rest.pop(0) if rest and (wait or chance.random() < 0.2) else []
+
+        with ticks.TickLoop(simulation, lead, more) as loop:
+            for tick in itertools.count():
+                (number, phases), _ = loop.advance()
+                assert number == tick
+                busy += int((phases == Phase.ACT).sum())
+                if (phases == Phase.IDLE).all() and not loop.refill():
+                    break
+        assert not rest
+        assert simulation.ran == sum(map(len, lists))
+        assert busy == sum(map(sum, lists))
+
+
 @pytest.mark.parametrize("lead", [1, 5])
 def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_device, lead):
     """Otherwise a GPU would be idle from the end of each tick until the host asks for the next one."""

@@ -23,6 +23,11 @@ def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
     launch(arrangement.assign_episodes_kernel, 1, state, worlds=len(state.phase), episodes=episodes, tries=tries)
 
 
+def free_idle_worlds(state: WorldState) -> None:
+    """Free the worlds that are idle, so that `assign_episodes` assigns episodes to them."""
+    launch(arrangement.free_idle_worlds_kernel, len(state.phase), state)
+
+
 def sample_episodes(scene: SceneData, state: WorldState, seed: int) -> None:
     """Sample mode, bin, objects, distractors and light of starting episodes."""
     kernels = (arrangement.sample_modes_kernel, arrangement.sample_bins_kernel, arrangement.sample_objects_kernel)

@@ -11,7 +11,6 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.codes import Phase
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
@@ -94,7 +93,7 @@ class Simulation:
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
         planned = [index for each in DataLayout.of(config).plan() for index in each] if episodes is None else episodes
         indices = np.asarray(planned, np.int32)
-        self.episodes = wp.array(indices, dtype=wp.int32, device=device)
+        self.episodes = self._former = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(
             config.bake.worlds, config.arrangement.max_objects, config.move.rounds, built.layout.bodies_per_world, len(built.head.cups)
         )
@@ -215,10 +214,13 @@ class Simulation:
             self.perception.clear_graphs()
 
     def restart(self, episodes: Sequence[int]) -> None:
-        """Have the worlds, which must all be idle, run another list of episodes, in order, from the next tick on."""
+        """Have the worlds that are idle, and others once they are free, run another list of episodes, in order, from the next tick on. The
+        former list must be used up. Work is enqueued on the current stream.
+        """
+        self._former = self.episodes  # Launched kernels may still read it.
         self.episodes = wp.array(np.asarray(episodes, np.int32), dtype=wp.int32, device=self.device)
         self.state.next_episode.zero_()
-        self.state.phase.fill_(int(Phase.EMPTY))
+        arrange.free_idle_worlds(self.state)
 
     def _arrange(self) -> None:
         """Start episodes in free worlds: objects are sampled and dropped."""

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from synpick_warp.cloud.claims import BEATS, CHECKS, FIRST_WAIT, LEASE, Sizes, default_chunk
+from synpick_warp.cloud.claims import BEATS, CHECKS, FIRST_WAIT, GROWTH, LEASE, Sizes, default_chunk
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, WHOLE_BYTES
 from synpick_warp.cloud.ledger import BLOCK
 from synpick_warp.system.stores.object_store import PAGE, PART_BYTES
@@ -53,7 +53,7 @@ class Machine(NamedTuple):
     """Worker: what a chunk takes, what a view weighs, what it costs, how often it is lost."""
 
     start: float
-    """Time of a chunk beyond its views: worlds start, and few are left at its end [s]."""
+    """Time of a bake beyond its views: worlds start, and few are left at its end [s]."""
     rate: float
     """Views while all worlds are busy [1/s]."""
     views: float
@@ -73,6 +73,8 @@ class Machine(NamedTuple):
     """Time until another machine takes the place of a lost one, assumed [s]."""
     price: float = 2.0
     """Spot price of a GPU with its share of the host, assumed [USD/h]."""
+    drains: bool = True
+    """Whether each chunk is a bake of its own; False: a bake takes chunks until none is free, each before the one before has drained."""
 
     def file_requests(self) -> int:
         """Requests that write a file: one, or as many as it has parts and two more."""
@@ -90,11 +92,11 @@ class Machine(NamedTuple):
 
 
 def measured_machine(folder: Path = RESULTS) -> Machine:
-    """Worker fitted to two measured bakes, of 48 and of 150 episodes: a constant time, and a time per view."""
+    """Worker fitted to two measured bakes, of 48 and of 150 episodes: a constant time of a bake, and a time per view."""
     runs = [json.loads((folder / f"speed_bake_{count}.json").read_text()) for count in (48, 150)]
     (views, seconds), (more, longer) = ([_value(run, name) for name in ("views", "start to exit")] for run in runs)
     rate = (more - views) / (longer - seconds)
-    return Machine(start=seconds - views / rate, rate=rate, views=more / 150)
+    return Machine(start=seconds - views / rate, rate=rate, views=more / 150, drains=False)
 
 
 def _value(run: dict[str, list[dict[str, float]]], name: str) -> float:
@@ -203,7 +205,7 @@ class Simulation:
 
     def _claim_chunks(self, number: int, end: float) -> Iterator[float]:
         """The worker loop of `claims.Chunks`; returns whether the worker has lived until all was done."""
-        turn, seen, pause = self._draw.getrandbits(64), np.full(len(self.until), -1.0), 0.0
+        turn, seen, pause, begins = self._draw.getrandbits(64), np.full(len(self.until), -1.0), 0.0, True
         order = np.concatenate([np.roll(group, -(turn % len(group))) for group in self._groups])
         while self.now < end:
             over, leased = self.over.copy(), self.until >= 0.0
@@ -222,20 +224,25 @@ class Simulation:
                     break
                 seen[chunk] = self.until[chunk]
             else:
-                pause = min(2.0 * pause or FIRST_WAIT, LEASE / BEATS)
+                pause = min(GROWTH * pause or FIRST_WAIT, LEASE / BEATS)
                 yield pause * self._draw.uniform(0.5, 1.0)
+                begins = True
                 continue
             pause = 0.0
             self.until[chunk], self.owner[chunk] = self.now + LEASE, number
-            yield from self._bake(int(chunk), number, end)
+            yield from self._bake(int(chunk), number, end, begins or self.machine.drains)
+            begins = False
         return False
 
-    def _bake(self, chunk: int, number: int, end: float) -> Iterator[float]:
-        """Bake and deliver a chunk in rounds of one episode a world; a lost machine leaves what it has not delivered, and its lease."""
+    def _bake(self, chunk: int, number: int, end: float, begins: bool) -> Iterator[float]:
+        """Bake and deliver a chunk in rounds of one episode a world; a lost machine leaves what it has not delivered, and its lease.
+        `begins`: with the chunk a bake begins, so that worlds start, and once drain."""
         machine, out = self.machine, self.out
-        start, began = machine.start, self.now
+        start, began = machine.start * begins, self.now
         self.active += 1
-        yield self._ask("list", self._block_pages(chunk)) + self._ask("read", 3)  # Done marks; settings and constants, which are there.
+        yield self._ask("list", self._block_pages(chunk)) + self._ask(
+            "read", 3 * begins
+        )  # Done marks; settings and constants, which are there.
         while self.left[chunk] > 0.0:
             count = min(float(machine.worlds), self.left[chunk])
             views = count * machine.views

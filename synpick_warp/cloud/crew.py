@@ -1,0 +1,99 @@
+"""Crew of claiming workers of one command: what they cost, and an observer that adds rate and remaining time to their counts."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from synpick_warp.errors import DeviceError
+from synpick_warp.system.progress import Progress, SilentProgress
+
+RAY = "ray"
+_ENGINE = re.compile(r"(ray(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{1,5})?)?")
+_WINDOW = 60.0
+"""Time over which the rate is averaged, since workers pause between bakes [s]."""
+_LEAST = 1.0
+"""Minimum time that a rate is averaged over [s]."""
+
+
+@dataclass
+class Crew:
+    """Options of claiming workers, and what they have cost. Raises DeviceError if there is no such engine."""
+
+    engine: str = RAY
+    """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client.
+    Empty: a process on each device that the command names."""
+    workers: int = 0
+    """Number of the engine's workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu."""
+    price: float = 0.0
+    """Price of a worker an hour."""
+    alive: int = 0
+    """Number of running workers."""
+    seconds: float = 0.0
+    """Accumulated running time of all workers [s]."""
+
+    def __post_init__(self) -> None:
+        if _ENGINE.fullmatch(self.engine) is None:
+            raise DeviceError(f"--engine is {self.engine}; allowed: ray, or ray://HOST:PORT of a Ray Client, such as ray://head:10001")
+
+    def __str__(self) -> str:
+        cost = f" · cost {self.price * self.seconds / 3600.0:,.2f}" if self.price else ""
+        return f"{self.alive} worker{'s' * (self.alive != 1)}{cost}"
+
+
+class CrewProgress(SilentProgress):
+    """Decorator of an observer that receives counts of a crew, and adds the rate of the last _WINDOW, remaining time of the plan, and the
+    workers' time."""
+
+    def __init__(self, progress: Progress, crew: Crew, before: int, planned: int, clock: Callable[[], float] = time.monotonic) -> None:
+        """
+        Args:
+            progress: The observer.
+            crew: Workers; receives their time, by `alive`.
+            before: Episodes of the plan that were done before.
+            planned: Episodes of the plan.
+            clock: Time [s].
+        """
+        self._progress, self._crew, self._before, self._planned, self._clock = progress, crew, before, planned, clock
+        self._now = clock()
+        self._seen = deque([(self._now, 0)])
+        """Times, and the number of views at these, from the last one without views on."""
+
+    def stage(self, text: str) -> None:
+        """See `Progress`."""
+        self._progress.stage(text)
+
+    def note(self, text: str) -> None:
+        """See `Progress`."""
+        self._progress.note(text)
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Take episodes, worlds and views of all workers since their start; the others are computed here. See `Progress`.
+
+        An episode that runs counts as half done, on the average.
+        """
+        del episodes, views_per_s, seconds_left
+        now, seen = self._clock(), self._seen
+        self._crew.seconds += self._crew.alive * (now - self._now)
+        self._now = now
+        if not views:
+            seen.clear()
+        seen.append((now, views))
+        while now - seen[0][0] > _WINDOW:
+            seen.popleft()
+        rate = (views - seen[0][1]) / max(_LEAST, now - seen[0][0])
+        begun = episodes_done + 0.5 * worlds_active
+        left = max(0.0, self._planned - self._before - begun) * views / begun / rate if episodes_done and rate > 0.0 else None
+        self._progress.update(
+            episodes_done=min(self._planned, self._before + episodes_done),
+            episodes=self._planned,
+            worlds_active=worlds_active,
+            views=views,
+            views_per_s=rate,
+            seconds_left=left,
+        )
