@@ -16,8 +16,10 @@ BIN := $(VENV)/bin
 DEMO := demo
 # One more than the cores: tests also wait, for processes that they start.
 WORKERS := 3
+# Slow tests wait more than others.
+SLOW_WORKERS := 4
 # Neighbours in one process, which makes what they share once.
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+PYTEST = $(BIN)/python -m pytest --dist worksteal
 
 # Processes that tests start need not compile the sources again, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
@@ -35,10 +37,10 @@ test: $(VENV)/installed-dev
 	$(MAKE) --no-print-directory -j2 checks pytest
 
 pytest: $(VENV)/installed-dev
-	$(PYTEST) -m 'not slow'
+	$(PYTEST) -n $(WORKERS) -m 'not slow'
 
 test-slow: $(VENV)/installed-dev
-	$(PYTEST) -m slow
+	$(PYTEST) -n $(SLOW_WORKERS) -m slow
 
 checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import os
 import signal
 import subprocess
@@ -50,6 +51,25 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Each process begins with its share of the tests that take minutes, so that none has one left when the others have ended.
+
+    `--dist worksteal` hands each process one part of the list at the start.
+    """
+    minutes = {item: mark.kwargs.get("minutes", 0) for item in items if (mark := item.get_closest_marker("slow"))}
+    long = sorted((item for item in items if minutes.get(item)), key=lambda item: -minutes[item])
+    others = iter([item for item in items if not minutes.get(item)])
+    left, processes = len(items), getattr(config, "workerinput", {}).get("workercount", 1)
+    items.clear()
+    for index in range(processes):
+        share = long[index::processes]
+        size = left // (processes - index)
+        items += [*share, *itertools.islice(others, max(0, size - len(share)))]
+        left -= size
+    items += others
 
 
 def pytest_collection_finish() -> None:

@@ -71,7 +71,7 @@ def baked(tmp_path_factory):
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=1)
 def test_parts_stay_within_the_mesh_in_every_step(baked):
     """Nothing passes through a wall, the divider or the sloped floor while the gripper picks."""
     data_set = DataSet(baked / "set")

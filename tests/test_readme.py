@@ -62,7 +62,7 @@ def run_blocks(document: str, folder: Path, environment: dict[str, str]) -> str:
     return said
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=2)
 def test_the_lines_of_the_readme_run_as_written(tmp_path, environment):
     assert [language for language, _ in blocks(README)].count("python") == 3
     run_blocks(README, tmp_path, environment)
@@ -70,7 +70,7 @@ def test_the_lines_of_the_readme_run_as_written(tmp_path, environment):
     assert (tmp_path / "view.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=1)
 def test_the_page_on_ones_own_cell_leads_to_a_valid_data_set(tmp_path, environment):
     """Settings of a quick bake are all that is added."""
     bake = "synpick-warp bake "

@@ -214,9 +214,15 @@ def _read_preset(name: str, source: str) -> Values:
     if name not in names:
         known = f"presets: {', '.join(names)}; a file's name ends in .toml"
         raise ConfigError(f"there is no preset {format_value(name)}{source}; {known}{suggest(name, names)}")
+    return _preset_values(name)
+
+
+@functools.cache
+def _preset_values(name: str) -> Values:
+    """Values of a preset that is there, read once a process: presets come with the program."""
     document = _parse(_folder() / f"{name}.toml")
     base = document.pop(_BASE, None)
-    return _override(_read_preset(base, "") if base else {}, document, f"in the preset {name}")
+    return _override(_preset_values(base) if base else {}, document, f"in the preset {name}")
 
 
 def _parse(path: Path) -> dict[str, Any]:

@@ -7,6 +7,7 @@ where it would spill. Holes of the floor and of the walls do not matter, since n
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,6 +28,8 @@ POOL_SHARE = 0.1
 """Least volume of a depression, as a fraction of the largest: smaller ones are grooves of a flange."""
 HOLE = 0.015
 """Width of a hole that collision shapes may close [m]."""
+BATCH = 1 << 14
+"""Triangles that are bisected at a time."""
 LEVELS = 48
 """Levels at which dividers are looked for."""
 LIMIT_CELLS = 128
@@ -88,21 +91,50 @@ class Surface:
 
 def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Bisect the longest edges of triangles (F, 3, 3) until none exceeds `longest`; returns the triangles, and the given one of each."""
-    owner, done, owners = np.arange(len(corners)), [], []
-    corners = np.ascontiguousarray(corners.transpose(1, 2, 0))  # corner, coordinate, triangle
-    while len(owner):
-        squares = (corners - corners[[1, 2, 0]]) ** 2
-        lengths = np.sqrt(squares[:, 0] + squares[:, 1] + squares[:, 2])
-        large = lengths.max(axis=0) > longest
-        done.append(corners[..., ~large])
-        owners.append(owner[~large])
-        corners, owner = corners[..., large], owner[large]
-        first = lengths[:, large].argmax(axis=0)
-        a, b, c = (np.where(first == 0, corners[k], np.where(first == 1, corners[k - 2], corners[k - 1])) for k in range(3))
-        middle = (a + b) / 2.0
-        corners = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=2)
-        owner = np.concatenate([owner, owner])
-    return np.concatenate(done, axis=2).transpose(2, 0, 1), np.concatenate(owners)
+    parts = [(batch[..., small], owner[small]) for batch, owner, small, _, _ in _bisect(corners, longest)]
+    return np.concatenate([part for part, _ in parts], axis=2).transpose(2, 0, 1), np.concatenate([owner for _, owner in parts])
+
+
+def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (N, 3) of the triangles that `subdivide` makes, once for every edge that is cut there, and the given triangle of each."""
+    parts = [(middle, owner) for _, _, _, middle, owner in _bisect(corners, longest)]
+    points = np.concatenate([corners.reshape(-1, 3).T, *(middle for middle, _ in parts)], axis=1).T
+    return points, np.concatenate([np.repeat(np.arange(len(corners)), 3), *(owner for _, owner in parts)])
+
+
+def _bisect(corners: np.ndarray, longest: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+    """Longest-edge bisection (Rivara, 1984), in batches that stay in the processor's cache.
+
+    Yields:
+        Triangles of a batch (3, 3, N) by corner and coordinate, and the given one of each (N); which of them have no edge that exceeds
+        `longest` (N) bool; middles of the longest edges of all others (3, M), and the given triangle of each (M).
+    """
+    corners = np.ascontiguousarray(corners.transpose(1, 2, 0))
+    edges = np.stack([_distance(corners[k], corners[(k + 1) % 3]) for k in range(3)])
+    waiting = [(corners, edges, np.arange(corners.shape[2]))]
+    while waiting:
+        corners, edges, owner = waiting.pop()
+        if len(owner) > BATCH:
+            waiting += [(corners[..., part], edges[:, part], owner[part]) for part in (slice(BATCH), slice(BATCH, None))]
+            continue
+        first = np.where(edges.max(axis=0) > longest, edges.argmax(axis=0), 3)
+        groups = [np.flatnonzero(first == k) for k in range(3)]
+        # From the longest edge on: its ends a and b, the third corner c, and the lengths of the other edges.
+        a, b, c = (np.concatenate([corners[k - j].take(rows, axis=1) for k, rows in enumerate(groups)], axis=1) for j in (0, 2, 1))
+        bc, ca = (np.concatenate([edges[k - j].take(rows) for k, rows in enumerate(groups)]) for j in (2, 1))
+        middle, cut = (a + b) / 2.0, owner.take(np.concatenate(groups))
+        yield corners, owner, first == 3, middle, cut
+        if len(cut):
+            across = _distance(middle, c)
+            halves = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=2)
+            edges = np.concatenate([np.stack([_distance(a, middle), across, ca]), np.stack([_distance(middle, b), bc, across])], axis=1)
+            waiting.append((halves, edges, np.concatenate([cut, cut])))
+
+
+def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Distances (N) between points (3, N)."""
+    squares = (one - other) ** 2
+    return np.sqrt(squares[0] + squares[1] + squares[2])
 
 
 def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
@@ -114,8 +146,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
         return None
     shape = tuple(np.ceil((high - low)[:2] / cell).astype(int) + 1 + 2 * BORDER)
     start = (low + high)[:2] / 2.0 - np.array(shape) * cell / 2.0
-    small, owner = subdivide(corners, 0.9 * cell)
-    points = small.reshape(-1, 3)
+    points, owner = spread_points(corners, 0.9 * cell)
     height = np.full(shape, low[2])
     x, y = np.floor((points[:, :2] - start) / cell).astype(int).T
     np.maximum.at(height, (x, y), points[:, 2])
@@ -132,7 +163,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
     inside = np.isin(labels, kept)
     # Walls raise the cells at the edges of the floor, where a slope is lowest: points of upper sides on these count, too.
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    upper = np.repeat((normal[:, 2] > 0.5 * np.linalg.norm(normal, axis=1))[owner], 3)
+    upper = (normal[:, 2] > 0.5 * np.linalg.norm(normal, axis=1))[owner]
     floor = float(height[inside].min())
     near = upper & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
     return Surface(start, cell, height, inside, float(level[inside].max()), float(points[near, 2].min(initial=floor)))

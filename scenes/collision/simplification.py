@@ -146,9 +146,10 @@ def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> np.nda
     # A polyhedron of F facets has at most 2 F - 4 vertices (Euler), wherever its half-spaces are moved.
     max_facets = (max_vertices + 4) // 2
     chosen = _select(facets, chosen, max_facets + max(_SPARE), _MIN_GAIN * volume)
-    choices = [_eliminate(facets, chosen[: max_facets + spare], max_facets, _MIN_GAIN * volume) for spare in _SPARE]
+    starts = dict.fromkeys(tuple(chosen[: max_facets + spare]) for spare in _SPARE)  # One, if the selection ended before the first limit.
+    choices = [_eliminate(facets, start, max_facets, _MIN_GAIN * volume) for start in starts]
     best = min(choices, key=lambda choice: choice[1].volume)
-    return center + _fit_volume(facets, best[0], volume)
+    return center + _fit_volume(facets, *best, volume)
 
 
 def _gain(larger: ConvexHull, smaller: ConvexHull, normal: np.ndarray, offset: float) -> float:
@@ -178,14 +179,15 @@ def _select(facets: _Facets, chosen: list[int], max_facets: int, min_gain: float
     return chosen
 
 
-def _eliminate(facets: _Facets, chosen: list[int], max_facets: int, min_gain: float) -> tuple[list[int], ConvexHull]:
+def _eliminate(facets: _Facets, chosen: Sequence[int], max_facets: int, min_gain: float) -> tuple[list[int], ConvexHull]:
     """Backward elimination: remove the half-space with the least gain beside the others while there are more than `max_facets`, or it gains
     less than `min_gain`.
 
     A gain only grows as others are removed, hence lazy evaluation again. Of more than six half-spaces one can always be removed so that the
     intersection stays bounded (Steinitz).
     """
-    chosen, current = list(chosen), _intersect(facets, chosen)
+    chosen = list(chosen)
+    current = _intersect(facets, chosen)
     gains = np.full(len(facets.normal), np.inf)
     gains[chosen] = 0.0
     fresh: dict[int, ConvexHull] = {}
@@ -206,19 +208,24 @@ def _eliminate(facets: _Facets, chosen: list[int], max_facets: int, min_gain: fl
     return chosen, current
 
 
-def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float) -> np.ndarray:
-    """Vertices of the intersection whose half-spaces are moved inward, by a common fraction of their mean gaps, to the given volume.
+def _fit_volume(facets: _Facets, chosen: Sequence[int], polyhedron: ConvexHull, volume: float) -> np.ndarray:
+    """Vertices of the intersection, given as a `polyhedron`, whose half-spaces are moved inward, by a common fraction of their mean gaps,
+    to the given volume.
 
     The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. Scaling about the centroid does the
     rest.
     """
+    moved: dict[float, ConvexHull | None] = {0.0: polyhedron}
 
     def excess(shift: float) -> float:
         """Difference of the cube roots of the volumes of the shifted and of the wanted polyhedron [m]."""
-        try:
-            return float(np.cbrt(_intersect(facets, chosen, shift).volume) - np.cbrt(volume))
-        except QhullError:  # moved so far that it is empty
-            return -float(np.cbrt(volume))
+        if shift not in moved:
+            try:
+                moved[shift] = _intersect(facets, chosen, shift)
+            except QhullError:  # moved so far that it is empty
+                moved[shift] = None
+        hull = moved[shift]
+        return -float(np.cbrt(volume)) if hull is None else float(np.cbrt(hull.volume) - np.cbrt(volume))
 
     if excess(0.0) <= 0.0:
         shift = 0.0
@@ -226,7 +233,7 @@ def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float) -> np.nda
         shift = 1.0
     else:
         shift = root_scalar(excess, method="brentq", bracket=(0.0, 1.0), xtol=_FIT_TOLERANCE).root
-    polyhedron = _intersect(facets, chosen, shift)
+    polyhedron = moved.get(shift) or _intersect(facets, chosen, shift)
     center = _centroid(polyhedron)
     return center + (polyhedron.points[polyhedron.vertices] - center) * np.cbrt(volume / polyhedron.volume)
 
@@ -306,7 +313,9 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
     # A facet of the dual hull at distance b from the inner point is a vertex at distance 1/b from it.
     if intersection.dual_equations[:, 3].max() > -1.0 / _FAR:
         raise QhullError("the intersection is unbounded")
-    vertices = np.unique(intersection.intersections.round(_DECIMALS), axis=0)
+    vertices = intersection.intersections.round(_DECIMALS) + 0.0  # without negative zeros
+    vertices = vertices[np.lexsort(vertices.T[::-1])]
+    vertices = vertices[np.append(True, (vertices[1:] != vertices[:-1]).any(axis=1))]
     return ConvexHull(vertices @ facets.axes.T)
 
 

@@ -306,7 +306,7 @@ def test_a_damaged_plan_is_refused(memory):
         work(memory)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=3)
 def test_workers_killed_fifty_times_leave_the_set_of_one_bake(prefix, tmp_path):
     """Three at a time, killed at random moments and replaced; leases of two seconds."""
     kills, episodes, draw = int(os.environ.get("SYNPICK_KILLS", 50)), 100, random.Random(0)

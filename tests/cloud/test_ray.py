@@ -26,7 +26,7 @@ from tests.harness import scripted_bake
 S3 = ("bake", "--config", "smoke", "--device", "cpu", "--out", "s3://bucket/set")
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=1)
 def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, tmp_path):
     """Two workers; the first that claims a chunk is killed in it, another actor takes its place, and its chunk is dealt again."""
     pytest.importorskip("ray")

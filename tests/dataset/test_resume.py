@@ -48,7 +48,7 @@ def expected(whole) -> dict[str, str]:
     return digests(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=3)
 def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
     """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake ends in between, another folder is
     begun. The longest time to a kill is at most twice the time of any bake that ends: a machine may be busy while the first is timed.

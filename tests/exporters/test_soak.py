@@ -13,7 +13,7 @@ TICKS = 100
 """A short soak; `python -m tests.harness.soak` runs 10,000. One writer, so that it has run every type of task by half time."""
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=1)
 def test_memory_and_open_files_stay_constant():
     command = [sys.executable, "-m", "tests.harness.soak", "--ticks", str(TICKS), "--writers", "1"]
     process = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)

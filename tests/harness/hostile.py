@@ -51,20 +51,23 @@ def places(document: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...
 
 
 def replaced(document: Any, place: tuple[Any, ...], value: Any) -> Any:
-    """A copy with another value at one place."""
-    changed = copy.deepcopy(document)
-    parent = changed
-    for key in place[:-1]:
-        parent = parent[key]
+    """A copy with another value at one place; it shares what lies beside the place."""
+    changed, parent = _copied(document, place)
     parent[place[-1]] = value
     return changed
 
 
 def removed(document: Any, place: tuple[Any, ...]) -> Any:
-    """A copy without one key or element."""
-    changed = copy.deepcopy(document)
-    parent = changed
-    for key in place[:-1]:
-        parent = parent[key]
+    """A copy without one key or element; it shares what lies beside the place."""
+    changed, parent = _copied(document, place)
     del parent[place[-1]]
     return changed
+
+
+def _copied(document: Any, place: tuple[Any, ...]) -> tuple[Any, Any]:
+    """A copy of the branches on the way to a place, and the last of them."""
+    parent = changed = copy.copy(document)
+    for key in place[:-1]:
+        parent[key] = copy.copy(parent[key])
+        parent = parent[key]
+    return changed, parent

@@ -19,6 +19,7 @@ from synpick_warp.dataset.commit import merge
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
 from synpick_warp.stages.render import light_tables, scene
+from synpick_warp.system.processes import isolation
 from tests.harness.charts import render_here
 
 MOST_MAPS = 50
@@ -54,6 +55,7 @@ def made_once() -> Iterator[None]:
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
         patch.setattr(os, "fsync", lambda handle: None)
+        patch.setattr(isolation, "IDLE_TIME", 600.0)  # Between two tests that read files half a minute may pass.
         yield
 
 

@@ -46,7 +46,7 @@ def device_processes() -> list[int]:
     return sorted(int(number) for number in numbers if b"generate_share" in Path(f"/proc/{number}/cmdline").read_bytes())
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=2)
 def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path, capsys):
     """Begun on one device, continued on two, of which one is killed, and finished on one."""
     one, several = tmp_path / "one", tmp_path / "several"

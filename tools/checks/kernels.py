@@ -45,7 +45,8 @@ def main(root: Path) -> int:
     faults = [fault for path, tree in modules.items() for fault in check_module(path, tree, writes)]
     faults += [fault for folder in HOST_FOLDERS for fault in check_launches(root, folder)]
     launching = sorted(path for folder in LAUNCHING for path in (root / folder).rglob("*.py"))
-    faults += [fault for path in launching for fault in check_launch_arguments(path, kernel_parameters(modules))]
+    parameters = kernel_parameters(modules)
+    faults += [fault for path in launching for fault in check_launch_arguments(path, parameters)]
     for path, line, rule in faults:
         print(f"{path.relative_to(root)}:{line}: {rule}")
     return 1 if faults else 0

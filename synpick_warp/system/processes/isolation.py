@@ -96,7 +96,7 @@ class _Server:
         with theirs, self._lock:
             if fresh or self._worker is None or self._worker.process.poll() is not None:
                 self.stop()
-                program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r})"
+                program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
                 self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
             with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
                 socket.send_fds(control, [b"r"], [theirs.fileno(), result])
@@ -228,15 +228,15 @@ def _outcome(end: bytes, stream: BinaryIO, limits: Limits) -> Any:
 # ---- in the server and its children ----
 
 
-def main(modules: Sequence[str]) -> None:
-    """Entry point of the server: fork a supervisor for each link that arrives, until the caller's end, or too long without any."""
+def main(modules: Sequence[str], idle: float) -> None:
+    """Entry point of the server: fork a supervisor for each link that arrives, until the caller's end, or `idle` [s] without any."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # The kernel reaps supervisors.
     warnings.simplefilter("ignore")  # Python 3.12 warns of a fork beside the threads of BLAS, which handles forks.
     for module in modules:
         importlib.import_module(module)
     control = socket.socket(fileno=int(sys.argv[1]))
-    while select.select([control], [], [], IDLE_TIME)[0]:
+    while select.select([control], [], [], idle)[0]:
         message, handles, _, _ = socket.recv_fds(control, 1, 2)
         if not message:
             return

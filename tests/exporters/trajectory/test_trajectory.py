@@ -85,7 +85,7 @@ def test_steps_equal_the_batches(store, episode):
         np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=1)
 def test_more_episodes_than_a_task_takes_are_written_as_one_by_one(tmp_path):
     """Each has the same frames whether its rows share tasks with others of more and fewer instances, or not."""
     episodes = tuple(range(2 * SPOOL_ROWS + 3))

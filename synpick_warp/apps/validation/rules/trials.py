@@ -12,7 +12,7 @@ import numpy as np
 from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.bop.models import models_folder
-from synpick_warp.dataset.reading import Episode, open_data_set
+from synpick_warp.dataset.reading import DataSet, Episode, open_data_set
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 from synpick_warp.scenes.assets.meshes import read_mesh
@@ -52,9 +52,14 @@ class PicksSubject:
         return f"picks/{self.index:06d}.parquet"
 
     @cached_property
+    def data(self) -> DataSet:
+        """The data set, which reads its settings once."""
+        return open_data_set(self.root)
+
+    @cached_property
     def episode(self) -> Episode:
         """The episode."""
-        return open_data_set(self.root)[self.index]
+        return self.data[self.index]
 
     @cached_property
     def picks(self) -> np.ndarray:
@@ -72,7 +77,7 @@ class PicksSubject:
     def views(self) -> Iterator[tuple[np.void, np.ndarray, View]]:
         """Yield each state with its trials on labelled objects and its view; skips states without either."""
         episode = self.episode
-        if not {"bop", "shards"} & set(open_data_set(self.root).config.bake.formats):
+        if not {"bop", "shards"} & set(self.data.config.bake.formats):
             return
         for state in episode.pick_states:
             frame, camera = int(state["frame"]), int(state["camera"])
@@ -193,7 +198,7 @@ def check_outcomes(subject: PicksSubject) -> Findings:
 @rule(PicksSubject, "picks-own", "bake the episode again: attempts and picks are not of the same run")
 def check_own(subject: PicksSubject) -> Findings:
     """The own grasp of a state of picks is that of the attempt that chose from its frame, with its outcome where it takes its path."""
-    config = open_data_set(subject.root).config
+    config = subject.data.config
     is_same = (config.picks.near, config.picks.hold, config.picks.lift_height) == (0.0, 0.0, config.pick.lift_height)
     attempts = {attempt["frame"]: attempt for attempt in subject.episode.attempts if attempt.get("point") is not None}
     own = subject.picks[(subject.picks["share"] == Share.OWN) & (subject.picks["repeat"] == 0)]
