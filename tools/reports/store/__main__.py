@@ -15,7 +15,7 @@ from tools.reports.store.model import Limits, Machine, Replication, Simulation, 
 
 INDICES = 0.0007
 """Time of the indices for an episode of shards, 3 cameras and 504 frames [s] (tools/results/store_indices.json)."""
-VARIANTS = ((512, 1, 0), (4096, 64, 128))
+VARIANTS = ((512, 1, 0), (4096, 64, 128), (10_000, 64, 128))
 """Columns besides: GPUs, partitions of the prefix, episodes of a chunk (0: that of a bake)."""
 
 
