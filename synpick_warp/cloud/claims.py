@@ -32,9 +32,9 @@ BEATS = 4
 MARGIN = 0.1
 """Safety margin: last part of a lease in which its owner takes it for lost."""
 FIRST_WAIT = 0.5
-"""Back-off of a worker that waits for others: pause before it looks again, which grows up to the interval of heartbeats [s]."""
+"""First pause of the exponential back-off of a worker that waits for others [s]. Pauses grow up to the interval of heartbeats."""
 GROWTH = 1.25
-"""Growth of that pause: a worker that has waited notices the end at most a quarter of that time late."""
+"""Growth factor of these pauses: the end of a wait is noticed late by at most a quarter of it."""
 CHECKS = 8
 """Leases that a worker tries to take after each listing: thousands of workers that wait then ask for less than the store answers."""
 CHUNK_WORLDS = 2
@@ -129,7 +129,7 @@ class Claims:
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:12]}"
 
     def pauses(self) -> Iterator[float]:
-        """Yield the pauses of a worker that waits for others [s]: exponential back-off, up to the interval of heartbeats."""
+        """Yield the pauses of exponential back-off with jitter [s], at most the interval of heartbeats."""
         pause = FIRST_WAIT
         while True:
             yield (pause := min(pause, self.lease / BEATS)) * random.uniform(0.5, 1.0)
@@ -188,7 +188,7 @@ def default_chunk(worlds: int, episodes: int) -> int:
 
 
 class Chunk(NamedTuple):
-    """Chunk of a worker: its number, its episodes without done mark, its claim (None: workers of other chunks are not equal)."""
+    """Chunk of a worker: its number, its episodes without done mark, its claim (None: episodes are shared out by --shard)."""
 
     number: int
     episodes: list[int]
@@ -312,11 +312,15 @@ class Chunks:
         return sorted(set(wanted).difference(*(self._ledger.done(block) for block in blocks)))
 
 
-def plan_chunks(ledger: Ledger, ranges: Sequence[range], lease: float) -> Chunks:
-    """Chunks of a plan as they are by default, for a process that starts workers; raises StoreError if the store cannot have claims."""
+def open_claims(ledger: Ledger, lease: float) -> Claims:
+    """Lease manager of this process, with leases of `lease` [s]. Raises StoreError: the store has no conditional writes."""
     if not ledger.probe.conditional:
         raise StoreError(
-            f"{ledger.store.url} has no conditional writes, by which workers claim; share the episodes out by --shard i/n instead"
+            f"{ledger.store.url} has no conditional writes, which --claim needs; share the episodes out by --shard i/n instead"
         )
-    claims = Claims(ledger.store, ledger.probe.offset, lease)
+    return Claims(ledger.store, ledger.probe.offset, lease)
+
+
+def plan_chunks(ledger: Ledger, claims: Claims, ranges: Sequence[range]) -> Chunks:
+    """Work queue of the episodes in `ranges`, with chunks of the default size."""
     return Chunks(ledger, claims, ranges, default_chunk(ledger.config.bake.worlds, sum(map(len, ranges))))

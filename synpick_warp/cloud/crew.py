@@ -1,4 +1,4 @@
-"""Crew of claiming workers of one command: what they cost, and an observer that adds rate and remaining time to their counts."""
+"""Claiming workers of one command: their options and cost, and a progress observer that adds rate and remaining time."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from synpick_warp.errors import DeviceError
-from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.system.progress import ForwardingProgress, Progress
 
 RAY = "ray"
 _ENGINE = re.compile(r"(ray(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{1,5})?)?")
 _WINDOW = 60.0
-"""Time over which the rate is averaged, since workers pause between bakes [s]."""
+"""Averaging window of the rate [s]: workers pause between bakes."""
 _LEAST = 1.0
-"""Minimum time that a rate is averaged over [s]."""
+"""Minimum averaging window [s]."""
 
 
 @dataclass
 class Crew:
-    """Options of claiming workers, and what they have cost. Raises DeviceError if there is no such engine."""
+    """Options and cost of claiming workers. Raises DeviceError if there is no such engine."""
 
     engine: str = RAY
-    """"ray": the cluster that RAY_ADDRESS names, or else one on this machine, for this bake. "ray://HOST:PORT": a cluster's Ray Client.
-    Empty: a process on each device that the command names."""
+    """Ray cluster: "ray" is the one at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
+    Empty: no cluster, but one process for each device of the command."""
     workers: int = 0
     """Number of the engine's workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu."""
     price: float = 0.0
@@ -44,38 +44,31 @@ class Crew:
         return f"{self.alive} worker{'s' * (self.alive != 1)}{cost}"
 
 
-class CrewProgress(SilentProgress):
-    """Decorator of an observer that receives counts of a crew, and adds the rate of the last _WINDOW, remaining time of the plan, and the
-    workers' time."""
+class CrewProgress(ForwardingProgress):
+    """Decorator of an observer: adds the moving average of the rate and the remaining time of the plan to the counts of all workers, and
+    accumulates the workers' time in their `Crew`."""
 
     def __init__(self, progress: Progress, crew: Crew, before: int, planned: int, clock: Callable[[], float] = time.monotonic) -> None:
         """
         Args:
             progress: The observer.
-            crew: Workers; receives their time, by `alive`.
+            crew: Workers; its `seconds` grow by the time of `alive` workers.
             before: Episodes of the plan that were done before.
             planned: Episodes of the plan.
-            clock: Time [s].
+            clock: Monotonic clock [s].
         """
-        self._progress, self._crew, self._before, self._planned, self._clock = progress, crew, before, planned, clock
+        super().__init__(progress)
+        self._crew, self._before, self._planned, self._clock = crew, before, planned, clock
         self._now = clock()
         self._seen = deque([(self._now, 0)])
-        """Times, and the number of views at these, from the last one without views on."""
-
-    def stage(self, text: str) -> None:
-        """See `Progress`."""
-        self._progress.stage(text)
-
-    def note(self, text: str) -> None:
-        """See `Progress`."""
-        self._progress.note(text)
+        """Samples in the averaging window: time [s], number of views."""
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Take episodes, worlds and views of all workers since their start; the others are computed here. See `Progress`.
+        """Pass on episodes, worlds and views of all workers since their start, with rate and remaining time. See `Progress`.
 
-        An episode that runs counts as half done, on the average.
+        Running episodes count as half done.
         """
         del episodes, views_per_s, seconds_left
         now, seen = self._clock(), self._seen
@@ -89,7 +82,7 @@ class CrewProgress(SilentProgress):
         rate = (views - seen[0][1]) / max(_LEAST, now - seen[0][0])
         begun = episodes_done + 0.5 * worlds_active
         left = max(0.0, self._planned - self._before - begun) * views / begun / rate if episodes_done and rate > 0.0 else None
-        self._progress.update(
+        super().update(
             episodes_done=min(self._planned, self._before + episodes_done),
             episodes=self._planned,
             worlds_active=worlds_active,

@@ -24,7 +24,7 @@ from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, commi
 from synpick_warp.errors import OutputError, StoreError, SynpickError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
-from synpick_warp.system.progress import Progress
+from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.base import Store, TransientError, persist
 
 FILES_AT_ONCE, EPISODES_AT_ONCE = 16, 4
@@ -218,37 +218,19 @@ def _describe(error: BaseException) -> BaseException:
     return StoreError(f"an upload failed: {error}; the same command resumes") if isinstance(error, OSError) else error
 
 
-class WatchedProgress:
+class WatchedProgress(ForwardingProgress):
     """Decorator of a progress observer that raises the errors of an upload into the bake, which so ends early, and applies backpressure."""
 
     def __init__(self, progress: Progress, check: Callable[[], None]) -> None:
-        self._progress, self._check = progress, check
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        return None
+        super().__init__(progress)
+        self._check = check
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
         self._check()
-        self._progress.stage(text)
+        super().stage(text)
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, **counts: Any) -> None:
         """See `Progress`."""
         self._check()
-        self._progress.update(
-            episodes_done=episodes_done,
-            episodes=episodes,
-            worlds_active=worlds_active,
-            views=views,
-            views_per_s=views_per_s,
-            seconds_left=seconds_left,
-        )
-
-    def note(self, text: str) -> None:
-        """See `Progress`."""
-        self._progress.note(text)
+        super().update(**counts)

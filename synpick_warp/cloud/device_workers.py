@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from types import FrameType
 
-from synpick_warp.cloud.claims import plan_chunks
+from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.crew import Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Job, bake_into_store
@@ -26,7 +26,7 @@ from synpick_warp.factory.sizes import count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
 _PROGRAM = "from synpick_warp.cloud.device_workers import run_worker; from synpick_warp.factory.worker import main; main(run_worker)"
@@ -73,14 +73,14 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew
             with DeviceProcesses(names, _PROGRAM, handle) as processes:  # They load their libraries meanwhile.
                 store = open_store(job.url)
                 ledger = Ledger(store, config, probe(store))
-                chunks = plan_chunks(ledger, ranges, job.lease)
+                claims = open_claims(ledger, job.lease)
                 if ledger.finished():
                     progress.note("all episodes are done")
                     return BakeSummary()
                 common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
                 crew.alive = len(names)
-                shown = CrewProgress(progress, crew, chunks.count_over(), planned)
+                shown = CrewProgress(progress, crew, plan_chunks(ledger, claims, ranges).count_over(), planned)
                 lost = processes.run([_Share(**common, own=each) for each in own], summary, shown)
         finally:
             os.close(handle)
@@ -108,31 +108,23 @@ class _Stopped(BaseException):
     """Request to stop a worker that bakes nothing at present."""
 
 
-class _Relay(SilentProgress):
-    """Observer of a worker's bakes that passes reports on to the main process, with counts over all of its chunks."""
+class _Relay(ForwardingProgress):
+    """Observer of a worker's bakes that passes reports on to the main process, with counts over all of its bakes."""
 
     def __init__(self, link: BakeLink) -> None:
-        self._link, self._views = link, 0
+        super().__init__(link)
         self.busy = False
         """Whether a chunk is baked, which then ends by itself when the link requests a stop."""
         self.ended = BakeSummary()
         """Summary of the chunks that have ended."""
 
-    def stage(self, text: str) -> None:
-        """See `Progress`."""
-        self._link.stage(text)
-
-    def note(self, text: str) -> None:
-        """See `Progress`."""
-        self._link.note(text)
-
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Pass counts on; the remaining time is that of a bake, and left out. See `Progress`."""
+        """Pass counts on, without the remaining time, which is that of one bake. See `Progress`."""
         done, views = len(self.ended.episodes) + episodes_done, self.ended.views + views
         given = {"worlds_active": worlds_active, "views": views, "views_per_s": views_per_s, "seconds_left": None}
-        self._link.update(episodes_done=done, episodes=episodes, **given)
+        super().update(episodes_done=done, episodes=episodes, **given)
 
     def bake(self, job: _Share, bake: Callable[..., BakeSummary], _: object, *given: object) -> BakeSummary:
         """Bake a chunk with the worker's own settings, and add its summary."""

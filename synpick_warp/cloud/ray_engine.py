@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import plan_chunks
+from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.crew import RAY, Crew, CrewProgress
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_worker import Board, Report, Worker
@@ -74,14 +74,15 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         raise StoreError(f"{url} is in the memory of one process, and Ray's workers have their own; name a store that all of them reach")
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
-    chunks = plan_chunks(ledger, ranges, job.lease)
+    claims = open_claims(ledger, job.lease)
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
     with _cluster(ray, address, crew.workers):
         device, each = _resources(ray, config.bake.device, crew.workers)
-        return _Driver(ray, crew, progress, pickle.dumps(job), device, each, (chunks.count_over(), planned)).run()
+        before = plan_chunks(ledger, claims, ranges).count_over()
+        return _Driver(ray, crew, progress, pickle.dumps(job), device, each, (before, planned)).run()
 
 
 def import_ray(address: str | None) -> Any:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, default_chunk
+from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, open_claims, plan_chunks
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
 from synpick_warp.cloud.finish import close_blocks, finalize_store
 from synpick_warp.cloud.ledger import Ledger
@@ -32,8 +32,8 @@ from synpick_warp.system.stores.opening import open_store, probe
 MAX_CHUNK = 10_000
 """Chunk size of a bake without claims [episodes], to within a block; each chunk starts the worlds anew."""
 HELD_CHUNKS = 3
-"""Whole chunks whose number of episodes a claiming worker has at most, before it claims another one: a worker that starts early leaves some
-to others. Workers of known number have their share of the plan instead, if it is larger."""
+"""Prefetch limit of a claiming worker: with the episodes of so many whole chunks it claims no other, which leaves work for workers that
+start later. If the number of workers is known, the limit is at least a worker's share of the plan."""
 
 Baker = Callable[..., BakeSummary]
 """Function that bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""
@@ -87,12 +87,10 @@ def bake_into_store(
     ranges = DataLayout.of(config).plan_shard(splits, shard)
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
-    if claim and not ledger.probe.conditional:
-        raise StoreError(f"{url} has no conditional writes, which --claim needs; share the episodes out by --shard i/n instead")
+    claims = open_claims(ledger, lease) if claim else None
     summary = BakeSummary()
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
-        claims = Claims(store, ledger.probe.offset, lease) if claim else None
         if claims is None or not ledger.finished():
             baker = bake or keeping_baker()
             for work in _works(ledger, place, claims, ranges, workers):
@@ -110,9 +108,10 @@ def bake_into_store(
 
 
 class _Work(EpisodeSource):
-    """Source of the episodes of one bake into the store: a chunk, and with claims others while worlds are idle, before it has drained.
+    """Episode source of one bake into the store: a first chunk and, with claims, further chunks whenever worlds are idle.
 
-    A chunk is done when its own episodes have done marks, and is dropped when its lease is lost. Leaving the context gives the others up.
+    A chunk gets its end mark when all of its episodes have done marks, and is dropped when its lease is lost. Leaving the context releases
+    the leases of all other chunks.
     """
 
     def __init__(self, ledger: Ledger, place: Path, first: Chunk, chunks: Chunks | None = None, limit: int = 0) -> None:
@@ -121,17 +120,17 @@ class _Work(EpisodeSource):
             ledger: Ledger of the data set.
             place: Folder for temporary files.
             first: The chunk to begin with.
-            chunks: Where to claim others; None: nowhere.
-            limit: Number of episodes without done mark from which on no other chunk is claimed.
+            chunks: Work queue of further chunks; None: there are none.
+            limit: Prefetch limit: number of episodes without done mark from which on no other chunk is claimed.
         """
         super().__init__(first.episodes, limit)
         self.lost: set[int] = set()
-        """Episodes that were lost with the leases of their chunks."""
+        """Episodes of the chunks whose leases are lost."""
         self._ledger, self._place, self._chunks, self._limit = ledger, place, chunks, limit
         self._held: dict[int, tuple[Chunk, set[int]]] = {}
-        """Chunks by number, each with its episodes without done mark."""
+        """Number of a chunk -> the chunk, and its episodes without done mark."""
         self._numbers: dict[int, int] = {}
-        """Numbers of the chunks of these episodes."""
+        """Episode without done mark -> number of its chunk."""
         self._notes: list[str] = []
         self._lock, self._closing = threading.Lock(), threading.Lock()
         self._asker = ThreadPoolExecutor(1, "claim")
@@ -144,7 +143,7 @@ class _Work(EpisodeSource):
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Release the leases of unfinished chunks; after an error that is unknown they expire by themselves."""
+        """Release the leases of unfinished chunks. After an unexpected error they are left to expire."""
         held = [chunk for chunk, _ in self._held.values()]
         if self._asked is not None:
             with contextlib.suppress(BaseException):
@@ -157,12 +156,12 @@ class _Work(EpisodeSource):
                 chunk.claim.stop()
 
     def report(self, progress: Progress) -> None:
-        """Report the leases that were lost since the last call, in the thread of the bake."""
+        """Report the leases that were lost since the last call. Called by the thread of the bake."""
         while self._notes:
             progress.note(self._notes.pop(0))
 
     def permit(self, episode: int) -> None:
-        """Check the lease of an episode's chunk; raises LeaseLostError, and drops the chunk, if others may have it."""
+        """Check the lease of an episode's chunk. If it is lost, drop the chunk and raise LeaseLostError."""
         with self._lock:
             chunk, left = self._held.get(self._numbers.get(episode, -1), (None, set[int]()))
             try:
@@ -183,7 +182,7 @@ class _Work(EpisodeSource):
         raise lost
 
     def delivered(self, episode: int) -> None:
-        """Count an episode that has its done mark; after the last one of a chunk write the batched marks that are due, and the end mark."""
+        """Record that an episode has its done mark. After a chunk's last one, write the batched marks that are due, and the end mark."""
         with self._lock:
             chunk, left = self._held.get(self._numbers.pop(episode), (None, set[int]()))
             left.discard(episode)
@@ -202,7 +201,7 @@ class _Work(EpisodeSource):
                 self._chunks.done(chunk)
 
     def more(self, wait: bool) -> list[int]:
-        """Claim another chunk, in a thread: this call returns the episodes of the one that was asked for earlier. See `EpisodeSource`."""
+        """Claim another chunk asynchronously: returns the episodes of the claim that an earlier call began. See `EpisodeSource`."""
         if self._chunks is None:
             return []
         if self._asked is None:
@@ -229,14 +228,14 @@ class _Work(EpisodeSource):
         return []
 
     def _hold(self, chunk: Chunk) -> None:
-        """Add a chunk to those that this worker has."""
+        """Add a claimed chunk."""
         with self._lock:
             self._held[chunk.number] = chunk, set(chunk.episodes)
             self._numbers |= dict.fromkeys(chunk.episodes, chunk.number)
 
 
 def _take(summary: BakeSummary, part: BakeSummary) -> bool:
-    """Add the summary of a bake to that of the run; returns whether a signal stopped it."""
+    """Accumulate the summary of a bake in that of the run. Returns whether a signal stopped the bake."""
     seconds = summary.wall_seconds + part.wall_seconds
     summary.total += part.total
     summary.take_summary(part)
@@ -246,13 +245,13 @@ def _take(summary: BakeSummary, part: BakeSummary) -> bool:
 
 
 def _works(ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[range], workers: int) -> Iterator[_Work]:
-    """Yield the work of one bake after the other; arguments as of `bake_into_store`. With claims it ends when all of the plan are done."""
+    """Yield the episode source of each bake; arguments as of `bake_into_store`. With claims, ends when the whole plan is done."""
     if claims is None:
         for number, episodes in enumerate(_chunks(ledger, ranges)):
             yield _Work(ledger, place, Chunk(number, episodes, None))
         return
     planned = sum(map(len, ranges))
-    chunks = Chunks(ledger, claims, ranges, default_chunk(ledger.config.bake.worlds, planned))
+    chunks = plan_chunks(ledger, claims, ranges)
     limit = max(HELD_CHUNKS * chunks.sizes.chunk, -(-planned // workers) if workers else 0)
     for chunk in chunks:
         yield _Work(ledger, place, chunk, chunks, min(limit, planned))

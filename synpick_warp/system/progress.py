@@ -51,3 +51,31 @@ class SilentProgress:
 
     def note(self, text: str) -> None:
         """Do nothing."""
+
+
+class ForwardingProgress(SilentProgress):
+    """Decorator of an observer that passes all reports on: base of decorators that change some. It does not enter or exit the observer."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    def stage(self, text: str) -> None:
+        """Pass it on."""
+        self._progress.stage(text)
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Pass it on."""
+        self._progress.update(
+            episodes_done=episodes_done,
+            episodes=episodes,
+            worlds_active=worlds_active,
+            views=views,
+            views_per_s=views_per_s,
+            seconds_left=seconds_left,
+        )
+
+    def note(self, text: str) -> None:
+        """Pass it on."""
+        self._progress.note(text)
