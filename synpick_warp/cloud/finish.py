@@ -146,7 +146,7 @@ def _gather(ledger: Ledger, work: Path) -> list[int]:
 
 
 def _bundles(ledger: Ledger) -> Iterator[tuple[int, str, bytes]]:
-    """Yield the index files of all planned episodes, sorted, each after its episode and the URL of the batched mark that it is from.
+    """Yield (episode, URL of its batched mark, index file) of all planned episodes, sorted by episode.
 
     Raises:
         StoreError: A planned episode is in no batched mark.
@@ -164,7 +164,7 @@ def _bundles(ledger: Ledger) -> Iterator[tuple[int, str, bytes]]:
 
 
 def _read_mark(ledger: Ledger, key: str, spans: Sequence[range]) -> Iterator[tuple[int, str, bytes]]:
-    """Yield the index files of a batched mark, sorted by episode, lazily; items as of `_bundles`."""
+    """Lazily yield the items of `_bundles` for the episodes of one batched mark, sorted by episode."""
     source = f"{ledger.store.url}/{key}"
     for episode, bundle in split_bundles(ledger.store.blocks(key), [episode for span in spans for episode in span], source):
         yield episode, source, bundle

@@ -1,4 +1,5 @@
-"""Ray actors of a bake: claiming workers, one a GPU or CPU core, and the board on which they report. Only running actors import Ray.
+"""Ray actors of a bake: claiming workers, one for each GPU or CPU core, and a message board for their reports. Ray is imported by running
+actors only.
 
 Claims in the store deal the chunks out, and done marks commit episodes; what workers report is for the display and the summary alone.
 """
@@ -27,10 +28,10 @@ REPORT_INTERVAL = 1.0
 
 @dataclass
 class Report:
-    """Counts of a worker since its start, and what is new since its last report."""
+    """Progress report of a worker: counts since its start; notes and summaries since its last report."""
 
     busy: bool = False
-    """Whether it is baking a chunk; False: it is looking for a free chunk, or waiting for other workers."""
+    """Whether it bakes; False: it looks for a free chunk, or waits for other workers."""
     episodes: int = 0
     views: int = 0
     worlds: int = 0
@@ -41,21 +42,21 @@ class Report:
 
 
 class Board:
-    """Actor on which workers leave reports, and from which the driver collects them; carries the driver's request to stop back."""
+    """Message board: an actor to which workers post reports, which the driver collects. It passes the driver's request to stop on."""
 
     def __init__(self) -> None:
         self._reports: dict[int, Report] = {}
         self._stop = 0
 
     def post(self, worker: int, report: Report) -> int:
-        """Take a report; returns the signal for which to stop, or 0."""
+        """Store a report, with the notes and summaries of those not yet collected. Returns the signal for which to stop, or 0."""
         if (before := self._reports.get(worker)) is not None:
             report = replace(report, notes=before.notes + report.notes, chunks=before.chunks + report.chunks)
         self._reports[worker] = report
         return self._stop
 
     def collect(self, stop: int) -> dict[int, Report]:
-        """Hand over the reports since the last call, by worker; `stop`: signal for which workers are to stop, or 0."""
+        """Return the reports since the last call, by worker. `stop`: signal for which workers are to stop, or 0."""
         self._stop, reports = stop, self._reports
         self._reports = {}
         return reports
@@ -68,7 +69,7 @@ class Reporter(SilentProgress):
         """
         Args:
             post: Sends a report, and returns a handle of its answer, without waiting.
-            read: Answer of a handle: the signal for which to stop, or 0; None: it has not come yet.
+            read: Returns the answer of a handle: the signal for which to stop, or 0; None: it is pending.
         """
         self._post, self._read = post, read
         self._now, self._ended, self._posted = Report(), (0, 0), float("-inf")
@@ -86,7 +87,7 @@ class Reporter(SilentProgress):
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Post counts, at most once in REPORT_INTERVAL. See `Progress`."""
+        """Post counts, at most once every REPORT_INTERVAL. See `Progress`."""
         before = self._ended
         self._now.episodes, self._now.views = before[0] + episodes_done, before[1] + views
         self._now.worlds = worlds_active
@@ -99,7 +100,7 @@ class Reporter(SilentProgress):
 
     @contextlib.contextmanager
     def chunk(self, ended: list[BakeSummary]) -> Iterator[None]:
-        """Context manager around a chunk; at its end `ended` has its summary, unless it failed."""
+        """Context manager of a bake, which marks the worker as busy. On exit the summaries in `ended` are posted."""
         self._now.busy = True
         try:
             yield
@@ -109,7 +110,7 @@ class Reporter(SilentProgress):
             self._send()
 
     def _send(self) -> None:
-        """Post the report, and begin the next one."""
+        """Post the report, and start the next one."""
         self._answer, self._posted = self._post(self._now), time.monotonic()
         self._now = replace(self._now, notes=[], chunks=[])
 

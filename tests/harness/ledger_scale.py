@@ -1,4 +1,4 @@
-"""Seconds, requests and peak memory of a resume and of the finalization, by the number of episodes that are done, in a store in memory.
+"""Benchmark of resume and finalization against the number of done episodes: time, requests, peak memory. The store is in memory.
 
 python -m tests.harness.ledger_scale --episodes 10000,100000,1000000 --finalize 1000,10000,100000 --json FILE
 """
@@ -35,18 +35,18 @@ from tools.figures import finish_report
 from tools.options import Row, make_parser, positive_count
 
 FRAMES = 504
-"""Frames of an episode of mode pick or move, about."""
+"""Typical number of frames of an episode of mode pick or move."""
 LEFT = 1000
-"""Episodes that are not done when a bake resumes."""
+"""Number of remaining episodes of a resume."""
 
 
 def peak() -> float:
-    """Largest resident memory of this process so far [MB]."""
+    """Peak resident memory of this process [MB]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
 def open_with_marks(episodes: int, kind: str, make: bool) -> Store:
-    """A store with the records of a set of a format, and batched marks of so many episodes, with index files if `make`."""
+    """Make a store with the records of a data set of format `kind`, and batched marks of `episodes` episodes. `make`: with index files."""
     url = f"memory://{uuid4().hex}"
     store = open_store(url)
     with mock.patch.object(scripted_bake, "FRAMES", FRAMES if make else 1):
@@ -64,7 +64,7 @@ def open_with_marks(episodes: int, kind: str, make: bool) -> Store:
 
 
 def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
-    """Index file of another episode with the same content."""
+    """Index file of `episode`: that of episode 0 with the numbers changed."""
     first = len(tiny().rig) * episode
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
@@ -80,7 +80,7 @@ def _renumber(members: list[tuple[str, bytes]], episode: int) -> bytes:
 
 
 def measure_resume(episodes: int) -> Iterator[Row]:
-    """Find the remaining episodes of a set of which so many are done."""
+    """Measure the search for the remaining episodes of a data set with `episodes` done ones."""
     store, part, counts = open_with_marks(episodes, "shards", make=False), f"{episodes:,} episodes", Counter[str]()
     real = store._obs.list  # type: ignore[attr-defined]
 
@@ -101,7 +101,7 @@ def measure_resume(episodes: int) -> Iterator[Row]:
 
 
 def measure_finalization(episodes: int, kind: str) -> Iterator[Row]:
-    """Make the indices of so many episodes of a format, all but their upload."""
+    """Measure the finalization of `episodes` episodes of a format, without the upload of the indices."""
     store, part, before = open_with_marks(episodes, kind, make=True), f"{episodes:,} episodes", peak()
     with tempfile.TemporaryDirectory() as name, mock.patch.object(finish, "_put_indices"):
         started = time.perf_counter()

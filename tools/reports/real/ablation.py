@@ -33,23 +33,23 @@ from tools.reports.real import OBJECT, interval
 from tools.reports.real.worker import Worker
 
 START = 60.0
-"""Time of a process's first run beside its training [s]: imports, cached kernels, photographs, held-out views, scores."""
+"""Overhead of a process's first run, beside its training [s]: imports, loading of kernels and photographs, held-out views, scoring."""
 BETWEEN = 15.0
-"""The same of a later run [s]: scores and files."""
+"""Overhead of a later run [s]: scoring, writing of files."""
 FIRST_VIEWS = 20.0
-"""Time from the start of a stream until views come [s]: models, lights, 512 worlds, and the first piles, which need some 35 ticks."""
+"""Start-up time of a stream [s]: loading of models and lights, construction of 512 worlds, settling of the first piles (some 35 ticks)."""
 STREAM_RATE = 700.0
-"""Views/s of still piles after these, at 320x240 with 8 views a pile, on an H200."""
+"""Throughput of a stream after its start-up [views/s]: still piles, 8 views each, 320x240, on an H200."""
 REFERENCE_RATE = 30.0
-"""Views/s of mode reference at 320x240 and 64 paths."""
+"""Throughput of the path tracer [views/s]: 320x240, 64 paths a pixel."""
 TRAIN_RATE = 850.0
-"""Samples/s of the U-Net of width 48, 70 % at 160x120 and 30 % at 320x240, in bfloat16 on an H200."""
+"""Training throughput of the U-Net of width 48 [samples/s]: 70 % of the time at 160x120 and 30 % at 320x240, bfloat16, on an H200."""
 DETECTOR = 60.0
-"""Training of the detector [s]."""
+"""Training time of the detector [s]."""
 SLACK = 1.15
-"""Safety factor on expected times: a run starts only if so much time is left."""
+"""Safety factor on expected times: a run starts only if its expected time times SLACK is left."""
 MAX_FAILURES = 3
-"""Failures in succession after which a GPU is given no more runs."""
+"""Number of consecutive failures after which a GPU gets no more runs."""
 METRICS = {
     "mean_iou": ("mIoU", "", 1.0),
     "found": ("instances with IoU above 0.5", "%", 100.0),
@@ -146,7 +146,7 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 
 
 def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
-    """All rows in the order of priority, with numbers of views, and arguments of those with the most."""
+    """Yield all rows in order of priority. `choice`: arguments of the rows with the most views."""
     most = ("--capacity", "40000", *choice.split())
     detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
@@ -173,14 +173,14 @@ def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: the first row with all seeds, the others by seed; the row of this name before all."""
+    """Runs in the order in which they start: all seeds of the first row, then the others by seed. The row `preferred` comes before all."""
     first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
     rest = [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
     return sorted(first + rest, key=lambda job: job[0].name != preferred)
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
-    """Print when each run would start and end on as many GPUs."""
+    """Print the schedule on a number of GPUs: expected start and end of each run."""
     free = [(0.0, START)] * gpus
     for run, seed in jobs:
         begun, start = heapq.heappop(free)
@@ -220,7 +220,7 @@ class Execution:
         return time.monotonic() - self.started
 
     def _serve(self, gpu: int) -> None:
-        """Carry out runs on a GPU until none is left that fits, or several have failed in succession."""
+        """Carry out runs on a GPU until no remaining run fits, or MAX_FAILURES in a row have failed."""
         options = self.options
         shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
         worker, failures = Worker([*shared, *options.pass_on]), 0
@@ -237,7 +237,7 @@ class Execution:
             worker.stop()
 
     def _take(self, ready: bool) -> tuple[Run, int] | None:
-        """The next run that fits into the time left, as it fits; others are printed as left out."""
+        """Take the next run that fits into the remaining time, and shorten it if needed. Runs that do not fit are printed as left out."""
         with self.lock:
             for run, seed in self.waiting:
                 left = self.options.deadline - self.now
@@ -256,7 +256,7 @@ class Execution:
 
 
 def spent(path: Path) -> float:
-    """Time of a training with its stream, by its results [s]; infinite without."""
+    """Time of a training and its stream, read from its results [s]; infinite if there are none."""
     return json.loads(path.read_text())["more"]["seeds"][0]["seconds"] if path.exists() else math.inf
 
 

@@ -27,7 +27,7 @@ LUMA = (0.299, 0.587, 0.114)
 YCC = (LUMA, (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.081312))
 """Y, Cb and Cr of red, green and blue (JFIF)."""
 MIDDLE = (128 / 255, 0.0, 0.0)
-"""Y, Cb and Cr that are coded by 0."""
+"""Values of Y, Cb and Cr that the level shift of JPEG maps to 0."""
 BLOCK = 8
 """Side of a JPEG block [px]."""
 LEAST_RATE = 0.01
@@ -35,15 +35,16 @@ LEAST_RATE = 0.01
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
 FIRST = 0.125
-"""Fraction of the pool that is filled before the first step."""
+"""Fraction of the pool that is filled before training starts."""
 FILLING = 0.5
-"""Largest fraction of the time limit that passes before the first step."""
+"""Maximum fraction of the time limit that passes before training starts."""
 PACE = 4.0
-"""Most samples that are trained on for each further view, until all are there; fewer if there are fewer epochs."""
+"""Replay ratio while the stream runs: maximum number of training samples for each new view, or the number of epochs if that is smaller."""
 EAGER = 4
-"""Steps at each size before one is recorded as a CUDA graph: cuDNN finds its convolutions, the optimizer makes its state."""
+"""Number of eager warm-up steps at each image size before a CUDA graph is captured: cuDNN selects algorithms, the optimizer allocates its
+state."""
 AHEAD = 8
-"""Replays of CUDA graphs that are queued, at most, so that the schedule's time is the device's."""
+"""Maximum number of enqueued CUDA graph launches. It bounds how far the host, whose clock the schedule follows, runs ahead of the GPU."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
 
 @cache
 def _constant(values: tuple[float | tuple[float, ...], ...], device: torch.device) -> torch.Tensor:
-    """Constants as float32 on a device, copied once: the host waits for each copy."""
+    """Constant float32 tensor, cached for each device: a copy from pageable memory would synchronize with the host at each use."""
     return torch.tensor(values, dtype=torch.float32, device=device)
 
 
@@ -206,16 +207,16 @@ def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) 
 
 
 class _Graph:
-    """CUDA graph of an update: inputs, their recorded work, and its loss."""
+    """CUDA graph of a training step with static input buffers."""
 
     def __init__(self, trainer: _Trainer, drawn: Sequence[torch.Tensor], half: bool) -> None:
         self.inputs, self.graph = [part.clone() for part in drawn], torch.cuda.CUDAGraph()
-        # Other threads, as of the renderer, may work with the device meanwhile.
+        # Other threads, such as the renderer's, may use the device during capture.
         with torch.cuda.graph(self.graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
             self.loss = trainer.update(self.inputs[0], self.inputs[1], half)
 
     def update(self, drawn: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Train on a batch; returns its loss."""
+        """Copy a batch to the input buffers and launch the graph. Returns the loss."""
         for own, part in zip(self.inputs, drawn, strict=True):
             own.copy_(part)
         self.graph.replay()
@@ -223,7 +224,7 @@ class _Graph:
 
 
 class _Trainer:
-    """One training: network, optimizer and schedule."""
+    """Training loop state: network, optimizer, learning rate schedule. Creating it seeds PyTorch and starts the clock."""
 
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
@@ -239,16 +240,16 @@ class _Trainer:
         self.losses: list[torch.Tensor] = []
         self.eager, self.graphs, self.queued = [0, 0], dict[bool, _Graph](), list[torch.cuda.Event]()
         self.waited = 0.0
-        """Time before the first step, in which the first views came [s]."""
+        """Time before the first step, in which the first part of the pool was filled [s]."""
 
     @property
     def progress(self) -> float:
-        """Fraction of the schedule: of the steps, or of the time where this is nearer to its end."""
+        """Elapsed fraction of the schedule: the larger of those of steps and of time."""
         left = max(self.recipe.seconds - self.waited, 1.0)
         return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
 
     def step(self, pool: Pool) -> None:
-        """Train on a batch."""
+        """Train on a batch drawn from the pool, and append its loss to `losses`."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         rate, group, half = self.recipe.rate * max(factor, LEAST_RATE), self.optimizer.param_groups[0], done < self.recipe.half
@@ -260,7 +261,7 @@ class _Trainer:
         self.losses.append(self._replay(drawn, half) if self.graphed else self.update(*drawn, half))
 
     def update(self, images: torch.Tensor, classes: torch.Tensor, half: bool) -> torch.Tensor:
-        """Update the network by a batch of a pool; returns its loss."""
+        """Augment a batch, and take one optimizer step on it. Returns the loss."""
         images, classes = _prepare(images, classes, self.recipe, half)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
@@ -273,7 +274,7 @@ class _Trainer:
         return loss.detach()
 
     def _replay(self, drawn: tuple[torch.Tensor, torch.Tensor], half: bool) -> torch.Tensor:
-        """Update the network by the graph of this size, which is recorded after the first steps."""
+        """`update` by the CUDA graph of this image size, which is captured after EAGER steps."""
         self.eager[half] += 1
         if self.eager[half] <= EAGER:
             return self.update(*drawn, half)
@@ -288,9 +289,9 @@ class _Trainer:
 
 
 def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int, pool: Pool | None = None) -> tuple[Trained, Pool]:
-    """Train a network on views of a stream: on the first of them once they are in the pool; the others come while it trains.
+    """Train a network on views of a stream. Training starts when a first part of the pool is filled; the rest is filled during training.
 
-    A `pool` that is given goes on to be filled: one of `recipe.views` views or more is trained on as it is.
+    If a `pool` is given, the stream adds the views that it lacks of `recipe.views`. Returns the trained network and the pool.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
@@ -301,7 +302,7 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
-        # As many views as the samples so far are for, batch by batch, until the stream has ended.
+        # Take batches from the stream, until it ends, as long as the replay ratio is exceeded.
         while len(trainer.losses) * recipe.batch >= pace * (pool.seen - first) and pool.fill(batches, pool.seen + 1):
             pass
         trainer.step(pool)

@@ -1,4 +1,4 @@
-"""Worker process of a GPU: carries out command lines of `tools.reports.real` one after another, with what they share prepared once."""
+"""Worker process of a GPU, which executes command lines of `tools.reports.real` sequentially and prepares their shared inputs once."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 
 class Worker:
-    """Handle of a worker process, which is started with the first run, and again after a run in which it ended.
+    """Handle of a worker process. It is started by the first run, and restarted by a run after one that failed.
 
-    A process holds out views, and loads kernels and photographs once. It ends with a run that fails, so that none inherits a broken device.
+    Held-out views, kernels and photographs are prepared once in a process. It exits after a failure, since its CUDA context may be corrupt.
     """
 
     def __init__(self, shared: list[str]) -> None:
-        """`shared`: arguments of all runs, by whose settings views are held out."""
+        """`shared`: arguments of all runs, which also determine the held-out views."""
         self.shared = shared
         self._process: BaseProcess | None = None
         self._connection: Any = None
 
     @property
     def ready(self) -> bool:
-        """Whether the process runs, so that the next run starts at once."""
+        """Whether the process is running."""
         return self._process is not None and self._process.is_alive()
 
     def run(self, arguments: list[str], log: Path, seconds: float) -> bool:
-        """Carry out a run; False: it failed, or was stopped after so many seconds. Its output goes to the file `log`."""
+        """Execute a run, with its output in the file `log`. Returns False if it failed, or was killed after `seconds`."""
         if not self.ready:
             self._connection, other = _CONTEXT.Pipe()
             # No daemon: it may start processes of its own, as CoACD's.
@@ -55,7 +55,7 @@ class Worker:
 
 
 def _serve(connection: Any, shared: list[str]) -> None:
-    """Loop of the process until its parent has ended. An error ends it, with a traceback in the log."""
+    """Main loop of the process, until the parent exits. An error ends it, with a traceback in the log."""
     with ExitStack() as stack:
         bench = None
         while True:

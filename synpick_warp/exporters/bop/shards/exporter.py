@@ -103,7 +103,7 @@ def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardConte
 
 
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:
-    """Write the index of the views and shards of those scenes that a split has; returns their numbers and the size of the shards."""
+    """Write the index of a split by reading its shards of these scenes. Returns the numbers of views and shards, and their size."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
     with output_errors(out / split):
         parts.parent.mkdir(exist_ok=True)
@@ -119,14 +119,14 @@ def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Seq
 
 
 def _join_keys(parts: Path, split: Path) -> list[Path]:
-    """Join the lines of all files in a folder to the index of a split, in order of their numbers; returns the files."""
+    """Write the index of a split by concatenating the files of a folder in numerical order. Returns these files."""
     paths = sorted(parts.iterdir(), key=lambda path: (len(path.name), path.name)) if parts.is_dir() else []
     write_atomically(split / KEYS_FILE, join_lines(paths, b"{", b"}\n"))
     return paths
 
 
 def _join_known(out: Path, name: str, split: Path) -> SplitContent:
-    """Write the index of a split from lines that were made in advance; returns as `_write_keys`."""
+    """Write the index of a split from the `index_lines` of its episodes, without reading shards. Returns as `_write_keys`."""
     known, shards, size, views = out / LINES / split, 0, 0, 0
     with output_errors(out / split):
         _join_keys(known / KEYS_FILE, out / split)
