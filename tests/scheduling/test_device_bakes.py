@@ -19,7 +19,8 @@ from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import QUICK
 
-EPISODES = 6
+EPISODES = 10
+"""So many that some are left when the process is killed, on a machine that is used by others, too."""
 SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": ["bop"], "arrangement.max_objects": 2, "render.layers": []}
 SETTINGS |= TINY_PICKS
 """Objects are the embedded ones: each process loads them for itself."""
