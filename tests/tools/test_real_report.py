@@ -274,7 +274,7 @@ def test_rows_go_on_after_one_that_fails(monkeypatch, tmp_path, capsys):
     names = ("there", "fails", "long", "goes on")
     jobs = [(ablation.Run(name, 8, seeds=1, rate=1e-3 if name == "long" else 1e3, limit=1e4), 0) for name in names]
     (tmp_path / "there_0.json").write_text(results(0.5))
-    options = argparse.Namespace(real="R", models="M", lights="L", gpus=1, deadline=200.0, out=tmp_path, pass_on=[])
+    options = argparse.Namespace(real="R", models="M", lights="L", gpus=1, processes=1, deadline=200.0, out=tmp_path, pass_on=[])
     assert ablation.Execution(jobs, options).run() == 1
     assert commands == [("cuda:0", "fails_0"), ("cuda:0", "goes_on_0"), ("cuda:0", "stop")]
     assert "left out: seed 0 of long" in capsys.readouterr().out

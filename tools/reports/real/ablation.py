@@ -1,10 +1,10 @@
 """Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
-Each row is a run of `tools.reports.real` for each seed. Runs start in order of priority on the next free GPU, the first seed of all rows
-before the second; a GPU's runs share a process. A run that cannot end by the deadline is skipped and printed as "left out". The rows with
-the most views are shortened instead, down to a minimum time; the results then name the time. Times of runs beside their training are
-estimated from those that have ended. Runs with results in --out are not repeated, and the summary is written after each run. Without
---out, only the schedule is printed. All rows are scored on the same photographs and on the same held-out views, those of all levers.
+Each row is a run of `tools.reports.real` for each seed. Runs start in order of priority on the next free GPU: the first seed of all rows
+before the second, less important rows last. A process of a GPU serves many runs. A run that cannot end by the deadline is skipped and
+printed as "left out". The rows with the most views are shortened instead, down to a minimum time; the results then name the time. Times of
+runs are estimated from those that have ended. Runs with results in --out are not repeated, and the summary is written after each run.
+Without --out, only the schedule is printed. All rows are scored on the same photographs and the same held-out views, those of all levers.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -92,6 +92,8 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "edge of the table": ("render.table_size=[0,0]",),
 }
 """Settings that switch a part of the randomization off, by its name."""
+LATE_LEVERS = ("contrast", "edge of the table")
+"""Levers whose rows come last: the one is a part of another, the other concerns a border of the picture."""
 
 
 @dataclass(frozen=True)
@@ -110,24 +112,27 @@ class Run:
     """Shortest time limit, used if less time is left [s]; infinite: the limit is fixed."""
     detector: float = 0.0
     """Training time of the detector, if there is enough time left [s]; 0: no detector."""
+    late: bool = False
+    """Whether its runs come after all seeds of the other rows."""
 
     @property
     def training(self) -> float:
         """Expected time of rendering and training together [s]."""
         return min(self.limit, FIRST_VIEWS + self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
-    def fit(self, left: float, start: float) -> Run | None:
+    def fit(self, left: float, start: float, slowdown: float = 1.0) -> Run | None:
         """Fit the run into the remaining time: shortened limit, and detector only if there is time for it.
 
         Args:
             left: Time until the deadline [s].
             start: Time of the run beside its training [s].
+            slowdown: Factor on the expected time of its training.
 
         Returns:
             The run; None if the time is too short.
         """
         room = left - SLACK * start
-        if room < min(self.limit, SLACK * self.training, self.least):
+        if room < min(self.limit, SLACK * slowdown * self.training, self.least):
             return None
         limit = min(self.limit, room)
         return replace(self, limit=limit, detector=self.detector if room - limit > self.detector else 0.0)
@@ -151,32 +156,33 @@ def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
     detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
     yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
+    yield Run("all levers, ablation's number of views", views)
     yield Run("tote, not randomized", views, ("--config", "synpick", *tote))
     yield Run("tote, randomized", views, ("--config", "randomized", *tote))
-    yield Run("all levers, ablation's number of views", views)
     for name, settings in LEVERS.items():
-        yield Run(f"without {name}", views, _settings(*settings))
-    yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
-    yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"))
-    yield Run("without JPEG", views, ("--jpeg", "0"))
+        yield Run(f"without {name}", views, _settings(*settings), late=name in LATE_LEVERS)
     yield Run("colour and depth", views, ("--depth",))
-    yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)))
-    yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
-    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=450.0, least=300.0)
-    yield Run("2,000 views, fast", 2000, seeds=2, passes=MIN_STEP_VIEWS / 2000)
     traced = _settings("render.mode=reference", "render.samples=64")
-    yield Run("2,000 views, path-traced", 2000, traced, 2, MIN_STEP_VIEWS / 2000, REFERENCE_RATE)
+    yield Run("2,000 views, path-traced", 2000, traced, passes=MIN_STEP_VIEWS / 2000, rate=REFERENCE_RATE)
+    yield Run("2,000 views, fast", 2000, passes=MIN_STEP_VIEWS / 2000)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
-    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=450.0, least=300.0)
+    yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
+    yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
+    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=450.0, least=300.0)
+    yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"), late=True)
+    yield Run("without JPEG", views, ("--jpeg", "0"), late=True)
+    yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)), late=True)
+    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=450.0, least=300.0, late=True)
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: all seeds of the first row, then the others by seed. The row `preferred` comes before all."""
+    """Runs in the order in which they start: all seeds of the first row, then the others by seed, last the late rows. The row `preferred`
+    comes before all."""
     first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
     rest = [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
-    return sorted(first + rest, key=lambda job: job[0].name != preferred)
+    return sorted(first + rest, key=lambda job: (job[0].name != preferred, job[0].late))
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
@@ -200,12 +206,15 @@ class Execution:
         """Number of runs that failed or were stopped at the deadline."""
         self.start = {False: START, True: BETWEEN}
         """Expected time of a run beside its training, in a process that is to be started and in one that runs [s]."""
+        self.slowdowns: list[float] = []
+        """Time of each ended training, as a multiple of the expected one."""
 
     def run(self) -> int:
         """Carry out the runs; returns how many failed or were stopped."""
-        with ThreadPoolExecutor(self.options.gpus) as threads:
+        gpus = [gpu for _ in range(self.options.processes) for gpu in range(self.options.gpus)]
+        with ThreadPoolExecutor(len(gpus)) as threads:
             try:
-                list(threads.map(self._serve, range(self.options.gpus)))
+                list(threads.map(self._serve, gpus))
             finally:
                 self.waiting = iter(())  # After an interruption, no thread starts another.
         return self.failed
@@ -220,7 +229,7 @@ class Execution:
         return time.monotonic() - self.started
 
     def _serve(self, gpu: int) -> None:
-        """Carry out runs on a GPU until no remaining run fits, or MAX_FAILURES in a row have failed."""
+        """Carry out runs by a process on a GPU until no remaining run fits, or MAX_FAILURES in a row have failed."""
         options = self.options
         shared = ["--real", options.real, "--models", options.models, "--lights", options.lights, "--device", f"cuda:{gpu}"]
         worker, failures = Worker([*shared, *options.pass_on]), 0
@@ -231,8 +240,9 @@ class Execution:
                 done = worker.run(run.command(seed, stem), stem.with_suffix(".log"), options.deadline - begun)
                 failures = 0 if done else failures + 1
                 self._finish(f"gpu {gpu}  seed {seed}  {run.name}", done)
-                beside = self.now - begun - spent(stem.with_suffix(".json")) - run.detector
-                self.start[ready] = max(self.start[ready], beside)
+                training = spent(stem.with_suffix(".json"))
+                self.start[ready] = max(self.start[ready], self.now - begun - training - run.detector)
+                self.slowdowns += [training / run.training] if done else []
         finally:
             worker.stop()
 
@@ -241,9 +251,10 @@ class Execution:
         with self.lock:
             for run, seed in self.waiting:
                 left = self.options.deadline - self.now
-                if fits := run.fit(left, self.start[ready]):
+                slowdown = max(self.slowdowns, default=float(self.options.processes))
+                if fits := run.fit(left, self.start[ready], slowdown):
                     return fits, seed
-                needed = self.start[ready] + run.training
+                needed = self.start[ready] + slowdown * run.training
                 print(f"left out: seed {seed} of {run.name} needs {needed:.0f} s, {left:.0f} s are left", flush=True)
             return None
 
@@ -300,6 +311,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--deadline", type=finite_seconds, default=1400.0, help="seconds after which nothing runs (default: 1400)")
     parser.add_argument("--views", type=positive_count, default=8000, help="views of the rows of the ablation (default: 8000)")
     parser.add_argument("--main-views", type=positive_count, default=24_000, help="views of the first row (default: 24000)")
+    text = "processes of each GPU: one trains while another starts its stream or is scored (default: 1)"
+    parser.add_argument("--processes", type=positive_count, default=1, help=text)
+    parser.add_argument("--skip", nargs="+", default=[], metavar="NAME", help="rows that are left out")
     parser.add_argument("--first", default="", metavar="NAME", help="row that starts before all others")
     parser.add_argument(
         "--choice", default=CHOICE, metavar="ARGUMENTS", help="network of the rows with the most views (default: %(default)s)"
@@ -309,9 +323,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     rows = list(plan(options.views, options.main_views, options.choice))
     jobs, names = order(rows, options.first), [run.name for run in rows]
-    if options.first and options.first not in names:
-        print(f"reports.real.ablation: --first is {options.first}; rows: {'; '.join(names)}", file=sys.stderr)
-        return 2
+    for flag, name in [("first", options.first), *(("skip", name) for name in options.skip)]:
+        if name and name not in names:
+            print(f"reports.real.ablation: --{flag} is {name}; rows: {'; '.join(names)}", file=sys.stderr)
+            return 2
+    jobs = [(run, seed) for run, seed in jobs if run.name not in options.skip]
     if options.out is None:
         print_plan(jobs, options.gpus, options.deadline)
         return 0
