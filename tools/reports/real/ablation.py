@@ -170,11 +170,11 @@ def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
-    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=450.0, least=300.0)
+    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=500.0, least=300.0)
     yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"), late=True)
     yield Run("without JPEG", views, ("--jpeg", "0"), late=True)
     yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)), late=True)
-    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=450.0, least=300.0, late=True)
+    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=500.0, least=300.0, late=True)
 
 
 def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
