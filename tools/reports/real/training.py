@@ -80,8 +80,6 @@ class Recipe:
     """Whether the network sees depth beside colours."""
     half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
-    compiled: bool = False
-    """Whether network and loss are compiled by `torch.compile`, which takes about 30 s."""
     graphed: bool = False
     """Whether steps are replayed as CUDA graphs, for which the host has next to nothing to do."""
 
@@ -234,8 +232,6 @@ class _Trainer:
         rate = torch.tensor(recipe.rate, device=device) if self.graphed else recipe.rate
         self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, fused=device.type == "cuda", capturable=self.graphed)
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
-        self.logits = torch.compile(self.network, dynamic=False) if recipe.compiled else self.network
-        self.loss = torch.compile(segmentation_loss, dynamic=False) if recipe.compiled else segmentation_loss
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.eager, self.graphs, self.queued = [0, 0], dict[bool, _Graph](), list[torch.cuda.Event]()
@@ -265,8 +261,8 @@ class _Trainer:
         images, classes = _prepare(images, classes, self.recipe, half)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self.logits(images)
-        loss = self.loss(logits, classes, self.recipe.dice)
+            logits = self.network(images)
+        loss = segmentation_loss(logits, classes, self.recipe.dice)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
