@@ -152,7 +152,7 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 
 def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
     """Yield all rows in order of priority. `choice`: arguments of the rows with the most views."""
-    most = ("--capacity", "40000", *choice.split())
+    most = ("--worlds", "1024", "--capacity", "40000", *choice.split())
     detector = DETECTOR if find_spec("torchvision") else 0.0
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
     yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
