@@ -28,6 +28,7 @@ from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from synpick_warp.views.picks import COLUMNS, STATES
 from tools.figures import figures_tables, newest_runs, pivot_table, read_runs
+from tools.options import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
@@ -121,17 +122,21 @@ def sensor_reference() -> str:
 
 def store_reference() -> str:
     """The README of the report on stores with its tables of figures; the rest is as committed."""
-    runs = newest_runs(read_runs())
-    return _with_results(STORE, {name: pivot_table(runs[f"store_{name}.json"]) for name in ("scale", "requests", "indices", "reading")})
+    runs, stages = newest_runs(read_runs()), ("scale", "requests", "indices", "reading", "two_gpus")
+    return _with_results(STORE, {name: pivot_table(runs[f"store_{name}.json"]) for name in stages})
 
 
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     runs = newest_runs(read_runs())
     table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
-    run = runs["photographs_ablation.json"]
-    objects = msgspec.structs.replace(run, shown=[row.name for row in run.rows if row.name.startswith("obj_id")])
-    return _with_results(PHOTOGRAPHS, {"photographs": table, "photographs_objects": pivot_table(objects)})
+    rows = [row for name in ("ablation", "most") for row in runs[f"photographs_{name}.json"].rows if row.name.startswith("obj_id")]
+    objects = msgspec.structs.replace(runs["photographs_ablation.json"], rows=rows, shown=[])
+    levers = runs["photographs_levers.json"]
+    columns = {row: row.name.removeprefix(f"{row.part}: ") + " [%]" * row.unit.startswith("%") for row in levers.rows}
+    turned = [Row(row.part, row.value, part=column) for row, column in columns.items() if row.name.startswith(row.part)]
+    pivots = {"objects": objects, "levers": msgspec.structs.replace(levers, rows=turned, shown=[])}
+    return _with_results(PHOTOGRAPHS, {"photographs": table} | {f"photographs_{name}": pivot_table(run) for name, run in pivots.items()})
 
 
 def _with_results(path: Path, tables: Mapping[str, str]) -> str:
