@@ -93,7 +93,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
 }
 """Settings that switch a part of the randomization off, by its name."""
 BRIGHTER = ("randomize.object_brightness={log_uniform=[0.6,3.0]}",)
-"""Settings chosen after the labelled frames were seen, whose foam brick is brighter than 95 % of ours: the row explains, and is no result."""
+"""Settings chosen after the labelled frames were seen, whose foam brick is brighter than 95 % of ours: they explain a score."""
 LATE_LEVERS = ("contrast", "edge of the table")
 """Levers whose rows come last: the one is a part of another, the other concerns a border of the picture."""
 
