@@ -463,13 +463,8 @@ class DataSet(Mapping[int, Episode]):
             yield from self._scenes.episodes()
 
     def _is_committed(self, index: int) -> bool:
-        """Whether an episode belongs to this selection and has a manifest entry; always, without manifest, as in a lone store.
-
-        Nothing but a whole number is an episode.
-        """
-        if not hasattr(index, "__index__"):
-            return False
-        if self._only is not None and index not in self._only:
+        """Whether an episode belongs to this selection and has a manifest entry; always, without manifest, as in a lone store."""
+        if not hasattr(index, "__index__") or (self._only is not None and index not in self._only):
             return False
         return self.found is not None or not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 

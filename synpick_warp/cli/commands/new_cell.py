@@ -34,6 +34,7 @@ from synpick_warp.system.inputs.files import read_file
 
 if TYPE_CHECKING:
     from synpick_warp.scenes.types import RawObject
+    from synpick_warp.system.progress import Progress
 
 CELL, PICTURE, PARTS, BINS = "cell.toml", "cell.png", "parts", "bins"
 _FOV, _RESOLUTION = 40.0, (640, 480)
@@ -115,17 +116,25 @@ def new_cell(
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
         cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
-
-        def say(note: str) -> None:
-            progress.note(escape(note.replace(str(stage), str(folder))))
-
-        if models:
-            progress.stage("reading objects")
-        objects = _write_cell(cell, escape(str(folder)), stage, say)
-        draw_cell(stage / CELL, f"{place.name}/{CELL}", stage / PICTURE, progress, say, objects)
+        _fill(cell, folder, stage, progress, calibration or [], f"{place.name}/{CELL}")
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
     print(f"bake it: synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA")
     return 0
+
+
+def _fill(cell: NewCell, folder: Path, stage: Path, progress: Progress, calibration: Sequence[Path], title: str) -> None:
+    """Write settings and picture of a cell into its staged folder; messages name `folder`."""
+
+    def say(note: str) -> None:
+        progress.note(escape(note.replace(str(stage), str(folder))))
+
+    if cell.models:
+        progress.stage("reading objects")
+    try:
+        objects = _write_cell(cell, escape(str(folder)), stage, say)
+    except ConfigError as error:
+        raise _named(error, calibration, stage / CELL) from None
+    draw_cell(stage / CELL, title, stage / PICTURE, progress, say, objects)
 
 
 def _check_folder(folder: Path, place: Path) -> None:
@@ -160,6 +169,8 @@ def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
         if file.is_dir():
             continue
         if file.suffix.lower() not in SUFFIXES:
+            if not os.path.lexists(file):
+                raise ConfigError(f"there is no file or folder {file}, which --part names")
             raise ConfigError(f"--part is {format_value(str(file))}; allowed: a file that ends in {', '.join(SUFFIXES)}, or a folder")
         if _refers(file):
             raise ConfigError(f"--part is {file}, which refers to other files; name its folder, which is then used where it is")
@@ -302,6 +313,14 @@ def _read_cameras(files: Sequence[Path], resolution: str | None, model: str, sta
             raise ConfigError(f"{file}: {error}") from None
         rows.append((row, given))
     return rows
+
+
+def _named(error: ConfigError, files: Sequence[Path], settings: Path) -> ConfigError:
+    """Error on a camera that names its calibration file, in place of the settings, which are not kept; others as they are."""
+    match = re.match(r"camera\[(\d+)\]", str(error))
+    if match is None or not files:
+        return error
+    return ConfigError(f"{files[int(match[1])]}: {error}".replace(f" in {settings}", ""))
 
 
 def _name_camera(stem: str, taken: Sequence[str]) -> str:
