@@ -107,7 +107,7 @@ _MEASURED: dict[str, Any] = {
     "matrix": ((610.0, 0.0, 325.4), (0.0, 609.2, 238.9), (0.0, 0.0, 1.0)),
     "distortion": (-0.12, 0.08, 0.0005, -0.0003, 0.0),
     "model": "pinhole",
-    "pose": Pose(matrix=((1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.2), (0.0, 0.0, 0.0, 1.0))),
+    "pose": Pose(matrix=((1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 1.5), (0.0, 0.0, 0.0, 1.0))),
     "jitter": Jitter(Distribution("normal", ((0.0,), (0.002,))), Distribution("normal", ((0.0,), (0.2,)))),
 }
 """Example of a camera with lens and pose by numbers, and with jitter of the pose about them."""

@@ -57,8 +57,8 @@ def load_config(
     Args:
         preset_or_file: Name of a preset (`preset_names`), or path of a file that ends in .toml; a file that names no preset builds on
             "synpick". None: the preset "synpick".
-        settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays. Paths are relative to the current folder; those
-            in a file to that file.
+        settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays (or tuples, arrays). Paths are relative to the
+            current folder; those in a file to that file.
         source: Where `settings` come from, for error messages.
         splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
             the [splits] of a file always hold.
@@ -75,8 +75,10 @@ def load_config(
     offered = values.pop(_OFFERED, None)
     if splits and offered and SPLITS not in values:
         values[SPLITS] = offered
+    if not isinstance(settings or {}, Mapping):
+        raise ConfigError(f"the settings passed are {format_value(settings)}; allowed: a dict, of full keys such as bake.episodes")
     for key, value in (settings or {}).items():
-        section, _, name = key.partition(".")
+        section, _, name = str(key).partition(".")
         if section == SPLITS:
             values[SPLITS] = (override_table(values.get(SPLITS, ({}, ""))[0], name, value, source), source)
         else:
@@ -261,8 +263,15 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
     for name, value in content.items():
         key = f"{section}.{name}"
         item, annotation = _setting(section, name, source)
-        values[key] = (check_value(key, value, item, annotation, source), source)
+        values[key] = (check_value(key, _plain(value), item, annotation, source), source)
     return values
+
+
+def _plain(value: Any) -> Any:
+    """A path as its name, and a number or an array of NumPy or PyTorch in Python's types; others as they are."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _check_section(section: str, source: str) -> None:
@@ -284,6 +293,8 @@ def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[An
     """Field and type of a setting; raises ConfigError if there is none of the name, with a hint."""
     _check_section(section, source)
     known = settings_of(sections()[section])
+    if not name:
+        raise ConfigError(f"{section} is a section, set {source}; set single keys, such as {section}.{next(iter(known))}")
     if name not in known:
         hint = suggest(name, list(known))
         keys = [f"{other}.{name}" for other, kind in sections().items() if name in settings_of(kind)]

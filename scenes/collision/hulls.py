@@ -13,8 +13,11 @@ from synpick_warp.scenes.types import ConvexPiece, HullSize
 
 # Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
-# Rows of the distance matrix that are computed at a time: fine round meshes have tens of thousands of hull vertices.
-_DISTANCE_ROWS = 1024
+# Entries of the distance matrix that are computed at a time.
+_DISTANCES = 2**24
+# Hull vertices of which all pairs are compared, some seconds; fine round meshes have hundreds of thousands. Of more, those from which the
+# farthest vertices are sought.
+_MOST_COMPARED, _SOUGHT_FROM = 2**15, 1024
 
 
 @dataclass(frozen=True)
@@ -34,9 +37,31 @@ def hull_size(points: np.ndarray) -> HullSize:
     hull = _hull_of(points)
     if hull is None:
         return HullSize(0.0, 0.0)
-    corners = hull.points[hull.vertices]
-    blocks = (corners[start : start + _DISTANCE_ROWS] for start in range(0, len(corners), _DISTANCE_ROWS))
-    return HullSize(float(hull.volume), max(float(cdist(block, corners).max()) for block in blocks))
+    return HullSize(float(hull.volume), _largest_distance(hull.points[hull.vertices]))
+
+
+def _largest_distance(corners: np.ndarray) -> float:
+    """Largest distance of two corners (N, 3) of a hull.
+
+    Of many, all are compared with some, then with the farthest of each, and so on until none is farther, which may find another one of
+    several nearly equal chords.
+    """
+    if len(corners) <= _MOST_COMPARED:
+        return _farthest(corners, corners)[0]
+    found, far = _farthest(corners[:: len(corners) // _SOUGHT_FROM], corners)
+    while (farther := _farthest(corners[far], corners))[0] > found:
+        found, far = farther
+    return found
+
+
+def _farthest(some: np.ndarray, corners: np.ndarray) -> tuple[float, np.ndarray]:
+    """Largest distance of a corner from one of some (n, 3), and the indices of the farthest corners from each."""
+    largest, far, rows = 0.0, [], max(1, _DISTANCES // len(corners))
+    for start in range(0, len(some), rows):
+        distances = cdist(some[start : start + rows], corners)
+        largest = max(largest, float(distances.max()))
+        far.append(distances.argmax(axis=1))
+    return largest, np.unique(np.concatenate(far))
 
 
 def hull_volume(points: np.ndarray) -> float:

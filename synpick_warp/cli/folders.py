@@ -281,10 +281,16 @@ def check_output_file(
 
 
 def open_split(folder: Path, split: str | None) -> DataSet:
-    """Open a data set, or one of its splits. Raises DatasetError if a baked one lacks its settings, or has no such split."""
+    """Open a data set, or one of its splits.
+
+    Raises DatasetError if a baked one lacks its settings or manifest, these are damaged, or it has no such split.
+    """
+    from synpick_warp.dataset.commit.manifest import read_manifest
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(folder)
     if data_set.found is None and not (folder / "config.toml").exists():
         raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
+    if (folder / "manifest").is_dir():
+        read_manifest(folder)
     return data_set if split is None else data_set.split(split)

@@ -194,9 +194,9 @@ class Episode(PickTables):
         from synpick_warp.dataset.view import View
 
         frames, cameras = len(self), self._data_set.camera_count
-        if not 0 <= camera < cameras:
+        if camera not in range(cameras):
             raise IndexError(f"there is no camera {camera}; there are {cameras} cameras")
-        if not -frames <= frame < frames:
+        if frame not in range(-frames, frames):
             raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
         if frame % frames not in (own := self.frames(camera)):
             raise IndexError(f"episode {self.index} has no picture of camera {camera} in frame {frame}; it has one every {own.step} frames")
@@ -464,7 +464,7 @@ class DataSet(Mapping[int, Episode]):
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode belongs to this selection and has a manifest entry; always, without manifest, as in a lone store."""
-        if self._only is not None and index not in self._only:
+        if not hasattr(index, "__index__") or (self._only is not None and index not in self._only):
             return False
         return self.found is not None or not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 

@@ -37,7 +37,7 @@ def resolve_settings(
     Raises:
         ConfigError: A setting is unknown or not allowed.
     """
-    given = {ARGUMENTS[name]: _plain(value) for name, value in arguments.items() if value is not None}
+    given = {ARGUMENTS[name]: value for name, value in arguments.items() if value is not None}
     if given.get("bake.worlds") == "auto":  # As the command line has it.
         given["bake.worlds"] = 0
     overrides = dict(settings) | given
@@ -45,10 +45,3 @@ def resolve_settings(
         return load_settings(config, overrides, splits=splits)
     config = override_config(config, overrides)
     return override_config(config, measure_meshes(config.bin, config.gripper))
-
-
-def _plain(value: object) -> object:
-    """Convert a value to its TOML equivalent: paths to strings, tuples to lists."""
-    if isinstance(value, Path):
-        return str(value)
-    return list(value) if isinstance(value, tuple) else value

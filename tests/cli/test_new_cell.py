@@ -13,6 +13,7 @@ import pytest
 import trimesh
 
 from synpick_warp.apps.viz.cell.frusta import project
+from synpick_warp.apps.viz.cell.poses import describe_blocked
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.cell.rig import intrinsics
 from synpick_warp.configs.files.cell_file import WIDTH
@@ -52,11 +53,11 @@ def opencv(path: Path, distortion=FIVE, matrix=K) -> Path:
 
 @pytest.fixture
 def drawn(monkeypatch) -> list[str]:
-    """Pictures are not rendered; titles of those asked for."""
+    """Pictures are not rendered; titles of those asked for, and parts that need not be read again."""
     titles: list[str] = []
 
-    def draw(file, name, out, say):
-        titles.append(name)
+    def draw(file, name, out, progress, say, objects):
+        titles.extend([name, *(raw.name for raw in objects or ())])
         out.write_bytes(b"")
 
     monkeypatch.setattr(new_cell, "draw_cell", draw)
@@ -146,6 +147,7 @@ def test_a_camera_is_that_of_its_calibration_and_sees_the_bin(tmp_path, drawn, f
         pixels, depth = project(camera, np.array(config.cell.bins[0].corners))
         assert (depth > 0.0).all()
         assert ((pixels > 0.0) & (pixels < (320.0, 240.0))).all()
+        assert not describe_blocked(config)
         # No farther than needed: the bin reaches a border that is kept free.
         assert np.min([pixels, (320.0, 240.0) - pixels]) < 0.06 * 320
     assert path.read_bytes() == before
@@ -168,7 +170,7 @@ def test_parts_are_copied_with_their_unit(tmp_path, drawn, offset, center):
     config = load_config(tmp_path / "cell" / "cell.toml")
     assert config.bake.models == str(tmp_path / "cell" / "parts")
     assert (config.objects.unit, config.objects.center, config.objects.symmetries) == ("mm", center, "detect")
-    assert drawn == ["cell/cell.toml"]
+    assert drawn == ["cell/cell.toml", "bracket"]
     (tmp_path / "cell").rename(tmp_path / "moved")
     assert load_config(tmp_path / "moved" / "cell.toml").bake.models == str(tmp_path / "moved" / "parts")
 
@@ -222,7 +224,10 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["c", "--calibration", "empty.yaml"], "empty.yaml is no calibration file"),
         (["c", "--calibration", "skew.yaml"], "skew.yaml (OpenCV): the camera matrix has skew"),
         (["c", "--calibration", "folds.yaml"], "folds.yaml: distortion "),
-        (["c", "--calibration", "swapped.yaml"], "camera[0].matrix is "),
+        (
+            ["c", "--calibration", "swapped.yaml"],
+            "swapped.yaml: camera[0].matrix is ",
+        ),
         (["c", "--calibration", "zivid.json"], "zivid.json does not say the image's size; add --resolution WIDTHxHEIGHT"),
         (["c", "--lens", "fish"], '--lens is "fish"; allowed: pinhole, fisheye; did you mean fisheye?'),
         (["c", "--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT'),
@@ -247,6 +252,7 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["c", "--bin", "bin.stl", "--bin-unit", "mm", "--part", "nut.stl"], "nut: too large for the bin"),
         (["c", "--bin", "b\udcff.stl", "--bin-unit", "mm"], "cannot write c/cell.toml: the name of a file or folder in it is not UTF-8"),
         (["c", "--part", "gone.stl"], "there is no file gone.stl"),
+        (["c", "--part", "gone"], "there is no file or folder gone, which --part names"),
         (["c", "--part", "empty.yaml"], '--part is "empty.yaml"; allowed: a file that ends in'),
         (["c", "--part", "a.obj"], "--part is a.obj, which refers to other files; name its folder"),
         (["c", "--part", "nut.stl"], "nut: too large for the bin"),
@@ -282,7 +288,7 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, drawn, a
 
 @pytest.mark.parametrize("exists", [False, True])
 def test_nothing_is_half_written(tmp_path, monkeypatch, exists):
-    def fail(file, name, out, say):
+    def fail(*_):
         raise LightError("no light")
 
     monkeypatch.setattr(new_cell, "draw_cell", fail)
@@ -291,6 +297,6 @@ def test_nothing_is_half_written(tmp_path, monkeypatch, exists):
         folder.mkdir(parents=True)
     assert mistake("new-cell", folder) == "no light"
     assert list(tmp_path.rglob("*")) == ([folder.parent, folder] if exists else [])
-    monkeypatch.setattr(new_cell, "draw_cell", lambda file, name, out, say: out.write_bytes(b""))
+    monkeypatch.setattr(new_cell, "draw_cell", lambda file, name, out, *_: out.write_bytes(b""))
     assert run("new-cell", folder).code == 0
     assert sorted(path.name for path in folder.iterdir()) == ["cell.png", "cell.toml"]

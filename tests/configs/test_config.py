@@ -8,6 +8,7 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -144,6 +145,33 @@ def test_paths_and_no_arguments_do_as_names_do(tmp_path):
     assert load_config(Path(write(tmp_path, 'preset = "smoke"\n'))) == load_config("smoke", {})
     with pytest.raises(ConfigError, match=r"^bake.worlds is -1 in the settings passed; allowed: at least 0, at most 65536$"):
         load_config("smoke", {"bake.worlds": -1})
+
+
+def test_values_of_other_libraries_are_read_as_pythons():
+    given = {
+        "bake.episodes": np.int64(3),
+        "physics.friction": np.float32(0.5),
+        "cameras.resolution": np.array([64, 48]),
+        "bake.models": Path("m"),
+    }
+    config = load_config("smoke", given)
+    assert (config.bake.episodes, config.physics.friction, config.cameras.resolution) == (3, 0.5, (64, 48))
+    assert config.bake.models == "m"
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"bake": {"episodes": 1}}, "bake is a section, set in the settings passed; set single keys, such as bake.mode"),
+        ("bake.episodes=1", 'the settings passed are "bake.episodes=1"; allowed: a dict, of full keys such as bake.episodes'),
+        ({1: 2}, "there is no section 1, set in the settings passed; sections: bake, "),
+        ({"bake.episodes": np.array([1, 2])}, "bake.episodes is [1, 2] in the settings passed; allowed: a whole number"),
+    ],
+)
+def test_settings_that_are_no_dict_of_keys_are_named(settings, said):
+    with pytest.raises(ConfigError) as caught:
+        load_config("smoke", settings)
+    assert str(caught.value).startswith(said)
 
 
 def test_whole_numbers_are_allowed_for_floats():

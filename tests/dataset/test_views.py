@@ -127,6 +127,14 @@ def test_views_come_frame_by_frame_and_end_with_the_last(data):
         data[0].view(FRAMES)
     with pytest.raises(IndexError, match="there is no camera 3"):
         data[0].view(0, camera=3)
+    for wrong in ("x", 1.0, None, slice(0, 1), 99, -1):
+        assert wrong not in data
+        with pytest.raises(KeyError, match="has no episode"):
+            data[wrong]
+    with pytest.raises(IndexError, match="there is no camera left; there are"):
+        data[0].view(0, camera="left")
+    with pytest.raises(IndexError, match="episode 0 has no frame x"):
+        data[0].view("x")
 
 
 def test_an_episode_without_manifest_entry_is_not_listed(tmp_path):

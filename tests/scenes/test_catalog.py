@@ -11,12 +11,14 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.distance import cdist
 
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes import catalog
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.collision import hulls
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
@@ -339,6 +341,15 @@ def test_the_diameter_is_the_largest_distance(seed, count):
     points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     distances = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=-1)
     assert hull_size(points).diameter == pytest.approx(distances.max(), rel=1e-12)
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0), (3.0, 1.0, 1.0), (1.0, 1.0, 0.1), (1.0, 1.02, 1.01)])
+def test_of_many_hull_vertices_not_all_are_compared(monkeypatch, scale):
+    points = trimesh.creation.icosphere(4).vertices * scale
+    diameter = hull_size(points).diameter
+    monkeypatch.setattr(hulls, "_MOST_COMPARED", 100)
+    monkeypatch.setattr(hulls, "cdist", lambda some, others: cdist(some, others) if len(some) < 2000 else pytest.fail("all"))
+    assert hull_size(points).diameter == pytest.approx(diameter, rel=1e-3)
 
 
 def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):

@@ -149,6 +149,8 @@ def test_an_unfinished_set_says_how_much_is_there(copy):
         ("train/000000/scene_camera.json", '{"0": 1e999}', "{path} is damaged: "),
         ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": 3}, "attempts": []}', "{path} is damaged: "),
         ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": "pick"}, "attempts": [{}]}', "{path} is damaged: "),
+        ("manifest.json", "{", "{path} is damaged: "),
+        ("manifest.json", None, "{folder} has no manifest.json; "),
         ("config.toml", None, "{folder} has no config.toml; "),
         ("config.toml", "splits = 3", "splits is 3 in {path}; "),
         ("train/000000/depth/000000.png", "nothing", "{path} is not an image"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_camera, footprint, image_border, project, rays
+from synpick_warp.apps.viz.cell.poses import describe_blocked
 from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.configs.files.load import load_config
@@ -126,6 +127,20 @@ def test_what_a_camera_covers_is_said():
     assert lines[1].endswith(", pinhole 5 coefficients")
     assert describe_camera(TOP, "top", tote)[2] == "2.00 m to the floor, 20 mm/px; 8 of 8 corners of the tote in view"
     assert "; 0 of 8 corners" in describe_camera(camera(80, 60, 100.0, (3.0, 0.0, 2.0)), "off", tote)[2]
+
+
+@pytest.mark.parametrize(
+    ("settings", "blocked"),
+    [
+        ({"cameras.positions": [[0.0, 0.0, 2.0], [0.1, 0.1, 1.0], [0.4, 0.0, 1.0]]}, [1]),
+        ({"cameras.positions": [[0.0, 0.0, 2.0], [0.1, 0.1, 1.0], [0.4, 0.0, 1.0]], "bake.mode": "move"}, []),
+        ({"pick.lift_height": 2.0, "bins.kind": "none"}, [0]),
+    ],
+)
+def test_a_camera_in_the_way_of_the_gripper_is_named(settings, blocked):
+    lines = describe_blocked(load_config("smoke", {"bake.mode": "pick"} | settings))
+    assert [int(line[14]) for line in lines] == blocked
+    assert all(line.startswith("camera camera_") and " stands over the t" in line for line in lines)
 
 
 def test_a_camera_on_the_gripper_is_where_the_gripper_is_drawn():

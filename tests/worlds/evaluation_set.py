@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 
 FRAMES = 4
 CAMERAS = 3
@@ -63,7 +64,7 @@ def write_evaluation_set(folder: Path) -> Path:
     assert len(config.cameras.positions) == CAMERAS
     (folder / "config.toml").write_text(config_to_toml(config))
     (folder / "manifest").mkdir()
-    (folder / "manifest.json").write_text("{}")
+    (folder / "manifest.json").write_bytes(encode_manifest(make_manifest(config)))
     random = np.random.default_rng(7)
     for episode, mode in enumerate(MODES):
         row = {"episode": episode, "mode": mode, "frames": FRAMES, "ending": "finished"}

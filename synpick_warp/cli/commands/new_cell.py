@@ -7,11 +7,11 @@ import os
 import re
 import shlex
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -31,6 +31,10 @@ from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickE
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import read_file
+
+if TYPE_CHECKING:
+    from synpick_warp.scenes.types import RawObject
+    from synpick_warp.system.progress import Progress
 
 CELL, PICTURE, PARTS, BINS = "cell.toml", "cell.png", "parts", "bins"
 _FOV, _RESOLUTION = 40.0, (640, 480)
@@ -94,13 +98,14 @@ def new_cell(
 
     Exit codes: 0; 2, DIR is not empty, or a file or size cannot be used; then nothing is written.
     """
-    from synpick_warp.apps.viz.cell.poses import pose_for
-
     place = Path(os.path.realpath(folder))
     _check_folder(folder, place)
     _check_parts(parts := part or [], unit)
     shape = _read_bin(bin_, bin_unit, bin_up)
-    with _staged(folder, place) as stage:
+    from synpick_warp.apps.viz.cell.poses import pose_for
+    from synpick_warp.cli.display import make_console, make_progress
+
+    with _staged(folder, place) as stage, make_progress(make_console()) as progress:
         copied = [file for file in parts if not file.is_dir()]
         for file in copied:
             _copy(file, stage / PARTS)
@@ -111,11 +116,25 @@ def new_cell(
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
         cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
-        _write_cell(cell, escape(str(folder)), stage)
-        draw_cell(stage / CELL, f"{place.name}/{CELL}", stage / PICTURE, lambda note: escape(note.replace(str(stage), str(folder))))
+        _fill(cell, folder, stage, progress, calibration or [], f"{place.name}/{CELL}")
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
     print(f"bake it: synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA")
     return 0
+
+
+def _fill(cell: NewCell, folder: Path, stage: Path, progress: Progress, calibration: Sequence[Path], title: str) -> None:
+    """Write settings and picture of a cell into its staged folder; messages name `folder`."""
+
+    def say(note: str) -> None:
+        progress.note(escape(note.replace(str(stage), str(folder))))
+
+    if cell.models:
+        progress.stage("reading objects")
+    try:
+        objects = _write_cell(cell, escape(str(folder)), stage, say)
+    except ConfigError as error:
+        raise _named(error, calibration, stage / CELL) from None
+    draw_cell(stage / CELL, title, stage / PICTURE, progress, say, objects)
 
 
 def _check_folder(folder: Path, place: Path) -> None:
@@ -150,6 +169,8 @@ def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
         if file.is_dir():
             continue
         if file.suffix.lower() not in SUFFIXES:
+            if not os.path.lexists(file):
+                raise ConfigError(f"there is no file or folder {file}, which --part names")
             raise ConfigError(f"--part is {format_value(str(file))}; allowed: a file that ends in {', '.join(SUFFIXES)}, or a folder")
         if _refers(file):
             raise ConfigError(f"--part is {file}, which refers to other files; name its folder, which is then used where it is")
@@ -294,6 +315,14 @@ def _read_cameras(files: Sequence[Path], resolution: str | None, model: str, sta
     return rows
 
 
+def _named(error: ConfigError, files: Sequence[Path], settings: Path) -> ConfigError:
+    """Error on a camera that names its calibration file, in place of the settings, which are not kept; others as they are."""
+    match = re.match(r"camera\[(\d+)\]", str(error))
+    if match is None or not files:
+        return error
+    return ConfigError(f"{files[int(match[1])]}: {error}".replace(f" in {settings}", ""))
+
+
 def _name_camera(stem: str, taken: Sequence[str]) -> str:
     """Name of a camera after its file, which differs from those that are taken."""
     name = re.sub(r"[^a-z0-9_]+", "_", stem.lower()).strip("_")
@@ -301,8 +330,9 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
     return next(each for each in (name, *(f"{name}_{number}" for number in range(2, 1000))) if each not in taken)
 
 
-def _write_cell(cell: NewCell, name: str, stage: Path) -> None:
-    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin.
+def _write_cell(cell: NewCell, name: str, stage: Path, say: Callable[[str], None]) -> list[RawObject] | None:
+    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin; returns the
+    parts, None: the embedded objects. `say` is called with each line on them.
 
     Raises:
         SynpickError: A setting, or a part, cannot be used.
@@ -313,20 +343,26 @@ def _write_cell(cell: NewCell, name: str, stage: Path) -> None:
         (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
         return load_settings(stage / CELL)
 
-    def largest(cell: NewCell) -> float:
-        config = write(cell)
+    def read(cell: NewCell) -> list[RawObject]:
+        config, lines = write(cell), []
         objects = replace(config.objects, strict=cell.models == PARTS)
-        return max(raw.hull.volume for raw in read_objects(config.bake.models, objects, config.object_rows, config.cell.bins))
+        found = read_objects(config.bake.models, objects, config.object_rows, config.cell.bins, lines.append)
+        for line in lines:
+            say(line)
+        return found
 
     if not cell.models:
         write(cell)
-        return
+        return None
     try:
-        volume = largest(cell)
-    except CatalogError as error:
-        cell = replace(cell, center=True)
         try:
-            volume = largest(cell)
-        except CatalogError:
-            raise CatalogError(str(error).replace('objects.unit = "', '--unit "')) from None
-    write(replace(cell, volume=2.0 * volume))
+            found = read(cell)
+        except CatalogError as error:
+            if "objects.center" not in str(error):
+                raise
+            cell = replace(cell, center=True)
+            found = read(cell)
+    except CatalogError as error:
+        raise CatalogError(str(error).replace('objects.unit = "', '--unit "')) from None
+    write(replace(cell, volume=2.0 * max(raw.hull.volume for raw in found)))
+    return found

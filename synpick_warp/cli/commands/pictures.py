@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -14,6 +14,10 @@ from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError, escape
 from synpick_warp.scenes.bin_meshes.loading import load_settings
+
+if TYPE_CHECKING:
+    from synpick_warp.scenes.types import RawObject
+    from synpick_warp.system.progress import Progress
 
 
 def preview(
@@ -120,32 +124,45 @@ def _preview_cell(cell: str, out: Path | None) -> int:
 
     check_picture_name(sheet)
     check_output_file(sheet, "--out", inputs=[Path(cell)])
-    draw_cell(cell, Path(cell).name, sheet)
+    from synpick_warp.cli.display import make_console, make_progress
+
+    with make_progress(make_console()) as progress:
+        draw_cell(cell, Path(cell).name, sheet, progress, lambda note: progress.note(escape(note)))
     print(f"cell: {escape(str(sheet))}")
     return 0
 
 
-def draw_cell(preset_or_file: str | Path, name: str, out: Path, say: Callable[[str], str] = escape) -> None:
-    """Draw the cell of settings, as of `load_settings`, with the progress on the console.
+def draw_cell(
+    preset_or_file: str | Path,
+    name: str,
+    out: Path,
+    progress: Progress,
+    say: Callable[[str], None],
+    objects: Sequence[RawObject] | None = None,
+) -> None:
+    """Draw the cell of settings, as of `load_settings`.
 
     Args:
         preset_or_file: As of `load_settings`.
         name: What the sheet is of, for its title.
         out: PNG or JPEG file to write.
-        say: Words a note.
+        progress: Receives stages.
+        say: Called with each note.
+        objects: Objects of the settings; None: they are read.
 
     Raises:
         SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
     """
     config = load_settings(preset_or_file)
+    from synpick_warp.apps.viz.cell.poses import describe_blocked
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
-    from synpick_warp.cli.display import make_console, make_progress
 
-    with make_progress(make_console()) as progress:
-        scene = CellScene(config, progress, lambda note: progress.note(say(note)))
-        progress.stage(f"rendering {len(config.rig)} cameras")
-        write_cell_sheet(scene, config.rig, config.bins, name, out)
+    scene = CellScene(config, progress, say, objects)
+    for line in describe_blocked(config):
+        say(line)
+    progress.stage(f"rendering {len(config.rig)} cameras")
+    write_cell_sheet(scene, config.rig, config.bins, name, out)
 
 
 def explain(

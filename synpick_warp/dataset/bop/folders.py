@@ -15,7 +15,7 @@ class Listing:
     """Names in a folder. Files are read by these names only, so that no link leads a reader out of the data set."""
 
     root: Path
-    """The data set, resolved."""
+    """The data set, as the user names it."""
     place: str
     """The folder, relative to the root; "" is the root."""
     files: frozenset[str] = frozenset()
@@ -52,7 +52,7 @@ def list_folder(root: Path, place: str = "") -> Listing:
     """List a folder of a data set.
 
     Args:
-        root: The data set, resolved.
+        root: The data set.
         place: The folder, relative to the root.
 
     Raises:
@@ -78,7 +78,7 @@ def list_folder(root: Path, place: str = "") -> Listing:
 def _leads_inside(root: Path, link: str) -> bool:
     """Whether a symbolic link leads to something inside the data set."""
     try:
-        target = Path(link).resolve(strict=True)
+        target, place = Path(link).resolve(strict=True), root.resolve()
     except (OSError, RuntimeError):
         return False
-    return target != root and target.is_relative_to(root)
+    return target != place and target.is_relative_to(place)

@@ -60,7 +60,7 @@ class Layout:
         """
         if not folder.is_dir():
             raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")
-        self.root = folder.resolve()
+        self.root = folder
         self.listing = list_folder(self.root)
         self._refuse_parts(folder)
         self.models = {name: self.listing.enter(name) for name in sorted(filter(MODELS.fullmatch, self.listing.folders))}

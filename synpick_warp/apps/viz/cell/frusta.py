@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.cell.rendering import Picture
 from synpick_warp.apps.viz.drawing import Image, put_text, text_size
 from synpick_warp.scenes.types import Camera
+
+if TYPE_CHECKING:
+    from synpick_warp.apps.viz.cell.rendering import Picture
 
 Color = tuple[int, int, int]
 """Blue, green, red."""

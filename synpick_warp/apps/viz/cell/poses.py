@@ -3,28 +3,63 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from synpick_warp.apps.viz.cell.frusta import project
-from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
+from synpick_warp.apps.viz.cell.frusta import center, project
+from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Cameras, Pose
 from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.episodes.manipulation import Pick
+from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.cameras import make_cameras
 
-_DIRECTIONS = ((-90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))
+_DIRECTIONS = ((90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))
 """Azimuth and elevation from which the cameras look at the bin [°]: the first from above."""
+_STEP, _LOWEST = 5.0, 40.0
+"""Elevations at which a camera is tried that would stand in the gripper's way, and the lowest [°]."""
 _FARTHEST, _MARGIN = 20.0, 0.05
 """Largest distance of a camera [m], and free border of its image around the bin, as a fraction of its sides."""
 
 
 def pose_for(row: CameraRow, index: int, sizes: BinSizes) -> Pose:
-    """Pose from which a camera sees all of a bin, as near as it can: the first from above, the others from the sides."""
-    azimuth, elevation = (math.radians(angle) for angle in _DIRECTIONS[index % len(_DIRECTIONS)])
+    """Pose from which a camera sees all of a bin, as near as it can: the first from above, the others from the sides, as steep as they can
+    without standing in the gripper's way."""
+    azimuth, elevation = _DIRECTIONS[index % len(_DIRECTIONS)]
+    up = (0.0, 1.0, 0.0) if index % len(_DIRECTIONS) == 0 else (0.0, 0.0, 1.0)
+    while True:
+        pose = _nearest(row, math.radians(azimuth), math.radians(elevation), up, sizes)
+        if elevation <= _LOWEST or not is_in_way(pose.position or (), sizes, Gripper(), Pick()):
+            return pose
+        elevation -= _STEP
+
+
+def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
+    """Whether the gripper passes through a place while it picks from a bin: a camera there sees nothing but its shaft meanwhile."""
+    top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
+    aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
+    return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
+
+
+def describe_blocked(config: Config) -> list[str]:
+    """Lines on cameras in the gripper's way, unless it never picks."""
+    if config.bake.mode == "move":
+        return []
+    noun = config.cell.bins[0].noun
+    return [
+        f"camera {name} stands over the {noun}, where the gripper passes in picking: it then sees only its shaft; move it aside or up"
+        for name, camera in zip(config.rig.names, make_cameras(config.rig), strict=True)
+        if camera.fixed_to == WORLD and any(is_in_way(center(camera), bin, config.gripper, config.pick) for bin in config.cell.bins)
+    ]
+
+
+def _nearest(row: CameraRow, azimuth: float, elevation: float, up: tuple[float, float, float], sizes: BinSizes) -> Pose:
+    """Pose in a direction [rad] from which a camera sees all of a bin, as near as it can."""
     back = (math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation))
     target = (0.0, 0.0, round(sizes.height / 2.0, 3))
-    up = (0.0, 1.0, 0.0) if index % len(_DIRECTIONS) == 0 else (0.0, 0.0, 1.0)
 
     def pose(distance: float) -> Pose:
         x, y, z = (round(end + distance * step, 3) + 0.0 for end, step in zip(target, back, strict=True))

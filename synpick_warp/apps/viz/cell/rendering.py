@@ -61,8 +61,10 @@ class Laid:
 class CellScene:
     """Scene of a cell before simulation: bins, gripper and objects, rendered from any camera."""
 
-    def __init__(self, config: Config, progress: Progress, report: Callable[[str], None]) -> None:
-        """Read the objects, and build the scene.
+    def __init__(
+        self, config: Config, progress: Progress, report: Callable[[str], None], objects: Sequence[RawObject] | None = None
+    ) -> None:
+        """Build the scene of some objects; None: they are read.
 
         Raises:
             SynpickError: Device, bins, cameras or all objects cannot be used.
@@ -73,8 +75,10 @@ class CellScene:
         bins = make_bins(self.sizes)
         for line in (line for one in bins for line in one.notes):
             report(line)
-        progress.stage("reading objects")
-        self.objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
+        if objects is None:
+            progress.stage("reading objects")
+            objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
+        self.objects = objects
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
         catalog = Catalog(tuple(map(_entry, self.objects)))
         light = next(sky for sky in skies() if sky.name == _SKY)
