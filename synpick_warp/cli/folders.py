@@ -205,12 +205,16 @@ _fetched: dict[Path, tuple[str, TemporaryDirectory[str]]] = {}
 
 def _fetch(url: str) -> Path:
     """Copy a data set in an object store into a temporary folder, which `drop_fetched` deletes; returns the copy's folder."""
+    from rich.console import Console
+
+    from synpick_warp.cli.display import CountProgress
     from synpick_warp.cloud.reading import copy_set
 
     place = TemporaryDirectory(prefix="synpick-read-")
     folder = Path(place.name) / url.rpartition("/")[2]
     _fetched[folder] = url, place
-    copy_set(url, folder)
+    with CountProgress(Console(stderr=True, highlight=False)) as counter:
+        copy_set(url, folder, report=counter.report)
     return folder
 
 
@@ -264,6 +268,9 @@ def check_output_file(
     Raises:
         OutputError: It does.
     """
+    from synpick_warp.exporters.writing.files import check_local
+
+    check_local(out, option)
     try:
         place = out.parent.resolve() / out.name
         roots = [folder for folder in place.parents if is_data_set(folder)]

@@ -54,7 +54,7 @@ from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickEr
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.inputs.urls import as_url
 from synpick_warp.system.processes.garbage import collection_paused
-from synpick_warp.system.processes.interrupt import KeptInterrupt
+from synpick_warp.system.processes.interrupt import KeptInterrupt, raising_sigterm
 
 if TYPE_CHECKING:
     from synpick_warp.cloud.crew import Crew
@@ -195,18 +195,18 @@ def bake(
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
     profiles = profile or profile_out is not None
-    several = parse_devices(devices, device, profiles)
-    names = parse_splits(split)
+    several, names = parse_devices(devices, device, profiles), parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
+    _check_store_options(out, claim=claim, shard=shard, profile=profiles)
+    crew = parse_engine(engine, workers, price, out, devices or shard, claim)
     if out is None:
         from synpick_warp.dataset.commit.manifest import make_manifest
 
         out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
         print(choice, flush=True)
-    _check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    run = partial(_bake, resolved, out, part, names, several, claim, parse_engine(engine, workers, price, out, devices or shard, claim))
+    run = partial(_bake, resolved, out, part, names, several, claim, crew)
     return _profiled(run, profile_out, out) if profiles else run()
 
 
@@ -318,7 +318,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     """Run the command line; mistakes are one line on the standard error, except those of the standard output."""
     try:
-        with KeptInterrupt():
+        with raising_sigterm(), KeptInterrupt():
             return app(arguments, exit_on_error=False, print_error=False) or 0
     except StreamError:
         return EXIT_MISTAKE
@@ -351,7 +351,7 @@ def _resolve(
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
-def _check_store_options(out: Path, *, claim: bool, shard: str | None, profile: bool) -> None:
+def _check_store_options(out: Path | None, *, claim: bool, shard: str | None, profile: bool) -> None:
     """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
     if claim and as_url(out) is None:
         raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
@@ -447,7 +447,8 @@ def _bake(
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
     if summary.stopped:
-        done = f"{len(summary.episodes)} of {summary.total} episodes are complete"
+        kind = "claimed episodes" if (claim or crew) and not devices else "episodes"
+        done = f"{len(summary.episodes)} of {summary.total} {kind} are complete"
         print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)
         return EXIT_SIGNAL + summary.stopped
     delivered = sum(1 for row in summary.episodes if row[2].delivers)

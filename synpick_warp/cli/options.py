@@ -122,7 +122,7 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
     return tuple(name.strip() for name in devices.split(","))
 
 
-def parse_engine(engine: str | None, workers: int, price: float, out: Path, beside: str | None, claims: bool = False) -> Crew | None:
+def parse_engine(engine: str | None, workers: int, price: float, out: Path | None, beside: str | None, claims: bool = False) -> Crew | None:
     """Parse --engine, --workers and --price; None: none is named. `beside`: value of an option that an engine excludes; `claims`: --claim
     is given, whose workers on --devices have a price, too.
 

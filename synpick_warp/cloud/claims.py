@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -207,6 +207,8 @@ class Chunks:
             chunk: Proposed number of episodes of a whole chunk; that of the worker that starts first counts for all.
         """
         self._ledger, self.claims, self._ranges = ledger, claims, ranges
+        self.on_wait: Callable[[], object] = lambda: None
+        """Called when a wait for other workers begins."""
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
         self._place = f"{CLAIMS}/{name}"
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))
@@ -225,15 +227,18 @@ class Chunks:
 
     def __iter__(self) -> Iterator[Chunk]:
         """Yield claimed chunks; waits while other workers have the leases on all others. The caller calls `done`, or ends the claim."""
-        pauses = self.claims.pauses()
+        pauses = None
         while True:
             chunk, are_over = self.take()
             if are_over:
                 return
             if chunk is None:
+                if pauses is None:
+                    pauses = self.claims.pauses()
+                    self.on_wait()
                 time.sleep(next(pauses))
                 continue
-            pauses = self.claims.pauses()
+            pauses = None
             if chunk.episodes:
                 yield chunk
             else:

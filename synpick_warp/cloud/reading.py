@@ -52,7 +52,7 @@ class Copier:
     """Downloader: copies objects of a data set into a folder, under the same names."""
 
     def __init__(self, url: str, folder: Path) -> None:
-        self.store: Store = open_store(url)
+        self.store: Store = open_store(url, make=False)
         self.folder = folder
 
     def fetch(self, name: str, digest: str | None = None) -> bool:
@@ -85,18 +85,22 @@ class Copier:
                 part.unlink()
         return True
 
-    def fetch_all(self, names: dict[str, str | None]) -> None:
+    def fetch_all(self, names: dict[str, str | None], report: Report = lambda unit, done, total: None) -> None:
         """Download objects in parallel, given their SHA-256 by name (None: unchecked). Missing objects are skipped."""
         with ThreadPoolExecutor(FILES_AT_ONCE, "download") as pool:
-            list(pool.map(lambda item: self.fetch(*item), names.items()))
+            for done, _ in enumerate(pool.map(lambda item: self.fetch(*item), names.items()), 1):
+                report("files copied", done, len(names))
 
     def fetch_records(self) -> None:
         """Download manifest and settings.
 
         Raises:
             DatasetError: There is no manifest.
+            StoreError: There is no bucket.
         """
         if not self.fetch(MANIFEST_FILE):
+            with contextlib.suppress(FileNotFoundError):
+                self.store.get(MANIFEST_FILE)  # Raises StoreError if there is no bucket, which HEAD does not tell.
             raise DatasetError(f"{self.store.url} has no {MANIFEST_FILE}; name the prefix of a data set that synpick-warp baked")
         self.fetch(CONFIG_FILE)
         (self.folder / ENTRIES).mkdir(exist_ok=True)
@@ -112,13 +116,16 @@ class Copier:
                 yield int(match[1])
 
 
-def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True) -> None:
+def copy_set(
+    url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True, report: Report = lambda unit, done, total: None
+) -> None:
     """Download a whole data set into a new folder.
 
     Args:
         url: Its prefix.
         folder: The folder, which is made.
         wanted: Predicate: whether a file is copied, by its name.
+        report: Progress callback.
 
     Raises:
         DatasetError: It is no data set, or larger than FREE_PART of the free space there.
@@ -138,7 +145,7 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
                 f"{url} has more than the {free / 1e9:.1f} GB that may be copied to {folder.parent}; set TMPDIR to a larger disk, or read "
                 "it by synpick_warp.open, which keeps a few episodes at a time"
             )
-    copier.fetch_all(dict.fromkeys(names))
+    copier.fetch_all(dict.fromkeys(names), report)
 
 
 def verify_store(url: str, report: Report = lambda unit, done, total: None) -> Verdict:
@@ -157,10 +164,10 @@ def verify_store(url: str, report: Report = lambda unit, done, total: None) -> V
         try:
             read_settings(folder, manifest)
             episodes = sorted(copier.episodes())
-            for entry in (CONSTANTS, *map(episode_entry, episodes), INDICES):
+            for done, entry in enumerate((CONSTANTS, *map(episode_entry, episodes), INDICES)):
                 checked, listed = _verify_entry(copier, entry)
                 files += checked
-                report("files", files, files)
+                report("episodes", min(done, len(episodes)), len(episodes))
                 if entry == INDICES:
                     finished = listed == episodes
         except (ConfigError, DatasetError) as error:
@@ -312,7 +319,7 @@ def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = 
 def list_shards(url: str) -> list[str]:
     """List the URLs of a set's webdataset shards, sorted, also those of episodes that are not committed. `stream_shards` lets
     `webdataset.WebDataset` read them without a copy."""
-    store = open_store(url)
+    store = open_store(url, make=False)
     return [f"{store.url}/{name}" for name, _ in store.list("") if re.fullmatch(r"[^/]+_web/shard-[0-9]+\.tar", name)]
 
 
@@ -350,7 +357,7 @@ def open_stream(url: str, mode: str = "rb", *_: object, **__: object) -> IO[byte
     if "r" not in mode:
         raise StoreError(f"{url} can be streamed for reading only; write to a local file")
     place, _slash, name = url.rpartition("/")
-    return _Stream(open_store(place).blocks(name))  # type: ignore[return-value]
+    return _Stream(open_store(place, make=False).blocks(name))  # type: ignore[return-value]
 
 
 def stream_shards() -> None:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -93,7 +94,7 @@ def bake_into_store(
         place = Path(name)
         if claims is None or not ledger.finished():
             baker = bake or keeping_baker()
-            for work in _works(ledger, place, claims, ranges, workers):
+            for work in _works(ledger, place, claims, ranges, workers, progress):
                 with work:
                     part = _bake(ledger, place, work, progress, devices, baker)
                 if _take(summary, part):
@@ -244,7 +245,9 @@ def _take(summary: BakeSummary, part: BakeSummary) -> bool:
     return summary.stopped != 0
 
 
-def _works(ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[range], workers: int) -> Iterator[_Work]:
+def _works(
+    ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[range], workers: int, progress: Progress
+) -> Iterator[_Work]:
     """Yield the episode source of each bake; arguments as of `bake_into_store`. With claims, ends when the whole plan is done."""
     if claims is None:
         for number, episodes in enumerate(_chunks(ledger, ranges)):
@@ -252,6 +255,7 @@ def _works(ledger: Ledger, place: Path, claims: Claims | None, ranges: Sequence[
         return
     planned = sum(map(len, ranges))
     chunks = plan_chunks(ledger, claims, ranges)
+    chunks.on_wait = partial(progress.stage, "waiting for episodes that other workers have claimed")
     limit = max(HELD_CHUNKS * chunks.sizes.chunk, -(-planned // workers) if workers else 0)
     for chunk in chunks:
         yield _Work(ledger, place, chunk, chunks, min(limit, planned))
@@ -293,9 +297,13 @@ def _bake(ledger: Ledger, place: Path, work: _Work, progress: Progress, devices:
         work.report(progress)
         delivery.check()
 
+    def deliver() -> None:
+        progress.stage("uploading finished episodes")
+        delivery.finish()
+
     try:
         with Delivery(ledger, folder, work.permit, work.delivered) as delivery:
-            summary = bake(ledger.config, folder, WatchedProgress(progress, check), work, devices, delivery.finish)
+            summary = bake(ledger.config, folder, WatchedProgress(progress, check), work, devices, deliver)
         work.report(progress)
         summary.total -= len(work.lost)
         summary.episodes = [row for row in summary.episodes if row.episode not in work.lost]

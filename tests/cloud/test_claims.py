@@ -112,11 +112,13 @@ def test_a_worker_without_work_asks_little_and_each_lease_once(memory, monkeypat
         store.put(chunks._key(number), msgspec.json.encode(claims._Lease(others.owner, time.time() + 100.0)))
     monkeypatch.setattr(store, "create", lambda key, data, real=store.create: asked.append(key) or real(key, data))
     monkeypatch.setattr(store._obs, "list", lambda *a, real=store._obs.list, **given: asked.append("list") or real(*a, **given))
-    pauses = iter(range(3))
+    pauses, waits = iter(range(3)), []
+    chunks.on_wait = lambda: waits.append(len(asked))
     monkeypatch.setattr(claims.time, "sleep", lambda seconds: next(pauses))
     with pytest.raises(RuntimeError):  # Of the iterator, when the pauses end.
         next(iter(chunks))
     assert asked.count("list") == 4 * 2
+    assert len(waits) == 1
     assert len(set(asked) - {"list"}) == len(asked) - 8 == 4 * claims.CHECKS
 
 
@@ -215,7 +217,7 @@ def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
 def test_a_worker_leaves_chunks_to_others_and_gives_up_what_it_holds(workers, most, memory, tmp_path):
     """Of 64 episodes in chunks of two, at most; of a worker of two the half."""
     store = open_store(memory)
-    works = run._works(Ledger(store, tiny(64), Probe(0.0, True)), tmp_path, Claims(store, 0.0), [range(64)], workers)
+    works = run._works(Ledger(store, tiny(64), Probe(0.0, True)), tmp_path, Claims(store, 0.0), [range(64)], workers, SilentProgress())
     with next(works) as held:
         found, end = list(held), time.monotonic() + 30.0
         while len(found) < most and time.monotonic() < end:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import pickle
+import signal
 import tempfile
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
+from synpick_warp.cli.main import main
 from synpick_warp.cloud import reading
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError, StoreError
@@ -116,7 +118,41 @@ def test_outputs_of_commands_are_in_the_current_folder(sets, place):
     assert run("convert", url, "--to", "coco", "--threads", "1").code == 0
     assert run("convert", folder, "--to", "coco", "--threads", "1", "--out", place / "local").code == 0
     assert files(place / "here" / "set-coco") == files(place / "local")
+    (place / "a.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n0,0,1,1.0,1 0 0 0 1 0 0 0 1,0 0 2000,0.1\n")
+    assert f"# BOP scores by the BOP toolkit need a copy of {url}" in run("eval", url, "--results", place / "a.csv").out
     assert list((place / "temporary").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("convert", "SET", "--to", "coco", "--out", "S3://b/x"), "--out is s3://b/x; only bake writes into object stores"),
+        (("preview", "SET", "--out", "s3://b/x.png"), "--out is s3://b/x.png; only bake writes into object stores"),
+        (("merge", "SET", "--out", "s3://b/x"), "--out is s3://b/x; only bake writes into object stores"),
+        (("merge", "s3://b/one", "--out", "x"), "s3://b/one is in an object store, where all of --shard fill one prefix"),
+        (("new-cell", "s3://b/x"), "DIR is s3://b/x; only bake writes into object stores"),
+        (("bake", "--claim"), "--claim shares out the episodes of a prefix in an object store; name one by --out"),
+    ],
+    ids=lambda each: each[0] if isinstance(each, tuple) else "",
+)
+def test_outputs_are_in_no_store_and_no_folder_is_named_like_one(picked_set, place, arguments, said):
+    ran = run(*(picked_set if each == "SET" else each for each in arguments))
+    assert (ran.code, ran.out) == (2, "")
+    assert said in ran.err
+    assert list((place / "here").iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["stats", "verify"])
+def test_a_command_that_is_to_end_deletes_its_copy(sets, place, monkeypatch, command):
+    monkeypatch.setattr(reading.Copier, "fetch_records", lambda self: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(SystemExit, match="143"):
+        main([command, sets[0]])
+    assert list((place / "temporary").iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_bucket_that_is_not_there_is_told(prefix, place):
+    assert "no-bucket/a/manifest.json: there is no such bucket" in mistake("stats", "s3://no-bucket/a")
 
 
 def test_damage_is_named_by_its_address(sets, place, monkeypatch):

@@ -205,9 +205,12 @@ def test_a_generation_is_compared_where_the_store_tells_one(memory, monkeypatch)
     assert modes == [{"e_tag": '"a"', "version": "1"}]
 
 
-def test_what_fails_for_good_ends_in_one_line(server, prefix):
-    server.fault = lambda method, path: "403 AccessDenied"
-    with pytest.raises(StoreError, match="credentials may not do that"):
+@pytest.mark.parametrize(
+    ("fault", "said"), [("403 AccessDenied", "credentials may not do that"), ("403 InvalidAccessKeyId", "does not accept the credentials")]
+)
+def test_what_fails_for_good_ends_in_one_line(server, prefix, fault, said):
+    server.fault = lambda method, path: fault
+    with pytest.raises(StoreError, match=said):
         open_store(prefix).put("key", b"data")
 
 
@@ -218,6 +221,7 @@ def test_what_fails_for_good_ends_in_one_line(server, prefix):
         ("gs://bucket/a", "gs://bucket/a"),
         (Path("file:///data/x"), "file:///data/x"),
         (Path("s3://"), "s3://"),
+        (Path("S3://Bucket/a"), "s3://Bucket/a"),
         ("folder/x", None),
         (Path("/a:b/c"), None),
         (None, None),

@@ -192,6 +192,14 @@ def test_a_damaged_batched_mark_is_named(memory):
             bake(memory)
 
 
+def test_what_is_refused_leaves_nothing_in_a_folder(tmp_path):
+    (tmp_path / "notes").write_text("")
+    with pytest.raises(OutputError, match="is not empty: it has notes"):
+        bake(f"file://{tmp_path}")
+    assert "typo is no folder; name one that is" in mistake("verify", f"file://{tmp_path}/typo")
+    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
+
+
 def test_a_prefix_in_another_set_is_refused(prefix):
     bake(prefix, tiny(1))
     with pytest.raises(OutputError, match=r"in the data set s3://.*/sets/one"):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
+from synpick_warp.cli.folders import check_output_file, find_data_set, has_images, name_fetched
 from synpick_warp.cli.options import WholeNumber, check_range
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, format_value
@@ -343,6 +343,8 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path], targets: Path | 
     """
     cameras = len(data_set.sensors)
     folder = data_set.folder.absolute()
+    if (url := name_fetched(str(folder))) != str(folder):
+        return escape(f"# BOP scores by the BOP toolkit need a copy of {url} on this machine, of which eval prints the command")
     name, ending = toolkit_name(data_set), toolkit_ending(data_set)
     lines = [f"# BOP scores by the BOP toolkit, once `{name}` is in its dataset_params.py:"]
     if name != folder.name:

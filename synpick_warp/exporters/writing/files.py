@@ -11,6 +11,7 @@ from pathlib import Path
 
 from synpick_warp.errors import OutputError
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.urls import as_url
 
 PARTIAL = ".partial"
 """Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically.
@@ -35,6 +36,7 @@ def check_output_folder(out: Path) -> None:
     Raises:
         OutputError: The folder holds something other than a data set, lies in another data set, or cannot be created or written.
     """
+    check_local(out, "--out")
     _check_outside(out)
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
@@ -58,6 +60,12 @@ def check_output_folder(out: Path) -> None:
         for folder in created:
             with contextlib.suppress(OSError):
                 folder.rmdir()
+
+
+def check_local(out: Path, option: str) -> None:
+    """Raise OutputError if an option names a place in an object store, into which only a bake writes."""
+    if (url := as_url(out)) is not None:
+        raise OutputError(f"{option} is {url}; only bake writes into object stores: name a path on this machine, and copy it there")
 
 
 def _check_outside(out: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?", re.DOTALL)
+_URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?", re.DOTALL | re.IGNORECASE)
 
 
 def as_url(place: Path | str | None) -> str | None:
-    """Normalize a URL: restores the slash that `Path` drops from "://", and strips those at the end. None: the place is a folder."""
+    """Normalize a URL: lower-case scheme, the slash that `Path` drops from "://", and none at the end. None: the place is a folder."""
     match = _URL.fullmatch(str(place)) if place is not None else None
     if match is None:
         return None
-    scheme, rest = match[1], match[2] or ""
+    scheme, rest = match[1].lower(), match[2] or ""
     return f"{scheme}://{'/' if scheme == 'file' else ''}{rest.rstrip('/')}"

@@ -1,4 +1,4 @@
-"""Interrupts: a KeyboardInterrupt that no library swallows, and graceful shutdown of a bake, whose first signal requests a stop.
+"""Interrupts: a KeyboardInterrupt that no library swallows, SIGTERM as an exception, and graceful shutdown of a bake, on the first signal.
 
 SIGTERM is the signal by which job schedulers announce the end of a job's time.
 """
@@ -10,6 +10,7 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from types import FrameType
 from typing import Self
 
@@ -101,6 +102,26 @@ class KeptInterrupt:
         while error is not None and error is not self._raised:
             error = error.__context__
         return error is not None
+
+
+@contextlib.contextmanager
+def raising_sigterm() -> Iterator[None]:
+    """Context manager in which SIGTERM raises SystemExit with the shell's code, so that temporary files are deleted on its way.
+
+    Where SIGTERM is ignored or handled otherwise, and in any thread but the main one, it does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def end(number: int, _: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 class StopRequest:

@@ -26,9 +26,12 @@ class FileSystemStore:
         """Open the file system; some connect. Raises StoreError: a package is not installed, or the URL cannot be opened."""
         try:
             fsspec = importlib.import_module("fsspec")
+        except ImportError:
+            raise StoreError(f"{url} needs the package fsspec; install it by pip install 'synpick-warp[cloud]'") from None
+        try:
             self._files, root = fsspec.core.url_to_fs(url)
         except ImportError as error:
-            raise StoreError(f"{url} needs a package that is not installed: {error}; pip install 'synpick-warp[cloud]'") from None
+            raise StoreError(f"{url} needs a package that is not installed: {_text(error)}") from None
         except Exception as error:  # Some connect, and each library has errors of its own.
             raise StoreError(f"{url} cannot be opened: {_text(error)}") from None
         self.url, self._root = url.rstrip("/"), str(root).rstrip("/")

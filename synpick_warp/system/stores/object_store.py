@@ -24,6 +24,7 @@ PART_BYTES, PARTS_AT_ONCE = 16 << 20, 4
 PAGE = 1000
 """Keys of a page of a listing: as many as S3 answers with."""
 _INSTALL = "install it by pip install 'synpick-warp[cloud]'"
+_SET_CREDENTIALS = "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
 _ADVICE = (
     (
         ("NoSuchBucket", "bucket does not exist", "NoSuchContainer", "ContainerNotFound"),
@@ -31,15 +32,16 @@ _ADVICE = (
     ),
     (("RequestTimeTooSkewed",), "the clock of this machine differs from the store's by more than the store allows; set it (NTP)"),
     (
-        ("AccessDenied", "status code: 403", "PermissionDenied", "Permission denied"),
-        "the credentials may not do that; give them the right to read, list and write there",
+        ("InvalidAccessKeyId", "SignatureDoesNotMatch", "InvalidToken", "ExpiredToken", "status code: 401", "Unauthenticated"),
+        _SET_CREDENTIALS,
     ),
     (
-        ("InvalidAccessKeyId", "SignatureDoesNotMatch", "status code: 401", "Unauthenticated", "credentials", "169.254.169.254"),
-        "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+        ("AccessDenied", "status code: 403", "PermissionDenied", "Permission denied"),
+        "the credentials may not do that; give them the right to read, list and write there, or set those that have it",
     ),
+    (("credentials", "169.254.169.254"), _SET_CREDENTIALS),
 )
-"""Signs in an error's text, and the advice for it; the first match counts."""
+"""Signs in an error's text, and the advice for it; the first match counts. Answers to HEAD have a status code alone."""
 _PASSING = (
     "status code: 5",
     "status code: 429",
@@ -85,7 +87,7 @@ class ObjectStore:
         if scheme == "memory":
             return _memories.setdefault(rest, self._kinds.MemoryStore())
         if scheme == "file":
-            return self._kinds.LocalStore(rest, mkdir=True)
+            return self._kinds.LocalStore(rest, mkdir=True, automatic_cleanup=True)
         if scheme in ("s3", "s3a"):
             _check_credentials(url)
         endpoint = _find_endpoint() if scheme in ("s3", "s3a") else ""

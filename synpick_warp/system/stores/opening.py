@@ -30,20 +30,25 @@ class Probe(NamedTuple):
     """Whether the store has conditional writes and honours them."""
 
 
-def open_store(url: str) -> Store:
+def open_store(url: str, *, make: bool = True) -> Store:
     """Open the object store of a URL. Object stores are sent no request; file systems of fsspec may connect, and file:// makes its folder.
+
+    Args:
+        url: Its prefix.
+        make: Whether file:// may make its folder, in one that is there; otherwise the folder itself must be there.
 
     Raises:
         StoreError: A package or credentials are missing, or the URL names no bucket, has a part "." or "..", an unknown scheme, or with
-            file:// no folder to be in.
+            file:// no folder to be.
     """
     scheme, _, rest = url.partition("://")
     if not {".", ".."}.isdisjoint(rest.split("/")):
         raise StoreError(f"{url} has a part . or ..; name a prefix without")
     if not rest.strip("/"):
         raise StoreError(f"{url} names no bucket; name one with a prefix, such as s3://bucket/prefix")
-    if scheme == "file" and not Path(rest).parent.is_dir():
-        raise StoreError(f"{url} cannot be opened: {Path(rest).parent} is no folder; make it")
+    needed = Path(rest).parent if make else Path(rest)
+    if scheme == "file" and not needed.is_dir():
+        raise StoreError(f"{url} cannot be opened: {needed} is no folder; {'make it' if make else 'name one that is'}")
     return ObjectStore(url) if scheme in OBJECT_STORES else FileSystemStore(url)
 
 
