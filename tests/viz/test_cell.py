@@ -138,7 +138,8 @@ def test_what_a_camera_covers_is_said():
     ],
 )
 def test_a_camera_in_the_way_of_the_gripper_is_named(settings, blocked):
-    lines = describe_blocked(load_config("smoke", {"bake.mode": "pick"} | settings))
+    config = load_config("smoke", {"bake.mode": "pick"} | settings)
+    lines = describe_blocked(config.bake.mode, config.rig, config.cell.bins, config.gripper, config.pick)
     assert [int(line[14]) for line in lines] == blocked
     assert all(line.startswith("camera camera_") and " stands over the t" in line for line in lines)
 

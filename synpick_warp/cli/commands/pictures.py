@@ -159,7 +159,7 @@ def draw_cell(
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
 
     scene = CellScene(config, progress, say, objects)
-    for line in describe_blocked(config):
+    for line in describe_blocked(config.bake.mode, config.rig, config.cell.bins, config.gripper, config.pick):
         say(line)
     progress.stage(f"rendering {len(config.rig)} cameras")
     write_cell_sheet(scene, config.rig, config.bins, name, out)

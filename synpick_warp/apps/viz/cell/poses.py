@@ -14,7 +14,6 @@ from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.episodes.manipulation import Pick
-from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.cameras import make_cameras
 
 _DIRECTIONS = ((90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))
@@ -44,15 +43,14 @@ def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gri
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 
-def describe_blocked(config: Config) -> list[str]:
-    """Lines on cameras in the gripper's way, unless it never picks."""
-    if config.bake.mode == "move":
-        return []
-    noun = config.cell.bins[0].noun
+def describe_blocked(mode: str, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
+    """Lines on cameras in the gripper's way while it picks from any of the bins; none in mode move."""
+    named = zip(rig.names, make_cameras(rig), strict=True) if mode != "move" else ()
+    fixed = ((name, center(camera)) for name, camera in named if camera.fixed_to == WORLD)
     return [
-        f"camera {name} stands over the {noun}, where the gripper passes in picking: it then sees only its shaft; move it aside or up"
-        for name, camera in zip(config.rig.names, make_cameras(config.rig), strict=True)
-        if camera.fixed_to == WORLD and any(is_in_way(center(camera), bin, config.gripper, config.pick) for bin in config.cell.bins)
+        f"camera {name} stands over the {bins[0].noun}, where the gripper passes in picking: it then sees only a shaft; move it aside or up"
+        for name, place in fixed
+        if any(is_in_way(place, each, gripper, pick) for each in bins)
     ]
 
 
