@@ -25,8 +25,8 @@ from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
 from tests.harness.exporter_contract import digests
 from tests.harness.processes import children, kill_after, wait_for
 
-KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
-"""Kills of the test at random times; the long form has 200."""
+KILLS, PARTS = int(os.environ.get("SYNPICK_KILLS", 20)), 2
+"""Kills of the test at random times, of which the long form has 200, and number of tests among which they are divided."""
 WRITERS_KILLED = 0.25
 """Fraction of these kills that meet a writer."""
 EPISODES = TINY["bake.episodes"]
@@ -49,21 +49,22 @@ def expected(whole) -> dict[str, str]:
 
 
 @pytest.mark.slow(minutes=3)
-def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
+@pytest.mark.parametrize("part", range(PARTS))
+def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path, part):
     """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake ends in between, another folder is
     begun. The longest time to a kill is at most twice the time of any bake that ends: a machine may be busy while the first is timed.
     The first finds other values in allocated memory: none may reach the files."""
-    numbers = random.Random(0)
+    numbers, wanted = random.Random(part), -(-KILLS // PARTS)
     started = time.monotonic()
     assert server.bake(tmp_path / "timed", allocated=0x7F) == 0
     longest = time.monotonic() - started
     assert digests(tmp_path / "timed") == expected
     kills = finished = 0
-    while kills < KILLS or (tmp_path / f"set {finished}").exists():
+    while kills < wanted or (tmp_path / f"set {finished}").exists():
         out = tmp_path / f"set {finished}"
         started = time.monotonic()
         process = server.start(out)
-        if kills < KILLS:
+        if kills < wanted:
             kill_after(process, numbers.uniform(0.0, longest), writer=numbers.random() < WRITERS_KILLED)
         code = server.wait()
         assert code in (0, -signal.SIGKILL, EXIT_MISTAKE)
