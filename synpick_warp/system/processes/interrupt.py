@@ -106,7 +106,7 @@ class KeptInterrupt:
 
 @contextlib.contextmanager
 def raising_sigterm() -> Iterator[None]:
-    """Context manager in which SIGTERM raises SystemExit with the shell's code, so that temporary files are deleted on its way.
+    """Context manager that turns SIGTERM into SystemExit with exit code 143, as shells report it, so that clean-up code runs.
 
     Where SIGTERM is ignored or handled otherwise, and in any thread but the main one, it does nothing.
     """

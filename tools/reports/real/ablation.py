@@ -272,7 +272,7 @@ class Execution:
 
 
 def spent(path: Path) -> float:
-    """Time of a training and its stream, read from its results [s]; infinite if there are none."""
+    """Duration of a training with its stream by its results file [s]; infinite without one."""
     return json.loads(path.read_text())["more"]["seeds"][0]["seconds"] if path.exists() else math.inf
 
 

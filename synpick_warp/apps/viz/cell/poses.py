@@ -37,18 +37,18 @@ def pose_for(row: CameraRow, index: int, sizes: BinSizes) -> Pose:
 
 
 def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
-    """Whether the gripper passes through a place while it picks from a bin: a camera there sees nothing but its shaft meanwhile."""
+    """Whether a position is in the gripper's swept volume in picks from a bin: a camera there sees nothing but the shaft meanwhile."""
     top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
     aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 
 def describe_blocked(mode: str, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
-    """Lines on cameras in the gripper's way while it picks from any of the bins; none in mode move."""
+    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none in mode move, which does not pick."""
     named = zip(rig.names, make_cameras(rig), strict=True) if mode != "move" else ()
     fixed = ((name, center(camera)) for name, camera in named if camera.fixed_to == WORLD)
     return [
-        f"camera {name} stands over the {bins[0].noun}, where the gripper passes in picking: it then sees only a shaft; move it aside or up"
+        f"camera {name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
         for name, place in fixed
         if any(is_in_way(place, each, gripper, pick) for each in bins)
     ]
