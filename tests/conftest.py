@@ -14,6 +14,7 @@ import pytest
 import warp as wp
 from hypothesis import settings
 
+from synpick_warp.exporters.writing import pool
 from synpick_warp.system.hardware.device import pick_device, start_warp
 from tests.harness.devices import VARIABLE
 
@@ -51,6 +52,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
+    # Beside other tests, which keep all cores busy, niced writers get a tenth of a core, and the bakes wait for them.
+    pool.NICENESS = 0
 
 
 @pytest.hookimpl(trylast=True)

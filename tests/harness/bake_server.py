@@ -120,11 +120,13 @@ def arguments(request: dict) -> list[str]:
 
 def _serve() -> None:
     from synpick_warp.cli import main as commands
+    from synpick_warp.exporters.writing import pool
     from synpick_warp.factory import assembly, pipeline
     from tests.harness.made_once import made_once
 
     once = made_once()
     once.__enter__()  # Forks inherit what a bake in this process has made.
+    pool.NICENESS = 0  # Beside other tests, which keep all cores busy, niced writers get a tenth of a core, and each bake waits for them.
     assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
     os.dup2(2, 1)

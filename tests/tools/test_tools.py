@@ -145,7 +145,8 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert bench.main([*small, "--json", str(file), *SHORT_PICKS]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {row["part"] for row in rows} == {"setup", *bench.DEFAULT_PARTS}
-    assert all(row["value"] >= 0.0 for row in rows)
+    # The space used of a file system, whose difference this row divides, changes with the files of other tests as well.
+    assert all(row["value"] >= 0.0 for row in rows if row["name"] != "size of a view on disk")
     printed = capsys.readouterr().out
     rows_of_stages = ("views, all stages", "picking, steps alone", "perception and planning: fraction of simulation and rendering")
     writers = ("bop, 1 process: views", "bop, 1 process: CPU time per view, writers, kernel", "shards, 1 process: cores in use")

@@ -17,7 +17,7 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
-from synpick_warp.exporters.writing.pool import NICENESS, QUEUE_DEPTH, WriterPool, WriteTask
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from tests.harness.environment import checkout_environment
 from tests.harness.processes import wait_until_gone
@@ -286,14 +286,15 @@ def test_a_process_that_dies_while_idle_is_reported(tmp_path):
         kill_one(tmp_path / "a")
 
 
-def test_processes_ignore_ctrl_c_and_never_import_the_simulator(tmp_path):
+def test_processes_are_niced_ignore_ctrl_c_and_never_import_the_simulator(tmp_path, monkeypatch):
+    monkeypatch.setattr(pool_module, "NICENESS", 7)
     with WriterPool(1, SIZE) as pool:
         (writer,) = pool.pids()
         assert os.getpgid(writer) != os.getpgid(0)
         pool.submit(interrupt, (), (tmp_path / "modules",), path=tmp_path)
         pool.submit(note, (), (tmp_path / "after", "x"), path=tmp_path)
         pool.wait()
-        assert os.getpriority(os.PRIO_PROCESS, writer) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+        assert os.getpriority(os.PRIO_PROCESS, writer) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + 7)
     assert (tmp_path / "after").exists()
     assert not {"warp", "newton", "trimesh"} & set((tmp_path / "modules").read_text().split())
 
