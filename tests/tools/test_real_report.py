@@ -30,6 +30,18 @@ from tools.reports.real.views import Pool  # noqa: E402
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
 
 
+def test_a_crop_has_the_pixels_of_a_part_of_the_image():
+    classes = torch.arange(48)[:, None] * 100 + torch.arange(64)
+    images = classes[None, None].float().expand(5, 4, -1, -1)
+    torch.manual_seed(0)
+    crops, labels = warp_views(images / 1e4, classes.expand(5, -1, -1), dataclasses.replace(RECIPE, scale=1.0, rotation=0.0), crop=0.5)
+    assert crops.shape == (5, 4, 24, 32)
+    assert len({int(one[0, 0]) for one in labels}) > 1
+    assert ((labels[:, 1:] - labels[:, :-1]) == 100).all()
+    assert ((labels[:, :, 1:] - labels[:, :, :-1]) == 1).all()
+    assert ((crops[:, 0] * 1e4 - labels).abs() <= 51).all()
+
+
 def test_scores_of_a_known_prediction():
     truth = np.zeros((2, 10), np.uint8)
     truth[0, :4], truth[1, :2] = 1, 2

@@ -31,6 +31,7 @@ except ModuleNotFoundError as missing:
 
 from rich.console import Console
 
+from synpick_warp.configs.cell.rig import resized
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
@@ -47,7 +48,7 @@ PRESET = "tabletop-train"
 """Default preset of the stream."""
 VIEWS_PER_BATCH = 48
 """Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
-RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0), "half": number_in(0.0, 1.0)}
+RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0), "half": number_in(0.0, 1.0), "crop": number_in(0.1, 1.0)}
 """Argument types of the options that are not just non-negative numbers."""
 SCALES = (0.8, 1.0, 1.25)
 """Factors of the image's size over which predictions are averaged for `Outcome.averaged`: within those of the augmentation."""
@@ -146,6 +147,10 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config = configure(options, fixed)
+    if options.enlarge > 1:
+        factor = options.enlarge
+        rows = [resized(row, (factor * width, factor * height)) for row in config.rig.rows for width, height in [row.resolution or (0, 0)]]
+        config = replace(config, camera=tuple(rows))
     return Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
 
 
@@ -269,6 +274,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "batch": (16, "views of a batch"),
         "width": (48, "channels of the network's first level"),
         "stride": (2, "every n-th frame of an episode is taken"),
+        "enlarge": (1, "factor by which the resolution of all cameras is enlarged"),
         "shrink": (1, "factor by which the stream's images are reduced"),
         "capacity": (48_000, "views in the pool, at most"),
         "held_out": (400, "synthetic views to measure on"),
@@ -286,6 +292,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
         "half": (Recipe.half, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
+        "crop": (Recipe.crop, "sides of random crops for the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():

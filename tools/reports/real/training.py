@@ -1,7 +1,7 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
-AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, mirrored
-borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
+AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, crop,
+mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
 from __future__ import annotations
@@ -80,6 +80,8 @@ class Recipe:
     """Whether the network sees depth beside colours."""
     half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
+    crop: float = 1.0
+    """Sides of the random crop that the rest of the schedule trains on, as a fraction of the image's."""
     graphed: bool = False
     """Whether steps are replayed as CUDA graphs, for which the host has next to nothing to do."""
 
@@ -99,15 +101,18 @@ class Trained:
     """Views trained on, repeats counted."""
 
 
-def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe) -> tuple[torch.Tensor, torch.Tensor]:
+def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Geometric augmentation of images (B, 3 or 4, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored
-    borders. Depth, the fourth channel, is of the nearest pixel, and becomes less as objects become larger."""
+    borders, and a random crop whose sides are the fraction `crop` of H and W. Depth, the fourth channel, is of the nearest pixel, and
+    becomes less as objects become larger."""
     count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle, aspect = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation), height / width
-    cosine, sine, reach = factor * angle.cos(), factor * angle.sin(), (factor - 1).abs()
+    covered = factor * crop
+    cosine, sine, reach = covered * angle.cos(), covered * angle.sin(), (covered - 1).abs()
     rows = [torch.stack([cosine, -sine * aspect, reach * draw[2]], 1), torch.stack([sine / aspect, cosine, reach * draw[3]], 1)]
-    grid = functional.affine_grid(torch.stack(rows, 1), [count, 1, height, width], align_corners=False)
+    size = [count, 1, *(BLOCK * round(side * crop / BLOCK) if crop < 1 else side for side in (height, width))]
+    grid = functional.affine_grid(torch.stack(rows, 1), size, align_corners=False)
     depth = functional.grid_sample(images[:, 3:], grid, "nearest", "reflection", align_corners=False) * factor.view(-1, 1, 1, 1)
     images = functional.grid_sample(images[:, :3], grid, "bilinear", "reflection", align_corners=False)
     labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
@@ -174,10 +179,11 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
 
 
 def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, half: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation; of half the size if `half`."""
-    values = images.float() / 255
-    if recipe.scale > 1:
-        values, classes = warp_views(values, classes, recipe)
+    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation: of the whole image at half its size if `half`,
+    of a crop otherwise."""
+    values, crop = images.float() / 255, 1.0 if half else recipe.crop
+    if recipe.scale > 1 or crop < 1:
+        values, classes = warp_views(values, classes, recipe, crop)
     if half:
         values, classes = halve_views(values, classes)
     colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
