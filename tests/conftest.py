@@ -52,7 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
-    # Beside other tests, which keep all cores busy, niced writers get a tenth of a core, and the bakes wait for them.
+    # Beside other tests, which keep all cores busy, niced writers get little of a core, and the bakes wait for them.
     pool.NICENESS = 0
 
 

@@ -49,6 +49,9 @@ STORE_BYTES = 100 << 20
 _PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 """Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
+_LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
+"""Environment variables of a cluster that is started here: it needs a token, and workers have normal priority. With Ray's niceness of 15
+they starve beside other programs that keep all cores busy."""
 
 
 def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
@@ -91,7 +94,7 @@ def import_ray(address: str | None) -> Any:
     Raises:
         DeviceError: It is not installed, or of another version.
     """
-    given = _VARIABLES if address is not None else _VARIABLES | {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    given = _VARIABLES if address is not None else _VARIABLES | _LOCAL | {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
     for name, value in given.items():
         os.environ.setdefault(name, value)  # Ray reads them when it is imported.
     low, high = (".".join(map(str, each)) for each in VERSIONS)

@@ -21,8 +21,9 @@ from synpick_warp.system.processes.pool import DeadProcessError, TaskError, Task
 from synpick_warp.system.processes.shared_memory import SharedArray, SharedSlots
 from synpick_warp.system.processes.worker import ProcessError
 
-NICENESS = 10
-"""Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""
+NICENESS = 5
+"""Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, gets three times
+the CPU time of one of them. With more, they starve beside other programs that keep all cores busy, and the bake waits for them."""
 QUEUE_DEPTH = 4
 """Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
 MAX_WAITING = 4096
