@@ -34,7 +34,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     with tempfile.TemporaryDirectory(dir="/tmp") as short:  # Paths of sockets have 107 characters.
         places = {"HOME": str(tmp_path / "home"), "TMPDIR": short, "PYTHONPATH": os.pathsep.join(sys.path)}
         command = [sys.executable, "-m", "tests.cloud.ray_driver", prefix, "12", "2", str(tmp_path / "died")]
-        ran = subprocess.run(command, env=os.environ | places, capture_output=True, text=True, timeout=500)
+        ran = subprocess.run(command, env=os.environ | places, capture_output=True, text=True, timeout=300)
         assert ran.returncode == 0, ran.stdout + ran.stderr
         assert list(Path(short).iterdir()) == []
     assert list((tmp_path / "home").iterdir()) == []
