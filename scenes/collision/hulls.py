@@ -17,7 +17,7 @@ _FLAT = 1e-6
 _DISTANCES = 2**24
 # Most hull vertices whose pairs are all compared, which takes some seconds; fine round meshes have hundreds of thousands.
 _MOST_COMPARED = 2**15
-# Number of hull vertices at which the farthest-point search in larger hulls starts.
+# Number of start vertices of the farthest-point search, for hulls with more vertices.
 _STARTS = 1024
 
 
@@ -42,9 +42,9 @@ def hull_size(points: np.ndarray) -> HullSize:
 
 
 def _largest_distance(corners: np.ndarray) -> float:
-    """Diameter of the vertices (N, 3) of a hull: exact by all pairs up to `_MOST_COMPARED` of them.
+    """Diameter of a point set, the vertices (N, 3) of a hull: exact, over all pairs, for up to `_MOST_COMPARED` vertices.
 
-    Of more it is a lower bound by iterated farthest-point search: from a sample to the farthest vertex of each, from these on, until the
+    For more it is a lower bound by iterated farthest-point search: from a sample to the farthest vertex of each, then from these, until the
     distance stops growing. On round bodies, which have many nearly equal chords, it was within 0.05 %.
     """
     if len(corners) <= _MOST_COMPARED:

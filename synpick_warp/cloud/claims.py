@@ -208,7 +208,7 @@ class Chunks:
         """
         self._ledger, self.claims, self._ranges = ledger, claims, ranges
         self.on_wait: Callable[[], object] = lambda: None
-        """Called when a wait for other workers begins."""
+        """Callback, invoked when this worker begins to wait for chunks that other workers hold."""
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
         self._place = f"{CLAIMS}/{name}"
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))

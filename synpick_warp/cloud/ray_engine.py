@@ -50,8 +50,8 @@ _PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 """Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
 _LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
-"""Environment variables of a cluster that is started here: it needs a token, and workers have normal priority. With Ray's niceness of 15
-they starve beside other programs that keep all cores busy."""
+"""Environment variables of a cluster that is started here: token authentication, and workers of normal priority. Ray's default niceness of
+15 starves them beside other CPU-bound programs."""
 
 
 def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:

@@ -110,7 +110,7 @@ class Reporter(SilentProgress):
             self._send()
 
     def _send(self) -> None:
-        """Post the report, and clear the notes and summaries that it contained."""
+        """Send the report, then remove its notes and chunk summaries from the next one."""
         self._answer, self._posted = self._post(self._now), time.monotonic()
         self._now = replace(self._now, notes=[], chunks=[])
 

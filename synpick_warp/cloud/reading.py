@@ -37,7 +37,7 @@ from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.system.inputs.paths import path_inside
-from synpick_warp.system.progress import Report
+from synpick_warp.system.progress import Report, ignore_progress
 from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import CONTROL, open_store
 
@@ -85,7 +85,7 @@ class Copier:
                 part.unlink()
         return True
 
-    def fetch_all(self, names: dict[str, str | None], report: Report = lambda unit, done, total: None) -> None:
+    def fetch_all(self, names: dict[str, str | None], report: Report = ignore_progress) -> None:
         """Download objects in parallel, given their SHA-256 by name (None: unchecked). Missing objects are skipped."""
         with ThreadPoolExecutor(FILES_AT_ONCE, "download") as pool:
             for done, _ in enumerate(pool.map(lambda item: self.fetch(*item), names.items()), 1):
@@ -116,9 +116,7 @@ class Copier:
                 yield int(match[1])
 
 
-def copy_set(
-    url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True, report: Report = lambda unit, done, total: None
-) -> None:
+def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True, report: Report = ignore_progress) -> None:
     """Download a whole data set into a new folder.
 
     Args:
@@ -148,7 +146,7 @@ def copy_set(
     copier.fetch_all(dict.fromkeys(names), report)
 
 
-def verify_store(url: str, report: Report = lambda unit, done, total: None) -> Verdict:
+def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
     """Verify the checksum of every file of a data set in a store, as `commit.verify.verify`: downloads one entry at a time.
 
     Raises:

@@ -129,9 +129,9 @@ class _Work(EpisodeSource):
         """Episodes of the chunks whose leases are lost."""
         self._ledger, self._place, self._chunks, self._limit = ledger, place, chunks, limit
         self._held: dict[int, tuple[Chunk, set[int]]] = {}
-        """Chunk, and its episodes without done mark, by chunk number."""
+        """Chunk and its episodes that have no done mark, by chunk number."""
         self._numbers: dict[int, int] = {}
-        """Chunk number by episode, for episodes without done mark."""
+        """Chunk number of each episode that has no done mark."""
         self._notes: list[str] = []
         self._lock, self._closing = threading.Lock(), threading.Lock()
         self._asker = ThreadPoolExecutor(1, "claim")

@@ -10,6 +10,10 @@ Report = Callable[[str, int, int], None]
 """Progress of a pass over a data set: receives the unit ("views"), the number done and the total."""
 
 
+def ignore_progress(unit: str, done: int, total: int) -> None:
+    """A `Report` that does nothing."""
+
+
 class Progress(Protocol):
     """Observer of a bake. The caller enters and exits it as a context manager; the bake only reports to it."""
 

@@ -25,8 +25,10 @@ from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
 from tests.harness.exporter_contract import digests
 from tests.harness.processes import children, kill_after, wait_for
 
-KILLS, PARTS = int(os.environ.get("SYNPICK_KILLS", 20)), 2
-"""Kills of the test at random times, of which the long form has 200, and number of tests among which they are divided."""
+KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
+"""Total number of kills at random times; a long run has 200."""
+PARTS = 2
+"""Number of tests that share these kills."""
 WRITERS_KILLED = 0.25
 """Fraction of these kills that meet a writer."""
 EPISODES = TINY["bake.episodes"]

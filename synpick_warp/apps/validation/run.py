@@ -23,7 +23,7 @@ from synpick_warp.dataset.commit.manifest import committed_episodes, read_manife
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
-from synpick_warp.system.progress import Report
+from synpick_warp.system.progress import Report, ignore_progress
 
 DEFAULT_SAMPLE = 200
 """Views that are rendered again; some 30 a second on one core."""
@@ -62,7 +62,7 @@ class Summary:
     """Deviations of instances by rule and obj_id, in the unit of the rule."""
 
 
-def validate(folder: Path, options: Options, summary: Summary, report: Report = lambda unit, done, total: None) -> Iterator[Violation]:
+def validate(folder: Path, options: Options, summary: Summary, report: Report = ignore_progress) -> Iterator[Violation]:
     """Check a data set by all rules.
 
     Args:

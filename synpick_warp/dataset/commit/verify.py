@@ -29,7 +29,7 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
-from synpick_warp.system.progress import Report
+from synpick_warp.system.progress import Report, ignore_progress
 
 _FILES_PER_PROCESS, _BYTES_PER_PROCESS = 10_000, 1 << 28
 """Minimum amount of work per worker process, in files and in bytes; one of the two suffices. On a Xeon with cached files either takes about
@@ -72,7 +72,7 @@ class Checked(NamedTuple):
     """Description of the first problem; empty: none."""
 
 
-def verify(folder: Path, threads: int | None = None, report: Report = lambda unit, done, total: None) -> Verdict:
+def verify(folder: Path, threads: int | None = None, report: Report = ignore_progress) -> Verdict:
     """Verify the checksum of every file of a data set, as recorded when it was written; stops at the first mismatch.
 
     Order: settings, constants, episodes by index, indices; then, whether an episode that the indices list is missing.

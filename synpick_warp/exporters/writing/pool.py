@@ -22,8 +22,8 @@ from synpick_warp.system.processes.shared_memory import SharedArray, SharedSlots
 from synpick_warp.system.processes.worker import ProcessError
 
 NICENESS = 5
-"""Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, gets three times
-the CPU time of one of them. With more, they starve beside other programs that keep all cores busy, and the bake waits for them."""
+"""Niceness increment of the writer processes (nice(2)). On saturated cores the bake, which feeds them and the GPU, gets three times the CPU
+share of a writer. A larger increment starves writers beside other CPU-bound programs, and the bake then waits for them."""
 QUEUE_DEPTH = 4
 """Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
 MAX_WAITING = 4096

@@ -9,7 +9,7 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?", re.DOTALL | re.IGNORECASE)
 
 
 def as_url(place: Path | str | None) -> str | None:
-    """Normalize a URL: lower-case scheme, the slash that `Path` drops from "://", and none at the end. None: the place is a folder."""
+    """Normalize a URL: scheme in lower case, "://" where `Path` has collapsed it to ":/", no trailing slashes. None: a local path."""
     match = _URL.fullmatch(str(place)) if place is not None else None
     if match is None:
         return None

@@ -41,7 +41,7 @@ _ADVICE = (
     ),
     (("credentials", "169.254.169.254"), _SET_CREDENTIALS),
 )
-"""Signs in an error's text, and the advice for it; the first match counts. Answers to HEAD have a status code alone."""
+"""Substrings of error messages, and the advice for each; the first match counts. Responses to HEAD requests contain only a status code."""
 _PASSING = (
     "status code: 5",
     "status code: 429",

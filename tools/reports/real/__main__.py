@@ -148,9 +148,8 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config = configure(options, fixed)
     if options.enlarge > 1:
-        factor = options.enlarge
-        rows = [resized(row, (factor * width, factor * height)) for row in config.rig.rows for width, height in [row.resolution or (0, 0)]]
-        config = replace(config, camera=tuple(rows))
+        sizes = [(options.enlarge * width, options.enlarge * height) for width, height in config.rig.sizes]
+        config = replace(config, camera=tuple(map(resized, config.rig.rows, sizes)))
     return Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
 
 
@@ -292,7 +291,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
         "half": (Recipe.half, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
-        "crop": (Recipe.crop, "sides of random crops for the rest of the training, as a fraction of the image's; 1: whole images"),
+        "crop": (Recipe.crop, "side lengths of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():

@@ -272,7 +272,7 @@ class Execution:
 
 
 def spent(path: Path) -> float:
-    """Duration of a training with its stream by its results file [s]; infinite without one."""
+    """Wall time of a run's training, its stream included, from its results file [s]; infinity if there is no such file."""
     return json.loads(path.read_text())["more"]["seeds"][0]["seconds"] if path.exists() else math.inf
 
 

@@ -81,7 +81,7 @@ class Recipe:
     half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
     crop: float = 1.0
-    """Sides of the random crop that the rest of the schedule trains on, as a fraction of the image's."""
+    """Side lengths of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
     graphed: bool = False
     """Whether steps are replayed as CUDA graphs, for which the host has next to nothing to do."""
 

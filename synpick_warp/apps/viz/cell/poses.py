@@ -37,7 +37,7 @@ def pose_for(row: CameraRow, index: int, sizes: BinSizes) -> Pose:
 
 
 def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
-    """Whether a position is in the gripper's swept volume in picks from a bin: a camera there sees nothing but the shaft meanwhile."""
+    """Whether a position lies in the gripper's swept volume during picks from a bin, where a camera sees only the shaft."""
     top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
     aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
