@@ -130,8 +130,9 @@ def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     runs = newest_runs(read_runs())
     table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
-    rows = [row for name in ("ablation", "most") for row in runs[f"photographs_{name}.json"].rows if row.name.startswith("obj_id")]
-    objects = msgspec.structs.replace(runs["photographs_ablation.json"], rows=rows, shown=[])
+    shown = [runs[f"photographs_{name}.json"] for name in ("ablation", "most", "native")]
+    rows = [row for run in shown for row in run.rows if row.name.startswith("obj_id")]
+    objects = msgspec.structs.replace(shown[0], rows=rows, shown=[])
     levers = runs["photographs_levers.json"]
     columns = {row: row.name.removeprefix(f"{row.part}: ") + " [%]" * row.unit.startswith("%") for row in levers.rows}
     turned = [Row(row.part, row.value, part=column) for row, column in columns.items() if row.name.startswith(row.part)]
