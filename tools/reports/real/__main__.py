@@ -299,7 +299,6 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
     parser.add_argument("--cameras", type=int, nargs="+", help="indices of the cameras to train on (default: all)")
     parser.add_argument("--network", choices=tuple(NETWORKS), default=Recipe.network, help="network (default: unet)")
     parser.add_argument("--depth", action="store_true", help="train and measure on colour and depth")
-    parser.add_argument("--graphed", action="store_true", help="replay training steps as CUDA graphs")
     parser.add_argument("--first-seed", type=int, default=0, help="first seed (default: 0)")
     parser.add_argument("--name", default="real", help="name of the run, in files (default: real)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write overlays of all frames to this folder")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -40,11 +39,6 @@ FILLING = 0.5
 """Maximum fraction of the time limit that passes before training starts."""
 PACE = 4.0
 """Replay ratio while the stream runs: maximum number of training samples for each new view, or the number of epochs if that is smaller."""
-EAGER = 4
-"""Number of eager warm-up steps at each image size before a CUDA graph is captured: cuDNN selects algorithms, the optimizer allocates its
-state."""
-AHEAD = 8
-"""Maximum number of enqueued CUDA graph launches. It bounds how far the host, whose clock the schedule follows, runs ahead of the GPU."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +76,6 @@ class Recipe:
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
     crop: float = 1.0
     """Side lengths of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
-    graphed: bool = False
-    """Whether steps are replayed as CUDA graphs, for which the host has next to nothing to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,37 +202,17 @@ def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) 
     return loss
 
 
-class _Graph:
-    """CUDA graph of a training step with static input buffers."""
-
-    def __init__(self, trainer: _Trainer, drawn: Sequence[torch.Tensor], half: bool) -> None:
-        self.inputs, self.graph = [part.clone() for part in drawn], torch.cuda.CUDAGraph()
-        # Other threads, such as the renderer's, may use the device during capture.
-        with torch.cuda.graph(self.graph, stream=torch.cuda.current_stream(), capture_error_mode="thread_local"):
-            self.loss = trainer.update(self.inputs[0], self.inputs[1], half)
-
-    def update(self, drawn: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Copy a batch to the input buffers and launch the graph. Returns the loss."""
-        for own, part in zip(self.inputs, drawn, strict=True):
-            own.copy_(part)
-        self.graph.replay()
-        return self.loss.clone()
-
-
 class _Trainer:
     """Training loop state: network, optimizer, learning rate schedule. Creating it seeds PyTorch and starts the clock."""
 
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
-        self.graphed = recipe.graphed and device.type == "cuda"
         self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
-        rate = torch.tensor(recipe.rate, device=device) if self.graphed else recipe.rate
-        self.optimizer = torch.optim.AdamW(self.network.parameters(), rate, fused=device.type == "cuda", capturable=self.graphed)
+        self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
-        self.eager, self.graphs, self.queued = [0, 0], dict[bool, _Graph](), list[torch.cuda.Event]()
         self.waited = 0.0
         """Time before the first step, in which the first part of the pool was filled [s]."""
 
@@ -254,17 +226,8 @@ class _Trainer:
         """Train on a batch drawn from the pool, and append its loss to `losses`."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
-        rate, group, half = self.recipe.rate * max(factor, LEAST_RATE), self.optimizer.param_groups[0], done < self.recipe.half
-        drawn = pool.draw(self.recipe.batch)
-        if self.graphed:
-            group["lr"].fill_(rate)
-        else:
-            group["lr"] = rate
-        self.losses.append(self._replay(drawn, half) if self.graphed else self.update(*drawn, half))
-
-    def update(self, images: torch.Tensor, classes: torch.Tensor, half: bool) -> torch.Tensor:
-        """Augment a batch, and take one optimizer step on it. Returns the loss."""
-        images, classes = _prepare(images, classes, self.recipe, half)
+        self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
+        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, done < self.recipe.half)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.network(images)
@@ -273,21 +236,7 @@ class _Trainer:
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
         self.optimizer.step()
-        return loss.detach()
-
-    def _replay(self, drawn: tuple[torch.Tensor, torch.Tensor], half: bool) -> torch.Tensor:
-        """`update` by the CUDA graph of this image size, which is captured after EAGER steps."""
-        self.eager[half] += 1
-        if self.eager[half] <= EAGER:
-            return self.update(*drawn, half)
-        if half not in self.graphs:
-            self.graphs[half] = _Graph(self, drawn, half)
-        loss = self.graphs[half].update(drawn)
-        self.queued.append(torch.cuda.Event())
-        self.queued[-1].record()
-        if len(self.queued) > AHEAD:
-            self.queued.pop(0).synchronize()
-        return loss
+        self.losses.append(loss.detach())
 
 
 def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int, pool: Pool | None = None) -> tuple[Trained, Pool]:

@@ -40,7 +40,7 @@ def changed(recipe: Recipe, text: str) -> Recipe:
     for part in [] if text == "base" else text.split(","):
         name, _, value = part.partition("=")
         try:
-            changes[name] = bool(int(value)) if types[name] is bool else types[name](value)
+            changes[name] = types[name](value)
             if name == "network" and value not in NETWORKS:
                 raise ValueError
             if types[name] is not str:
