@@ -1,6 +1,6 @@
-"""Draw the documents' pictures anew: a strip of one view's images, an animated pick, and the cell of configs/CELL.md.
+"""Draw the documents' pictures anew: a strip of one view's images, an animated pick, tables to train on, and the cell of configs/CELL.md.
 
-Two small bakes of embedded objects under embedded light maps, and the page's first steps, removed afterwards; some minutes on two CPU
+Three small bakes of embedded objects under embedded light maps, and the page's first steps, removed afterwards; some minutes on two CPU
 cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
@@ -32,7 +32,7 @@ from tools.options import fail, make_parser
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
 PAGE = PICTURES.parents[1] / "configs" / "CELL.md"
-STRIP, PICK, CELL = "strip.jpg", "pick.gif", "cell.jpg"
+STRIP, PICK, TABLES, CELL = "strip.jpg", "pick.gif", "tables.jpg", "cell.jpg"
 COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.color_format": "png", "bop.coco": False}
 STRIP_SETTINGS = COMMON | {
     "bake.mode": "move",
@@ -52,6 +52,8 @@ PICK_SETTINGS = COMMON | {
     "cameras.positions": [[0.0, 0.0, 2.0], [0.9, -1.1, 1.3]],
     "cameras.ups": [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
 }
+TABLE_ROWS, TABLE_COLUMNS = 2, 4
+"""Arrangement of the pictures of tables, each of an episode and a camera of its own."""
 PANEL = (480, 270)
 """Width and height of an image in the strip [px]."""
 CAPTION_SCALE = 0.5
@@ -78,6 +80,9 @@ def main(arguments: list[str] | None = None) -> int:
                 synpick_warp.bake("smoke", Path(folder) / name, settings | device)
             (strip,) = synpick_warp.open(Path(folder) / "strip").values()
             print(write_picture(options.out / STRIP, draw_strip(strip)))
+            tables = {"bake.episodes": TABLE_ROWS * TABLE_COLUMNS, "bake.worlds": TABLE_ROWS * TABLE_COLUMNS, "bop.coco": False}
+            synpick_warp.bake("tabletop-train", Path(folder) / "tables", tables | device)
+            print(write_picture(options.out / TABLES, draw_tables(list(synpick_warp.open(Path(folder) / "tables").values()))))
             (pick,) = synpick_warp.open(Path(folder) / "pick").values()
             print(write_animation(options.out / PICK, draw_pick(pick)))
             print(write_picture(options.out / CELL, draw_cell(Path(folder))))
@@ -123,6 +128,13 @@ def captioned(image: Image, text: str) -> Image:
     picture[-height - 14 :, : width + 16] //= 4
     put_text(picture, text, (8, picture.shape[0] - 8), CAPTION_SCALE, (255, 255, 255))
     return picture
+
+
+def draw_tables(episodes: list[Episode]) -> Image:
+    """First frames of episodes, each by the camera of the episode's number, in rows."""
+    views = [episode.view(0, camera=camera).rgb[..., ::-1] for camera, episode in enumerate(episodes)]
+    rows = [np.concatenate(views[first : first + TABLE_COLUMNS], axis=1) for first in range(0, len(views), TABLE_COLUMNS)]
+    return np.concatenate(rows)
 
 
 def draw_pick(episode: Episode) -> list[Image]:
