@@ -52,7 +52,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--check-bounds"):
         _check_bounds(config)
     start_warp()
-    # Beside other tests, which keep all cores busy, niced writers get little of a core, and the bakes wait for them.
+    # Writer processes of lower priority get little CPU time while other tests saturate all cores, and stall their bakes.
     pool.NICENESS = 0
 
 

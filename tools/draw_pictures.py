@@ -1,7 +1,7 @@
-"""Draw the documents' pictures anew: a strip of one view's images, an animated pick, tables to train on, and the cell of configs/CELL.md.
+"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, and the cell of configs/CELL.md.
 
-Three small bakes of embedded objects under embedded light maps, and the page's first steps, removed afterwards; some minutes on two CPU
-cores.
+Makes three small bakes of embedded objects under embedded light maps, and runs the first steps of that page, in a temporary folder; takes
+some ten minutes on two CPU cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0
@@ -52,8 +52,12 @@ PICK_SETTINGS = COMMON | {
     "cameras.positions": [[0.0, 0.0, 2.0], [0.9, -1.1, 1.3]],
     "cameras.ups": [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
 }
-TABLE_ROWS, TABLE_COLUMNS = 2, 4
-"""Arrangement of the pictures of tables, each of an episode and a camera of its own."""
+TABLE_COLUMNS = 4
+"""Columns of the grid of training views."""
+TABLE_SETTINGS = {"bake.worlds": 8, "bake.episodes": 8, "bop.coco": False}
+"""One episode for each of the eight cameras of `tabletop-train`."""
+BAKES = (("strip", "smoke", STRIP_SETTINGS), ("pick", "smoke", PICK_SETTINGS), ("tables", "tabletop-train", TABLE_SETTINGS))
+"""Folder, preset and settings of each bake."""
 PANEL = (480, 270)
 """Width and height of an image in the strip [px]."""
 CAPTION_SCALE = 0.5
@@ -76,15 +80,12 @@ def main(arguments: list[str] | None = None) -> int:
     device = {"bake.device": options.device}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            for name, settings in (("strip", STRIP_SETTINGS), ("pick", PICK_SETTINGS)):
-                synpick_warp.bake("smoke", Path(folder) / name, settings | device)
-            (strip,) = synpick_warp.open(Path(folder) / "strip").values()
-            print(write_picture(options.out / STRIP, draw_strip(strip)))
-            tables = {"bake.episodes": TABLE_ROWS * TABLE_COLUMNS, "bake.worlds": TABLE_ROWS * TABLE_COLUMNS, "bop.coco": False}
-            synpick_warp.bake("tabletop-train", Path(folder) / "tables", tables | device)
-            print(write_picture(options.out / TABLES, draw_tables(list(synpick_warp.open(Path(folder) / "tables").values()))))
-            (pick,) = synpick_warp.open(Path(folder) / "pick").values()
-            print(write_animation(options.out / PICK, draw_pick(pick)))
+            for name, preset, settings in BAKES:
+                synpick_warp.bake(preset, Path(folder) / name, settings | device)
+            baked = {name: list(synpick_warp.open(Path(folder) / name).values()) for name, _, _ in BAKES}
+            print(write_picture(options.out / STRIP, draw_strip(*baked["strip"])))
+            print(write_animation(options.out / PICK, draw_pick(*baked["pick"])))
+            print(write_picture(options.out / TABLES, draw_tables(baked["tables"])))
             print(write_picture(options.out / CELL, draw_cell(Path(folder))))
     except SynpickError as error:
         return fail("draw_pictures", error)
@@ -131,7 +132,7 @@ def captioned(image: Image, text: str) -> Image:
 
 
 def draw_tables(episodes: list[Episode]) -> Image:
-    """First frames of episodes, each by the camera of the episode's number, in rows."""
+    """Grid of training views: of each episode the first frame, seen by the camera with the episode's number."""
     views = [episode.view(0, camera=camera).rgb[..., ::-1] for camera, episode in enumerate(episodes)]
     rows = [np.concatenate(views[first : first + TABLE_COLUMNS], axis=1) for first in range(0, len(views), TABLE_COLUMNS)]
     return np.concatenate(rows)

@@ -17,7 +17,7 @@ _FLAT = 1e-6
 _DISTANCES = 2**24
 # Most hull vertices whose pairs are all compared, which takes some seconds; fine round meshes have hundreds of thousands.
 _MOST_COMPARED = 2**15
-# Number of start vertices of the farthest-point search, for hulls with more vertices.
+# Number of vertices from which the farthest-point search in larger hulls starts.
 _STARTS = 1024
 
 

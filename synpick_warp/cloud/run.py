@@ -131,7 +131,7 @@ class _Work(EpisodeSource):
         self._held: dict[int, tuple[Chunk, set[int]]] = {}
         """Chunk and its episodes that have no done mark, by chunk number."""
         self._numbers: dict[int, int] = {}
-        """Chunk number of each episode that has no done mark."""
+        """Chunk number of each episode that has no done mark, by the episode's index."""
         self._notes: list[str] = []
         self._lock, self._closing = threading.Lock(), threading.Lock()
         self._asker = ThreadPoolExecutor(1, "claim")

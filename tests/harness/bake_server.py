@@ -126,7 +126,7 @@ def _serve() -> None:
 
     once = made_once()
     once.__enter__()  # Forks inherit what a bake in this process has made.
-    pool.NICENESS = 0  # Beside other tests, which keep all cores busy, niced writers get little of a core, and each bake waits for them.
+    pool.NICENESS = 0  # Writers of lower priority stall their bakes while other tests saturate all cores.
     assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
     os.dup2(2, 1)

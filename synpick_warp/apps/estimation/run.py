@@ -19,7 +19,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.stages.pose.batch import Estimates
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.free_memory import free_host_memory
-from synpick_warp.system.progress import Report
+from synpick_warp.system.progress import Report, ignore_progress
 
 MAX_VIEWS = 128
 """Views that are estimated at a time, if their number is left open: enough to fill a GPU."""
@@ -67,7 +67,7 @@ def read_scenes(
     plans: Sequence[ScenePlan],
     options: Options,
     targets: TargetList | None = None,
-    report: Report = lambda *_: None,
+    report: Report = ignore_progress,
     pool: DecoderPool | None = None,
 ) -> list[Scene]:
     """Read the ground truth of scenes, and check that there are images to estimate on.
@@ -139,7 +139,7 @@ def run_estimation(
     object_ids: Sequence[int],
     factory: EstimatorFactory,
     options: Options,
-    report: Report = lambda *_: None,
+    report: Report = ignore_progress,
     pool: DecoderPool | None = None,
 ) -> Run:
     """Estimate the poses of all instances that are asked for; returns the table of poses, with times.

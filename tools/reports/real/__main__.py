@@ -150,7 +150,7 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
     if options.enlarge > 1:
         sizes = [(options.enlarge * width, options.enlarge * height) for width, height in config.rig.sizes]
         config = replace(config, camera=tuple(map(resized, config.rig.rows, sizes)))
-    return Source(config, TRAINING, options.stride, options.shrink, tuple(options.cameras or ()) or None, options.depth)
+    return Source(config, TRAINING, options.stride, tuple(options.cameras or ()) or None, options.depth)
 
 
 def _detector(options: argparse.Namespace, pool: Pool, bench: Bench) -> float:
@@ -274,7 +274,6 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "width": (48, "channels of the network's first level"),
         "stride": (2, "every n-th frame of an episode is taken"),
         "enlarge": (1, "factor by which the resolution of all cameras is enlarged"),
-        "shrink": (1, "factor by which the stream's images are reduced"),
         "capacity": (48_000, "views in the pool, at most"),
         "held_out": (400, "synthetic views to measure on"),
     }
@@ -291,7 +290,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
         "half": (Recipe.half, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
-        "crop": (Recipe.crop, "side lengths of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
+        "crop": (Recipe.crop, "side length of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }
     for name, (default, text) in numbers.items():

@@ -75,7 +75,7 @@ class Recipe:
     half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
     crop: float = 1.0
-    """Side lengths of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
+    """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +171,8 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
 
 
 def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, half: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Network input (B, 3 or 4, H, W) float32 in -0.5..0.5 and classes, after augmentation: of the whole image at half its size if `half`,
-    of a crop otherwise."""
+    """Augment a batch and normalize its colours: network input (B, 3 or 4, H, W) float32 in -0.5..0.5, and its classes. With `half`, images
+    are downsampled by two; otherwise they are cropped."""
     values, crop = images.float() / 255, 1.0 if half else recipe.crop
     if recipe.scale > 1 or crop < 1:
         values, classes = warp_views(values, classes, recipe, crop)

@@ -11,7 +11,6 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 
 import torch  # pyright: ignore[reportMissingImports]
-from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.online.dataset import StreamDataset
@@ -33,8 +32,6 @@ class Source:
     episodes: range
     stride: int
     """Every n-th frame of an episode."""
-    shrink: int = 1
-    """Factor by which images are reduced."""
     cameras: tuple[int, ...] | None = None
     """Indices of the cameras whose views are taken; None: all."""
     depth: bool = False
@@ -48,13 +45,8 @@ class Source:
         dataset = StreamDataset(self.config, fields=fields, episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
             image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
-            half = self.shrink // 2
-            if self.shrink > 1:
-                image = functional.avg_pool2d(image.float(), self.shrink).round_().to(torch.uint8)
-                classes = classes[:, half :: self.shrink, half :: self.shrink][:, : image.shape[2], : image.shape[3]]
             if self.depth:
-                depth = code_depth(batch["depth"])[:, :, half :: self.shrink, half :: self.shrink]
-                image = torch.cat((image, depth[:, :, : image.shape[2], : image.shape[3]]), dim=1)
+                image = torch.cat((image, code_depth(batch["depth"])), dim=1)
             yield image[:views], classes[:views]
             views -= len(image)
             if views <= 0:
