@@ -1,7 +1,7 @@
 """Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, and the cell of configs/CELL.md.
 
 Makes three small bakes of embedded objects under embedded light maps, and runs the first steps of that page, in a temporary folder; takes
-some ten minutes on two CPU cores.
+more than ten minutes on two CPU cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0
