@@ -273,8 +273,8 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "batch": (16, "views of a batch"),
         "width": (48, "channels of the network's first level"),
         "stride": (2, "every n-th frame of an episode is taken"),
-        "enlarge": (1, "factor by which the resolution of all cameras is enlarged"),
-        "capacity": (48_000, "views in the pool, at most"),
+        "enlarge": (2, "factor by which the resolution of all cameras is enlarged"),
+        "capacity": (24_000, "views in the pool, at most"),
         "held_out": (400, "synthetic views to measure on"),
     }
     for name, (default, text) in counts.items():

@@ -1,8 +1,7 @@
 """Ablation study of domain randomization, amount of data and renderer, on several GPUs within a time limit.
 
 Each row is a run of `tools.reports.real` for each seed. Runs start in order of priority on the next free GPU: the first seed of all rows
-before the second, less important rows last. A process of a GPU serves many runs. A run that cannot end by the deadline is skipped and
-printed as "left out". The rows with the most views are shortened instead, down to a minimum time; the results then name the time. Times of
+before the second. A process of a GPU serves many runs. A run that cannot end by the deadline is skipped and printed as "left out". Times of
 runs are estimated from those that have ended. Runs with results in --out are not repeated, and the summary is written after each run.
 Without --out, only the schedule is printed. All rows are scored on the same photographs and the same held-out views, those of all levers.
 
@@ -38,12 +37,12 @@ BETWEEN = 15.0
 """Overhead of a later run [s]: scoring, writing of files."""
 FIRST_VIEWS = 20.0
 """Start-up time of a stream [s]: loading of models and lights, construction of 512 worlds, settling of the first piles (some 35 ticks)."""
-STREAM_RATE = 700.0
-"""Throughput of a stream after its start-up [views/s]: still piles, 8 views each, 320x240, on an H200."""
-REFERENCE_RATE = 30.0
-"""Throughput of the path tracer [views/s]: 320x240, 64 paths a pixel."""
-TRAIN_RATE = 850.0
-"""Training throughput of the U-Net of width 48 [samples/s]: 70 % of the time at 160x120 and 30 % at 320x240, bfloat16, on an H200."""
+STREAM_RATE = 650.0
+"""Throughput of a stream after its start-up [views/s]: still piles, 8 views each, 640x480, on an H100."""
+REFERENCE_RATE = 7.5
+"""Throughput of the path tracer [views/s]: 640x480, 64 paths a pixel."""
+TRAIN_RATE = 500.0
+"""Training throughput of the U-Net of width 48 [samples/s]: 320x240 pixels a sample, bfloat16, on an H100."""
 DETECTOR = 60.0
 """Training time of the detector [s]."""
 SLACK = 1.15
@@ -64,10 +63,6 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
-CHOICE = "--network residual --width 64 --batch 32"
-"""Network of the rows with the most views."""
-MIN_LIMIT = 150.0
-"""Shortest time limit of the first row [s]."""
 MIN_STEP_VIEWS = 48_000
 """Number of training samples of runs with few views, equal to that of the others."""
 
@@ -78,24 +73,16 @@ VIEWS = 8
 
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
-HOLES = ("depth_sensor.shadows=false", "depth_sensor.edge_width=0", "depth_sensor.grazing_angle=89")
-"""Settings without what makes holes in depth."""
 LEVERS: dict[str, tuple[str, ...]] = {
     "places": ("arrangement.drop=layers", "bins.area=[0.8,0.55]"),
     "surfaces": ("randomize.surfaces=0", "randomize.table_color={uniform=[[0.05,0.05,0.05],[0.9,0.9,0.9]]}"),
     "distractors": ("randomize.distractors=off",),
     "effects": ("effects.exposure_jitter=0", "effects.white_balance_jitter=0", *(f"effects.{name}={_OFF}" for name in _EFFECTS)),
-    "contrast": (f"effects.contrast={_OFF}", f"effects.saturation={_OFF}"),
     "standing": ("arrangement.upright=0",),
     "lights": ("randomize.lamps=off", "randomize.exposure=off", "effects.exposure_jitter=0"),
     "materials": ("randomize.object_hue=off", "randomize.object_brightness=off", "randomize.object_roughness=off"),
-    "edge of the table": ("render.table_size=[0,0]",),
 }
 """Settings that switch a part of the randomization off, by its name."""
-BRIGHTER = ("randomize.object_brightness={log_uniform=[0.6,3.0]}",)
-"""Settings chosen after the labelled frames were seen, whose foam brick is brighter than 95 % of ours: they explain a score."""
-LATE_LEVERS = ("contrast", "edge of the table")
-"""Levers whose rows come last: the one is a part of another, the other concerns a border of the picture."""
 
 
 @dataclass(frozen=True)
@@ -110,12 +97,8 @@ class Run:
     rate: float = STREAM_RATE
     limit: float = 280.0
     """Time limit of rendering and training together [s]."""
-    least: float = math.inf
-    """Shortest time limit, used if less time is left [s]; infinite: the limit is fixed."""
     detector: float = 0.0
     """Training time of the detector, if there is enough time left [s]; 0: no detector."""
-    late: bool = False
-    """Whether its runs come after all seeds of the other rows."""
 
     @property
     def training(self) -> float:
@@ -123,7 +106,7 @@ class Run:
         return min(self.limit, FIRST_VIEWS + self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
     def fit(self, left: float, start: float, slowdown: float = 1.0) -> Run | None:
-        """Fit the run into the remaining time: shortened limit, and detector only if there is time for it.
+        """Fit the run into the remaining time: its detector is left out if there is no time for it.
 
         Args:
             left: Time until the deadline [s].
@@ -134,10 +117,9 @@ class Run:
             The run; None if the time is too short.
         """
         room = left - SLACK * start
-        if room < min(self.limit, SLACK * slowdown * self.training, self.least):
+        if room < min(self.limit, SLACK * slowdown * self.training):
             return None
-        limit = min(self.limit, room)
-        return replace(self, limit=limit, detector=self.detector if room - limit > self.detector else 0.0)
+        return replace(self, detector=self.detector if room - self.limit > self.detector else 0.0)
 
     def command(self, seed: int, stem: Path) -> list[str]:
         """Arguments of one seed, beside those that all runs share."""
@@ -152,18 +134,15 @@ def _settings(*assignments: str) -> tuple[str, ...]:
     return tuple(word for one in assignments for word in ("--set", one))
 
 
-def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
-    """Yield all rows in order of priority. `choice`: arguments of the rows with the most views."""
-    most = ("--worlds", "1024", "--capacity", "40000", *choice.split())
-    detector = DETECTOR if find_spec("torchvision") else 0.0
+def plan(views: int, main_views: int) -> Iterator[Run]:
+    """Yield all rows in order of priority."""
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
-    yield Run("all levers", main_views, passes=MAIN_PASSES, least=MIN_LIMIT, detector=detector)
+    yield Run("all levers", main_views, passes=MAIN_PASSES, detector=DETECTOR if find_spec("torchvision") else 0.0)
     yield Run("all levers, ablation's number of views", views)
     yield Run("tote, not randomized", views, ("--config", "synpick", *tote))
     yield Run("tote, randomized", views, ("--config", "randomized", *tote))
     for name, settings in LEVERS.items():
-        yield Run(f"without {name}", views, _settings(*settings), late=name in LATE_LEVERS)
-    yield Run("colour and depth", views, ("--depth",))
+        yield Run(f"without {name}", views, _settings(*settings))
     for amount in (1000, 3000):
         yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
     traced = _settings("render.mode=reference", "render.samples=64")
@@ -171,22 +150,13 @@ def plan(views: int, main_views: int, choice: str = CHOICE) -> Iterator[Run]:
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
-    yield Run("up to 200,000 views", 200_000, most, passes=2.0, limit=500.0, least=300.0)
-    yield Run("without photometric augmentation", views, ("--jitter", "0", "--jpeg", "0"), late=True)
-    yield Run("without JPEG", views, ("--jpeg", "0"), late=True)
-    yield Run("colour and depth without holes", views, ("--depth", *_settings(*HOLES)), late=True)
-    yield Run(
-        "up to 200,000 views, brighter objects", 200_000, (*most, *_settings(*BRIGHTER)), passes=2.0, limit=500.0, least=300.0, late=True
-    )
-    yield Run("up to 200,000 views, colour and depth", 200_000, (*most, "--depth"), passes=2.0, limit=500.0, least=300.0, late=True)
+    yield Run("colour and depth", views, ("--depth",))
 
 
-def order(rows: list[Run], preferred: str = "") -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: all seeds of the first row, then the others by seed, last the late rows. The row `preferred`
-    comes before all."""
+def order(rows: list[Run]) -> list[tuple[Run, int]]:
+    """Runs in the order in which they start: all seeds of the first row, then the others by seed."""
     first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
-    rest = [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
-    return sorted(first + rest, key=lambda job: (job[0].name != preferred, job[0].late))
+    return first + [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:
@@ -292,12 +262,10 @@ def collect(folder: Path, jobs: list[tuple[Run, int]]) -> dict[str, Any]:
         seeds = [document["more"]["seeds"][0] for document in documents]
         if not seeds:
             continue
-        limit = min(seed["limit"] for seed in seeds)
-        shorter = f"shortest time limit {limit:.0f} s" if limit < min(run.limit - 1.0, SLACK * run.training) else ""
         for metric, (label, unit, factor) in METRICS.items():
             values = [factor * seed[metric] for seed in seeds if seed.get(metric) is not None]
             if values:
-                words = " ".join(word for word in (unit, interval(values), shorter) if word)
+                words = " ".join(word for word in (unit, interval(values)) if word)
                 rows.append(Row(f"{run.name}: {label}", round(float(np.mean(values)), 4), words, part=run.name))
         objects = [{row["name"]: row["value"] for row in document["rows"] if row["part"] == OBJECT} for document in documents]
         rows += [Row(name, round(float(np.mean([one[name] for one in objects])), 4), part=run.name) for name in objects[0]]
@@ -318,20 +286,16 @@ def main(arguments: list[str] | None = None) -> int:
     text = "processes of each GPU: one trains while another starts its stream or is scored (default: 1)"
     parser.add_argument("--processes", type=positive_count, default=1, help=text)
     parser.add_argument("--skip", nargs="+", default=[], metavar="NAME", help="rows that are left out")
-    parser.add_argument("--first", default="", metavar="NAME", help="row that starts before all others")
-    parser.add_argument(
-        "--choice", default=CHOICE, metavar="ARGUMENTS", help="network of the rows with the most views (default: %(default)s)"
-    )
     parser.add_argument("--out", type=Path, help="existing folder to write to; without it the plan is printed")
     parser.add_argument("pass_on", nargs="*", help="more arguments of tools.reports.real for all runs, after --")
     options = parser.parse_args(arguments)
-    rows = list(plan(options.views, options.main_views, options.choice))
-    jobs, names = order(rows, options.first), [run.name for run in rows]
-    for flag, name in [("first", options.first), *(("skip", name) for name in options.skip)]:
-        if name and name not in names:
-            print(f"reports.real.ablation: --{flag} is {name}; rows: {'; '.join(names)}", file=sys.stderr)
+    rows = list(plan(options.views, options.main_views))
+    names = [run.name for run in rows]
+    for name in options.skip:
+        if name not in names:
+            print(f"reports.real.ablation: --skip is {name}; rows: {'; '.join(names)}", file=sys.stderr)
             return 2
-    jobs = [(run, seed) for run, seed in jobs if run.name not in options.skip]
+    jobs = [(run, seed) for run, seed in order(rows) if run.name not in options.skip]
     if options.out is None:
         print_plan(jobs, options.gpus, options.deadline)
         return 0

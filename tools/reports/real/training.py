@@ -74,7 +74,7 @@ class Recipe:
     """Whether the network sees depth beside colours."""
     half: float = 0.7
     """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
-    crop: float = 1.0
+    crop: float = 0.5
     """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
 
 
