@@ -130,7 +130,7 @@ def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     runs = newest_runs(read_runs())
     table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
-    shown = [runs[f"photographs_{name}.json"] for name in ("ablation", "most", "native")]
+    shown = [runs[f"photographs_{name}.json"] for name in ("small", "ablation", "most", "native")]
     rows = [row for run in shown for row in run.rows if row.name.startswith("obj_id")]
     objects = msgspec.structs.replace(shown[0], rows=rows, shown=[])
     levers = runs["photographs_levers.json"]

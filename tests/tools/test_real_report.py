@@ -23,7 +23,15 @@ from tools.reports.real import OBJECT, ablation, interval, training, worker  # n
 from tools.reports.real.__main__ import PRESET, make_options, recipe_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS  # noqa: E402
-from tools.reports.real.training import Recipe, compress_views, halve_views, segmentation_loss, train, warp_views  # noqa: E402
+from tools.reports.real.training import (  # noqa: E402
+    Recipe,
+    compress_views,
+    halve_views,
+    prepare_batch,
+    segmentation_loss,
+    train,
+    warp_views,
+)
 from tools.reports.real.tuning import changed  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
 
@@ -77,8 +85,20 @@ def test_halved_views_are_means_and_single_pixels():
     assert colors[0, 3].tolist() == [[53.0, 55.0], [61.0, 63.0]]
 
 
+@pytest.mark.parametrize(("progress", "size"), [(0.0, (24, 32)), (0.3, (24, 32)), (0.4, (48, 64)), (0.69, (48, 64)), (0.7, (48, 64))])
+def test_images_grow_over_the_schedule(progress, size):
+    """A quarter of the size, then half, then crops of half of each side, in which a pixel is one of the image's."""
+    classes = (torch.arange(96)[:, None] // 8 % 2 + torch.zeros(128, dtype=torch.int64)).expand(2, -1, -1)
+    recipe = dataclasses.replace(RECIPE, scale=1.0, rotation=0.0, jitter=0.0, jpeg=0.0, quarter=0.4, half=0.7)
+    images, labels = prepare_batch((classes[:, None] * 255).expand(-1, 3, -1, -1), classes, recipe, progress)
+    assert labels.shape[1:] == images.shape[2:] == size
+    assert torch.equal(images[:, 0] > 0, labels == 1)
+    assert int(labels[0, :, 0].diff().abs().sum()) == (11 if progress < 0.7 else pytest.approx(5, abs=1))
+
+
 def test_the_interval_is_students():
     assert interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
+    assert interval([1.0, 2.0]) == "(1, 2)"
     assert interval([1.0]) == ""
 
 

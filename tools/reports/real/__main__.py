@@ -48,7 +48,14 @@ PRESET = "tabletop-train"
 """Default preset of the stream."""
 VIEWS_PER_BATCH = 48
 """Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
-RANGES = {"scale": number_in(1.0, 4.0), "jpeg": number_in(0.0, 100.0), "half": number_in(0.0, 1.0), "crop": number_in(0.1, 1.0)}
+_FRACTION = number_in(0.0, 1.0)
+RANGES = {
+    "scale": number_in(1.0, 4.0),
+    "jpeg": number_in(0.0, 100.0),
+    "half": _FRACTION,
+    "quarter": _FRACTION,
+    "crop": number_in(0.1, 1.0),
+}
 """Argument types of the options that are not just non-negative numbers."""
 SCALES = (0.8, 1.0, 1.25)
 """Factors of the image's size over which predictions are averaged for `Outcome.averaged`: within those of the augmentation."""
@@ -289,7 +296,8 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "jpeg": (Recipe.jpeg, "lowest JPEG quality of augmentation; 0: none"),
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
-        "half": (Recipe.half, "fraction of the training with images of half the size, which takes a quarter of the time a sample"),
+        "half": (Recipe.half, "fraction of the training, at its beginning, with images of half the size or less"),
+        "quarter": (Recipe.quarter, "fraction of the training, at its beginning, with images of a quarter of the size"),
         "crop": (Recipe.crop, "side length of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }

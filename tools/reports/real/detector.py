@@ -19,6 +19,8 @@ MIN_SIDE = 6
 """Least width and height of a box that is trained on [px]."""
 JITTER = 0.3
 """Strength of photometric changes."""
+LEAST_HEIGHT = 480
+"""Least height to which the detector resizes images [px]: the photographs'. Its finest anchors have sides of 32 px."""
 
 
 def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -37,19 +39,28 @@ def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
-    """Train Faster R-CNN on the views of a pool for so many seconds; None without a torchvision that loads."""
+    """Train Faster R-CNN on the views of a pool for so many seconds; None without a torchvision that loads.
+
+    Steps whose gradient is not finite are skipped: one of them would leave weights without detections. Their number is printed.
+    """
     try:
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
     except (ImportError, OSError, RuntimeError):  # RuntimeError: torchvision was built for another PyTorch.
         return None
     views, classified = pool.tensors()
     height, width = views.shape[2:]
+    factor = max(1.0, LEAST_HEIGHT / height)
     network = fasterrcnn_mobilenet_v3_large_fpn(
-        weights=None, weights_backbone=None, num_classes=classes, trainable_backbone_layers=6, min_size=2 * height, max_size=2 * width
+        weights=None,
+        weights_backbone=None,
+        num_classes=classes,
+        trainable_backbone_layers=6,
+        min_size=round(factor * height),
+        max_size=round(factor * width),
     ).to(device)
     optimizer = torch.optim.SGD(network.parameters(), RATE, momentum=MOMENTUM, weight_decay=DECAY)
     truth: dict[int, dict[str, torch.Tensor]] = {}
-    started, random = time.perf_counter(), np.random.default_rng(pool.seed)
+    started, random, steps, skipped = time.perf_counter(), np.random.default_rng(pool.seed), 0, 0
     while (done := (time.perf_counter() - started) / seconds) < 1.0:
         optimizer.param_groups[0]["lr"] = RATE * min(1.0, 20 * done) * (1.0 if done < 0.7 else 0.1)
         chosen = random.integers(pool.count, size=batch).tolist()
@@ -61,8 +72,11 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
         losses = network(list(images), [truth[index] for index in chosen])
         optimizer.zero_grad()
         torch.stack(list(losses.values())).sum().backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-        optimizer.step()
+        finite = bool(torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0).isfinite())
+        if finite:
+            optimizer.step()
+        steps, skipped = steps + 1, skipped + (not finite)
+    print(f"detector: {steps} steps, {skipped} of them skipped since the gradient was not finite")
     return network.eval()
 
 

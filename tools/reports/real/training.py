@@ -73,7 +73,9 @@ class Recipe:
     depth: bool = False
     """Whether the network sees depth beside colours."""
     half: float = 0.7
-    """Fraction of the schedule, at its beginning, in which images have half their size (progressive resizing)."""
+    """Fraction of the schedule, at its beginning, in which images have half their size or less (progressive resizing)."""
+    quarter: float = 0.0
+    """Fraction of the schedule, at its beginning, in which images have a quarter of their size."""
     crop: float = 0.5
     """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
 
@@ -170,13 +172,14 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
     return torch.cat((colors, images[:, 3:][nearest]), dim=1), classes[nearest]
 
 
-def _prepare(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, half: bool) -> tuple[torch.Tensor, torch.Tensor]:
-    """Augment a batch and normalize its colours: network input (B, 3 or 4, H, W) float32 in -0.5..0.5, and its classes. With `half`, images
-    are downsampled by two; otherwise they are cropped."""
-    values, crop = images.float() / 255, 1.0 if half else recipe.crop
+def prepare_batch(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Augment a batch and normalize its colours: network input (B, 3 or 4, H, W) float32 in -0.5..0.5, and its classes. `progress`, the
+    elapsed fraction of the schedule, determines whether images are downsampled by four or by two, or cropped."""
+    halvings = (progress < recipe.quarter) + (progress < max(recipe.half, recipe.quarter))
+    values, crop = images.float() / 255, 1.0 if halvings else recipe.crop
     if recipe.scale > 1 or crop < 1:
         values, classes = warp_views(values, classes, recipe, crop)
-    if half:
+    for _ in range(halvings):
         values, classes = halve_views(values, classes)
     colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
     if recipe.jpeg:
@@ -227,7 +230,7 @@ class _Trainer:
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        images, classes = _prepare(*pool.draw(self.recipe.batch), self.recipe, done < self.recipe.half)
+        images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, done)
         images = images.contiguous(memory_format=torch.channels_last)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.network(images)
