@@ -150,7 +150,10 @@ class CountProgress:
 
 
 def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> None:
-    """Print endings of the episodes, totals, and advice. Of more than `MAX_ROWS` episodes, only failed ones are listed."""
+    """Print endings of the episodes, totals, and advice; without episodes, only where the data set is.
+
+    Of more than `MAX_ROWS` episodes, only failed ones are listed.
+    """
     many = len(summary.episodes) > MAX_ROWS
     if many:
         console.print(_counts(summary))
@@ -160,19 +163,23 @@ def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> No
         console.print(_listing(rows[:MAX_ROWS]))
     if len(rows) > MAX_ROWS:
         console.print(f"and {len(rows) - MAX_ROWS} more that delivered nothing", markup=False)
-    rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
-    before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
-    console.print(
-        f"{len(summary.episodes) - len(failed)} of {summary.total} episodes{before} and {summary.views:,} views"
-        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements resampled: {summary.resampled}",
-        markup=False,
-        soft_wrap=True,
-    )
+    if summary.total:
+        console.print(_totals(summary, len(failed)), markup=False, soft_wrap=True)
     if summary.outcomes:
         console.print(_attempts(summary), markup=False, soft_wrap=True)
     for ending, advice in sorted(summary.remedies.items()):
         console.print(f"{_words(ending)}: {advice}", markup=False, soft_wrap=True)
     console.print(f"data set: {out}", markup=False, soft_wrap=True)
+
+
+def _totals(summary: BakeSummary, failed: int) -> str:
+    """Numbers of episodes and views, and the rate."""
+    rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
+    before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
+    return (
+        f"{len(summary.episodes) - failed} of {summary.total} episodes{before} and {summary.views:,} views"
+        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements resampled: {summary.resampled}"
+    )
 
 
 def print_profile(console: Console, recorder: Recorder) -> None:

@@ -228,7 +228,7 @@ def build_stages(
     config = fit_to_catalog(config, catalog, bins, device, progress)
     if longest_first and episodes is not None:
         episodes = order_longest_first(config, catalog, episodes, device)
-    progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
+    progress.stage(f"building worlds on {device.alias} (worlds: {config.bake.worlds}, objects: {len(catalog)})")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
     fixtures = make_fixtures(bins, config.gripper)
     scene = build_render_scene(

@@ -22,7 +22,7 @@ class Progress(Protocol):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
 
     def stage(self, text: str) -> None:
-        """A new stage starts, such as "building 512 worlds"."""
+        """A new stage starts, such as "building worlds"."""
         ...
 
     def update(

@@ -52,6 +52,10 @@ def test_a_bake_that_picked_tells_of_attempts():
     assert expected in text.splitlines()
 
 
+def test_a_bake_that_others_have_finished_says_where_it_is():
+    assert printed(BakeSummary()) == "data set: data\n"
+
+
 @pytest.mark.parametrize("many", [False, True])
 def test_endings_are_those_of_the_bin(many):
     given = EpisodeRow(0, 0, Ending.EMPTIED, 9, 1.0, "pick", 3, 3, 3, 0, 0, bin={"name": "kanban"})
