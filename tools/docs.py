@@ -130,13 +130,13 @@ def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     runs = newest_runs(read_runs())
     table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
-    shown = [runs[f"photographs_{name}.json"] for name in ("small", "ablation", "most", "native")]
+    shown = [runs[f"photographs_{name}.json"] for name in ("small", "main", "most", "native")]
     rows = [row for run in shown for row in run.rows if row.name.startswith("obj_id")]
     objects = msgspec.structs.replace(shown[0], rows=rows, shown=[])
-    levers = runs["photographs_levers.json"]
-    columns = {row: row.name.removeprefix(f"{row.part}: ") + " [%]" * row.unit.startswith("%") for row in levers.rows}
+    ablation = runs["photographs_ablation.json"]
+    columns = {row: row.name.removeprefix(f"{row.part}: ") + " [%]" * row.unit.startswith("%") for row in ablation.rows}
     turned = [Row(row.part, row.value, part=column) for row, column in columns.items() if row.name.startswith(row.part)]
-    pivots = {"objects": objects, "levers": msgspec.structs.replace(levers, rows=turned, shown=[])}
+    pivots = {"objects": objects, "ablation": msgspec.structs.replace(ablation, rows=turned, shown=[])}
     return _with_results(PHOTOGRAPHS, {"photographs": table} | {f"photographs_{name}": pivot_table(run) for name, run in pivots.items()})
 
 

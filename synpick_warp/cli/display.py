@@ -150,7 +150,7 @@ class CountProgress:
 
 
 def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> None:
-    """Print endings of the episodes, totals, and advice; without episodes, only where the data set is.
+    """Print a bake's summary: endings of the episodes, totals, advice and the data set's path. A bake without episodes has only the path.
 
     Of more than `MAX_ROWS` episodes, only failed ones are listed.
     """
@@ -173,7 +173,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> No
 
 
 def _totals(summary: BakeSummary, failed: int) -> str:
-    """Numbers of episodes and views, and the rate."""
+    """Numbers of episodes and views, and throughput, as a line."""
     rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
     before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     return (

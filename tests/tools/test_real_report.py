@@ -242,9 +242,9 @@ def test_a_worker_starts_anew_after_a_run_that_ends_it(monkeypatch, tmp_path):
     assert ended == [(True, True, "a 0"), (False, False, "a 1"), (True, True, "a 0"), (False, False, "a 1")]
 
 
-@pytest.mark.parametrize("name", ablation.LEVERS)
-def test_each_lever_changes_the_preset(name):
-    changes = dict(parse_assignment(text) for text in ablation.LEVERS[name])
+@pytest.mark.parametrize("name", ablation.COMPONENTS)
+def test_each_component_changes_the_preset(name):
+    changes = dict(parse_assignment(text) for text in ablation.COMPONENTS[name])
     assert load_config(PRESET, changes) != load_config(PRESET, {})
 
 
@@ -275,9 +275,9 @@ def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, caps
         (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(results(value))
     made = ablation.collect(tmp_path, jobs)
     assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
-    assert made["rows"][-1] == dataclasses.asdict(Row("obj_id 2: IoU", 0.5, part="all levers"))
-    assert made["rows"][0]["name"] == "all levers: mIoU"
-    assert made["more"]["seeds"]["all levers"]["mean_iou"] == [0.4, 0.6]
+    assert made["rows"][-1] == dataclasses.asdict(Row("obj_id 2: IoU", 0.5, part="24,000 views"))
+    assert made["rows"][0]["name"] == "24,000 views: mIoU"
+    assert made["more"]["seeds"]["24,000 views"]["mean_iou"] == [0.4, 0.6]
 
 
 def test_rows_go_on_after_one_that_fails(monkeypatch, tmp_path, capsys):

@@ -296,8 +296,8 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "jpeg": (Recipe.jpeg, "lowest JPEG quality of augmentation; 0: none"),
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
-        "half": (Recipe.half, "fraction of the training, at its beginning, with images of half the size or less"),
-        "quarter": (Recipe.quarter, "fraction of the training, at its beginning, with images of a quarter of the size"),
+        "half": (Recipe.half, "fraction of the training until which images have half the size"),
+        "quarter": (Recipe.quarter, "fraction of the training until which images have a quarter of the size; 0: never"),
         "crop": (Recipe.crop, "side length of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }

@@ -3,7 +3,8 @@
 Each row is a run of `tools.reports.real` for each seed. Runs start in order of priority on the next free GPU: the first seed of all rows
 before the second. A process of a GPU serves many runs. A run that cannot end by the deadline is skipped and printed as "left out". Times of
 runs are estimated from those that have ended. Runs with results in --out are not repeated, and the summary is written after each run.
-Without --out, only the schedule is printed. All rows are scored on the same photographs and the same held-out views, those of all levers.
+Without --out, only the schedule is printed. All rows are scored on the same photographs and on the same held-out views, which have the full
+randomization.
 
     python -m tools.reports.real.ablation --real REAL --models YCB --lights HDRI --gpus 4 --deadline 1400 --out OUT
 """
@@ -63,8 +64,10 @@ PASSES = 6.0
 """Number of epochs."""
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
-MIN_STEP_VIEWS = 48_000
-"""Number of training samples of runs with few views, equal to that of the others."""
+SAMPLES = 48_000
+"""Number of training samples of rows with few views: that of the baseline."""
+TRACED_LIMIT = 480.0
+"""Time limit of the row with path-traced views [s]: their stream takes 130 s."""
 
 CAMERAS = ("2", "5")
 """Cameras of the row with few positions, both 0.86 m from the middle of the table."""
@@ -73,7 +76,7 @@ VIEWS = 8
 
 _OFF = "[0.0, 0.0]"
 _EFFECTS = ("vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "contrast", "saturation")
-LEVERS: dict[str, tuple[str, ...]] = {
+COMPONENTS: dict[str, tuple[str, ...]] = {
     "places": ("arrangement.drop=layers", "bins.area=[0.8,0.55]"),
     "surfaces": ("randomize.surfaces=0", "randomize.table_color={uniform=[[0.05,0.05,0.05],[0.9,0.9,0.9]]}"),
     "distractors": ("randomize.distractors=off",),
@@ -82,7 +85,7 @@ LEVERS: dict[str, tuple[str, ...]] = {
     "lights": ("randomize.lamps=off", "randomize.exposure=off", "effects.exposure_jitter=0"),
     "materials": ("randomize.object_hue=off", "randomize.object_brightness=off", "randomize.object_roughness=off"),
 }
-"""Settings that switch a part of the randomization off, by its name."""
+"""Components of the randomization: the settings that switch each off."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ class Run:
         return min(self.limit, FIRST_VIEWS + self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
     def fit(self, left: float, start: float, slowdown: float = 1.0) -> Run | None:
-        """Fit the run into the remaining time: its detector is left out if there is no time for it.
+        """Check whether the run fits into the remaining time, and leave out its detector if only that does not.
 
         Args:
             left: Time until the deadline [s].
@@ -135,18 +138,18 @@ def _settings(*assignments: str) -> tuple[str, ...]:
 
 
 def plan(views: int, main_views: int) -> Iterator[Run]:
-    """Yield all rows in order of priority."""
+    """Yield all rows in order of priority. The second one, with the full randomization, is the baseline of the ablation."""
     tote = ("--stride", "3", "--worlds", "64", *_settings("bake.mode=mixed", "cameras.resolution=[320,240]"))
-    yield Run("all levers", main_views, passes=MAIN_PASSES, detector=DETECTOR if find_spec("torchvision") else 0.0)
-    yield Run("all levers, ablation's number of views", views)
+    yield Run(f"{main_views:,} views", main_views, passes=MAIN_PASSES, detector=DETECTOR if find_spec("torchvision") else 0.0)
+    yield Run(f"{views:,} views", views)
     yield Run("tote, not randomized", views, ("--config", "synpick", *tote))
     yield Run("tote, randomized", views, ("--config", "randomized", *tote))
-    for name, settings in LEVERS.items():
+    for name, settings in COMPONENTS.items():
         yield Run(f"without {name}", views, _settings(*settings))
     for amount in (1000, 3000):
-        yield Run(f"{amount:,} views", amount, passes=MIN_STEP_VIEWS / amount)
+        yield Run(f"{amount:,} views", amount, passes=SAMPLES / amount)
     traced = _settings("render.mode=reference", "render.samples=64")
-    yield Run("1,000 views, path-traced", 1000, traced, passes=MIN_STEP_VIEWS / 1000, rate=REFERENCE_RATE, limit=480.0)
+    yield Run("1,000 views, path-traced", 1000, traced, passes=SAMPLES / 1000, rate=REFERENCE_RATE, limit=TRACED_LIMIT)
     yield Run("without shadows and bounces", views, _settings("render.mode=unoccluded"))
     yield Run("two camera positions", views, ("--cameras", *CAMERAS), rate=STREAM_RATE * len(CAMERAS) / VIEWS)
     yield Run("without augmentation of the tensors", views, ("--scale", "1", "--jitter", "0", "--jpeg", "0"))
@@ -154,9 +157,9 @@ def plan(views: int, main_views: int) -> Iterator[Run]:
 
 
 def order(rows: list[Run]) -> list[tuple[Run, int]]:
-    """Runs in the order in which they start: all seeds of the first row, then the others by seed."""
-    first = [(run, seed) for run in rows[:1] for seed in range(run.seeds)]
-    return first + [(run, seed) for seed in range(3) for run in rows[1:] if seed < run.seeds]
+    """Execution order of the runs: all seeds of the first row, then the other rows by seed."""
+    jobs = [(run, seed) for run in rows for seed in range(run.seeds)]
+    return sorted(jobs, key=lambda job: -1 if job[0] is rows[0] else job[1])
 
 
 def print_plan(jobs: list[tuple[Run, int]], gpus: int, deadline: float) -> None:

@@ -10,17 +10,19 @@ import cv2
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
-from tools.reports.real.training import jitter_views
+from tools.reports.real.training import MAX_NORM, Recipe, jitter_views
 from tools.reports.real.views import Pool
 
 RATE, MOMENTUM, DECAY = 0.02, 0.9, 1e-4
 """SGD as of Mask R-CNN (He et al., ICCV 2017)."""
 MIN_SIDE = 6
 """Least width and height of a box that is trained on [px]."""
-JITTER = 0.3
-"""Strength of photometric changes."""
-LEAST_HEIGHT = 480
-"""Least height to which the detector resizes images [px]: the photographs'. Its finest anchors have sides of 32 px."""
+WARM_UP = 0.05
+"""Fraction of the training in which the learning rate rises linearly."""
+DECAYED = 0.7
+"""Fraction of the training after which the learning rate is a tenth."""
+MIN_HEIGHT = 480
+"""Minimum image height of the detector [px], that of the photographs: smaller images are upsampled. Its smallest anchors have 32 px."""
 
 
 def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -39,9 +41,9 @@ def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
-    """Train Faster R-CNN on the views of a pool for so many seconds; None without a torchvision that loads.
+    """Train Faster R-CNN on the views of a pool for a given time [s]; returns None if torchvision is not installed or does not load.
 
-    Steps whose gradient is not finite are skipped: one of them would leave weights without detections. Their number is printed.
+    Steps with a non-finite gradient are skipped and counted, since they would make all weights NaN.
     """
     try:
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]
@@ -49,7 +51,7 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
         return None
     views, classified = pool.tensors()
     height, width = views.shape[2:]
-    factor = max(1.0, LEAST_HEIGHT / height)
+    factor = max(1.0, MIN_HEIGHT / height)
     network = fasterrcnn_mobilenet_v3_large_fpn(
         weights=None,
         weights_backbone=None,
@@ -62,21 +64,21 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
     truth: dict[int, dict[str, torch.Tensor]] = {}
     started, random, steps, skipped = time.perf_counter(), np.random.default_rng(pool.seed), 0, 0
     while (done := (time.perf_counter() - started) / seconds) < 1.0:
-        optimizer.param_groups[0]["lr"] = RATE * min(1.0, 20 * done) * (1.0 if done < 0.7 else 0.1)
+        optimizer.param_groups[0]["lr"] = RATE * min(1.0, done / WARM_UP) * (1.0 if done < DECAYED else 0.1)
         chosen = random.integers(pool.count, size=batch).tolist()
         for index in chosen:
             if index not in truth:
                 boxes, ids = boxes_of(classified[index].cpu().numpy())
                 truth[index] = {"boxes": torch.from_numpy(boxes).to(device), "labels": torch.from_numpy(ids).to(device)}
-        images = jitter_views(views[chosen, :3].float() / 255, JITTER)
+        images = jitter_views(views[chosen, :3].float() / 255, Recipe.jitter)
         losses = network(list(images), [truth[index] for index in chosen])
         optimizer.zero_grad()
         torch.stack(list(losses.values())).sum().backward()
-        finite = bool(torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0).isfinite())
+        finite = bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM).isfinite())
         if finite:
             optimizer.step()
         steps, skipped = steps + 1, skipped + (not finite)
-    print(f"detector: {steps} steps, {skipped} of them skipped since the gradient was not finite")
+    print(f"detector: {steps} steps, {skipped} of them skipped because of a non-finite gradient")
     return network.eval()
 
 

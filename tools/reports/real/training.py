@@ -73,9 +73,9 @@ class Recipe:
     depth: bool = False
     """Whether the network sees depth beside colours."""
     half: float = 0.7
-    """Fraction of the schedule, at its beginning, in which images have half their size or less (progressive resizing)."""
+    """End of the stage with images of half the size, as a fraction of the schedule (progressive resizing)."""
     quarter: float = 0.0
-    """Fraction of the schedule, at its beginning, in which images have a quarter of their size."""
+    """End of the stage with images of a quarter of the size, which comes before, as a fraction of the schedule; 0: there is none."""
     crop: float = 0.5
     """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
 
@@ -173,9 +173,12 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
 
 
 def prepare_batch(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Augment a batch and normalize its colours: network input (B, 3 or 4, H, W) float32 in -0.5..0.5, and its classes. `progress`, the
-    elapsed fraction of the schedule, determines whether images are downsampled by four or by two, or cropped."""
-    halvings = (progress < recipe.quarter) + (progress < max(recipe.half, recipe.quarter))
+    """Augmentation and normalization of a batch; the elapsed fraction of the schedule, `progress`, determines the size of its images.
+
+    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W): downsampled by four or by two, or
+    random crops.
+    """
+    halvings = 2 if progress < recipe.quarter else int(progress < recipe.half)
     values, crop = images.float() / 255, 1.0 if halvings else recipe.crop
     if recipe.scale > 1 or crop < 1:
         values, classes = warp_views(values, classes, recipe, crop)
