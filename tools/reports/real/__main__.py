@@ -53,7 +53,6 @@ RANGES = {
     "scale": number_in(1.0, 4.0),
     "jpeg": number_in(0.0, 100.0),
     "half": _FRACTION,
-    "quarter": _FRACTION,
     "crop": number_in(0.1, 1.0),
 }
 """Argument types of the options that are not just non-negative numbers."""
@@ -191,6 +190,7 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
     rows += [
         row("training, in all", [one.trained.seconds for one in outcomes], "s"),
         row("of it the stream", [one.trained.stream_seconds for one in outcomes], "s"),
+        row("compilation of kernels, before", [one.trained.compile_seconds for one in outcomes], "s"),
         row("views", [float(one.trained.views) for one in outcomes]),
         row("loss at the end", [one.trained.losses[-1] for one in outcomes]),
     ]
@@ -257,6 +257,7 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
             "losses": one.trained.losses,
             "seconds": one.trained.seconds,
             "stream_seconds": one.trained.stream_seconds,
+            "compile_seconds": one.trained.compile_seconds,
             "views": one.trained.views,
             "samples": one.trained.samples,
             "limit": options.seconds,
@@ -289,7 +290,7 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         parser.add_argument(flag, type=positive_count, default=default, help=f"{text} (default: {default})")
     numbers = {
         "passes": (4.0, "number of epochs"),
-        "seconds": (280.0, "time limit of a training with its stream, of which the first views take at most half [s]"),
+        "seconds": (270.0, "time limit of a training with its stream, of which the first views take at most half [s]"),
         "scale": (Recipe.scale, "largest factor of augmentation by size; 1: no geometric augmentation"),
         "rotation": (Recipe.rotation, "half width of augmentation by rotation [°]"),
         "jitter": (Recipe.jitter, "strength of photometric augmentation; 0: none"),
@@ -297,7 +298,6 @@ def make_options(text: str | None = __doc__) -> argparse.ArgumentParser:
         "dice": (Recipe.dice, "weight of the Dice loss beside the cross entropy"),
         "rate": (Recipe.rate, "largest learning rate"),
         "half": (Recipe.half, "fraction of the training until which images have half the size"),
-        "quarter": (Recipe.quarter, "fraction of the training until which images have a quarter of the size; 0: never"),
         "crop": (Recipe.crop, "side length of random crops in the rest of the training, as a fraction of the image's; 1: whole images"),
         "detector": (0.0, "seconds to train a detector; 0: none"),
     }

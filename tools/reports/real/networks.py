@@ -15,6 +15,29 @@ DEPTHS = (2, 3, 4, 3)
 """Residual blocks of each level."""
 
 
+def enlarge(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
+    """Features (B, C, H, W) resized to `size` by bilinear interpolation, as PyTorch's without aligned corners.
+
+    Twice the size is computed from slices, which are compiled to one kernel in the precision of `x`. PyTorch's own operator takes float32
+    under autocast, and its compiled gradient adds with atomics, for 10 of a step's 27 ms (H200, U-Net of width 48).
+    """
+    if tuple(size) != (2 * x.shape[2], 2 * x.shape[3]):
+        return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
+    x = x.permute(0, 2, 3, 1)  # Channels are last in memory, and remain so.
+    for axis in (1, 2):
+        last = x.shape[axis] - 1
+        before = torch.cat((x.narrow(axis, 0, 1), x.narrow(axis, 0, last)), axis)
+        after = torch.cat((x.narrow(axis, 1, last), x.narrow(axis, last, 1)), axis)
+        x = torch.stack((0.75 * x + 0.25 * before, 0.75 * x + 0.25 * after), axis + 1).flatten(axis, axis + 1)
+    return x.permute(0, 3, 1, 2)
+
+
+class UNet(Network):
+    """U-Net of `tools.examples.train_online`, whose upsampling can be compiled well."""
+
+    enlarge = staticmethod(enlarge)
+
+
 class ResidualNetwork(nn.Module):
     """Residual U-Net: a stem of 1/2 of the image's size, levels of 1/2 to 1/16 with `width` to 8 x `width` channels, logits of 1/2.
 
@@ -41,9 +64,8 @@ class ResidualNetwork(nn.Module):
             x = level(x)
             skips.append(x)
         for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
-            x = functional.interpolate(x, size=skip.shape[2:], mode="bilinear", align_corners=False)
-            x = level(torch.cat((x, skip), dim=1))
-        return functional.interpolate(self.head(x), size=size, mode="bilinear", align_corners=False)
+            x = level(torch.cat((enlarge(x, skip.shape[2:]), skip), dim=1))
+        return enlarge(self.head(x), size)
 
 
 class _Block(nn.Module):
@@ -64,5 +86,5 @@ def _convolution(before: int, after: int, size: int = 3, stride: int = 1) -> nn.
     return nn.Sequential(nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.ReLU())
 
 
-NETWORKS: dict[str, Callable[[int, int, int], nn.Module]] = {"unet": Network, "residual": ResidualNetwork}
+NETWORKS: dict[str, Callable[[int, int, int], nn.Module]] = {"unet": UNet, "residual": ResidualNetwork}
 """Constructors by name, of numbers of classes, of channels and of input channels."""

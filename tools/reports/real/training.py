@@ -1,7 +1,7 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
-AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, crop,
-mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
+AdamW with a warm-up and a cosine schedule; on a GPU mixed precision (bfloat16) and compiled kernels. Augmentation is geometric (scale,
+rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Recipe:
     width: int
     """Channels of the network's first level."""
     seconds: float
-    """Time limit of rendering and training together [s], by which the schedule ends."""
+    """Time limit of rendering and training together [s], by which the schedule ends. Kernels are compiled before."""
     capacity: int
     """Views in the pool, at most."""
     scale: float = 1.5
@@ -74,8 +74,6 @@ class Recipe:
     """Whether the network sees depth beside colours."""
     half: float = 0.7
     """End of the stage with images of half the size, as a fraction of the schedule (progressive resizing)."""
-    quarter: float = 0.0
-    """End of the stage with images of a quarter of the size, which comes before, as a fraction of the schedule; 0: there is none."""
     crop: float = 0.5
     """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
 
@@ -89,7 +87,9 @@ class Trained:
     """Mean loss of each tenth of the training."""
     stream_seconds: float
     seconds: float
-    """Total time [s]."""
+    """Time of rendering and training together [s]."""
+    compile_seconds: float
+    """Time to compile kernels, beside `seconds`."""
     views: int
     samples: int
     """Views trained on, repeats counted."""
@@ -175,14 +175,12 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
 def prepare_batch(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Augmentation and normalization of a batch; the elapsed fraction of the schedule, `progress`, determines the size of its images.
 
-    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W): downsampled by four or by two, or
-    random crops.
+    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W): of half the size, or random crops.
     """
-    halvings = 2 if progress < recipe.quarter else int(progress < recipe.half)
-    values, crop = images.float() / 255, 1.0 if halvings else recipe.crop
+    values, crop = images.float() / 255, 1.0 if progress < recipe.half else recipe.crop
     if recipe.scale > 1 or crop < 1:
         values, classes = warp_views(values, classes, recipe, crop)
-    for _ in range(halvings):
+    if progress < recipe.half:
         values, classes = halve_views(values, classes)
     colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
     if recipe.jpeg:
@@ -197,11 +195,10 @@ def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) 
     # A view where channels are last in memory; softmax then reads rows.
     rows, truth = logits.permute(0, 2, 3, 1).flatten(0, 2).float(), classes.flatten()
     logs = rows.log_softmax(1)
-    loss = functional.nll_loss(logs, truth)
+    exact = (truth[:, None] == torch.arange(rows.shape[1], device=rows.device)).float()
+    loss = -(logs * exact).sum() / len(rows)  # PyTorch's `nll_loss` adds up rows in one block of threads, which takes 2 ms.
     if dice:
-        shares = logs.exp()
-        exact = torch.zeros_like(shares).scatter_(1, truth[:, None], 1.0)
-        sizes = exact.sum(0)
+        shares, sizes = logs.exp(), exact.sum(0)
         similar = 2 * (shares * exact).sum(0) / (shares.sum(0) + sizes).clamp(min=1.0)
         occurs = (sizes > 0).float()[1:]
         loss = loss + dice * (((1 - similar[1:]) * occurs).sum() / occurs.sum().clamp(min=1.0))
@@ -217,10 +214,13 @@ class _Trainer:
         self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
+        self._loss = torch.compile(self._evaluate, dynamic=False) if device.type == "cuda" else self._evaluate
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
         """Time before the first step, in which the first part of the pool was filled [s]."""
+        self.compiling = 0.0
+        """Time to compile kernels [s], which is not the schedule's."""
 
     @property
     def progress(self) -> float:
@@ -228,16 +228,32 @@ class _Trainer:
         left = max(self.recipe.seconds - self.waited, 1.0)
         return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
 
+    def _evaluate(self, images: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
+        """Loss of a batch, in mixed precision."""
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+            logits = self.network(images)
+        return segmentation_loss(logits, classes, self.recipe.dice)
+
+    def compile(self, pool: Pool) -> None:
+        """Compile the kernels of a step, with a batch of each size whose gradients are discarded."""
+        started = time.perf_counter()
+        for progress in (0.0, 1.0):
+            self._loss(*self._draw(pool, progress)).backward()
+        self.optimizer.zero_grad()
+        self.compiling = time.perf_counter() - started
+        self.started += self.compiling
+
+    def _draw(self, pool: Pool, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
+        """Augmented batch."""
+        images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, progress)
+        return images.contiguous(memory_format=torch.channels_last), classes
+
     def step(self, pool: Pool) -> None:
         """Train on a batch drawn from the pool, and append its loss to `losses`."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, done)
-        images = images.contiguous(memory_format=torch.channels_last)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self.network(images)
-        loss = segmentation_loss(logits, classes, self.recipe.dice)
+        loss = self._loss(*self._draw(pool, done))
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
@@ -256,6 +272,8 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches(recipe.views - pool.seen)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
+    if device.type == "cuda":
+        trainer.compile(pool)
     first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
@@ -268,5 +286,6 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     parts = [values[len(values) * part // 10 : max(1, len(values) * (part + 1) // 10)] for part in range(10)]
     losses = [sum(part) / len(part) for part in parts if part]
     seconds = time.perf_counter() - trainer.started
-    trained = Trained(trainer.network.eval(), losses, pool.seconds, seconds, pool.seen, len(values) * recipe.batch)
+    samples = len(values) * recipe.batch
+    trained = Trained(trainer.network.eval(), losses, pool.seconds, seconds, trainer.compiling, pool.seen, samples)
     return trained, pool
