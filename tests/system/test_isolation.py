@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -71,6 +73,19 @@ def test_a_server_that_has_ended_is_started_again():
     assert isolation._server._worker is not None
     isolation._server._worker.process.kill()
     assert list(run_isolated(math.sqrt, [(4.0,)], LIMITS)) == [2.0]
+
+
+def test_calls_that_lose_their_server_share_the_next_one():
+    """A call that started another server for itself would end the one that another call waits for."""
+    list(run_isolated(math.sqrt, [(4.0,)], LIMITS))
+    server, links, request = isolation._server._worker.process, isolation._Links(), pickle.dumps((math.sqrt, (4.0,)))
+    server.send_signal(signal.SIGSTOP)
+    with ThreadPoolExecutor(8) as threads:
+        calls = [threads.submit(links.call, request, LIMITS) for _ in range(8)]
+        while len(links._open) < len(calls):
+            time.sleep(0.01)
+        server.kill()
+        assert [call.result() for call in calls] == [2.0] * len(calls)
 
 
 def test_calls_that_are_left_end_wherever_they_are_collected():

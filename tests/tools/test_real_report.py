@@ -103,10 +103,13 @@ def test_the_interval_is_students():
 
 
 def test_average_precision_of_known_detections():
-    image = np.zeros((20, 20), np.uint8)
-    image[2:12, 3:13] = 5
-    boxes, ids = boxes_of(image)
-    np.testing.assert_array_equal(boxes, [[3, 2, 13, 12]])
+    images = torch.zeros(2, 20, 30, dtype=torch.uint8)
+    images[0, 2:12, 3:14] = 5
+    images[0, 19, 29] = 6  # One pixel is too small.
+    (boxes, ids), (none, _) = (tuple(one.numpy() for one in found) for found in boxes_of(images, 7))
+    np.testing.assert_array_equal(boxes, [[3, 2, 14, 12]])
+    np.testing.assert_array_equal(ids, [5])
+    assert none.shape == (0, 4)
     far = np.array([[0.0, 0.0, 2.0, 2.0]])
     truth = [(boxes, ids), (boxes, ids)]
     exact, wrong = (boxes, ids, np.array([0.5])), (far, ids, np.array([0.9]))

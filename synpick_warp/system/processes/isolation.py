@@ -82,25 +82,25 @@ class _Server:
         self._lock = threading.Lock()
         self._worker: WorkerProcess | None = None
 
-    def open_link(self, result: int, fresh: bool) -> socket.socket:
+    def open_link(self, result: int, failed: WorkerProcess | None) -> tuple[socket.socket, WorkerProcess]:
         """Ask the server for a process that writes its result into the file with handle `result`.
 
         Args:
             result: Handle of an open file.
-            fresh: Start another server first.
+            failed: Server that did not answer this call before, or None. It is replaced, once for all calls that it did not answer.
 
         Returns:
-            The link to the process's supervisor.
+            The link to the process's supervisor, and the server.
         """
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
-            if fresh or self._worker is None or self._worker.process.poll() is not None:
+            if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
                 self.stop()
                 program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
                 self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
             with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
                 socket.send_fds(control, [b"r"], [theirs.fileno(), result])
-        return ours
+            return ours, self._worker
 
     def stop(self) -> None:
         """End the server; running calls go on to their end."""
@@ -152,9 +152,10 @@ class _Links:
     def call(self, request: bytes, limits: Limits) -> Any:
         """Run a call in an isolated process within its limits; returns its result, or a `Failure` (too slow, too much memory, a crash)."""
         with _open_scratch() as result:
-            for attempt in range(2):
+            server = None
+            for _ in range(2):
                 try:
-                    link = _server.open_link(result.fileno(), fresh=attempt > 0)
+                    link, server = _server.open_link(result.fileno(), failed=server)
                 except OSError as error:
                     advice = "end other processes, or raise the limits"
                     raise ProcessError(f"no process can be started to read a file: {error.strerror}; {advice}") from error

@@ -166,7 +166,8 @@ def _detector(options: argparse.Namespace, pool: Pool, bench: Bench) -> float:
         print("detector: torchvision is not installed or does not load; left out")
         return float("nan")
     found = [detect(network, frame.color, bench.size, bench.target) for frame in bench.frames]
-    return average_precision(found, [boxes_of(frame.label) for frame in bench.frames])
+    truth = boxes_of(torch.from_numpy(np.stack([frame.label for frame in bench.frames])), 1 + MODELS)
+    return average_precision(found, [(boxes.numpy(), ids.numpy()) for boxes, ids in truth])
 
 
 def rows_of(outcomes: list[Outcome]) -> list[Row]:

@@ -25,19 +25,21 @@ MIN_HEIGHT = 480
 """Minimum image height of the detector [px], that of the photographs: smaller images are upsampled. Its smallest anchors have 32 px."""
 
 
-def boxes_of(classes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounding boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) of a label image; an object is all pixels of its obj_id.
+def boxes_of(labels: torch.Tensor, classes: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    """Bounding boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) int64 of each of the label images (B, H, W), on their device.
 
-    Boxes narrower or lower than MIN_SIDE are left out.
+    An object is all pixels of its obj_id, which is less than `classes`. Boxes narrower or lower than MIN_SIDE are left out.
     """
-    boxes, ids = [], []
-    for index in np.unique(classes[classes > 0]):
-        rows, columns = np.nonzero(classes == index)
-        box = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-        if min(box[2] - box[0], box[3] - box[1]) >= MIN_SIDE:
-            boxes.append(box)
-            ids.append(int(index))
-    return np.array(boxes, np.float32).reshape(-1, 4), np.array(ids, np.int64)
+    ids = torch.arange(1, classes, device=labels.device)
+    held = labels[:, None] == ids[:, None, None]
+    spans = []
+    for axis in (3, 2):  # Columns, then rows that have a pixel of the object.
+        occurs = held.any(5 - axis).byte()
+        spans.append((occurs.argmax(2), occurs.shape[2] - occurs.flip(2).argmax(2)))
+    (left, right), (top, bottom) = spans
+    large = held.flatten(2).any(2) & (torch.minimum(right - left, bottom - top) >= MIN_SIDE)
+    boxes = torch.stack((left, top, right, bottom), 2).float()
+    return [(found[kept], ids[kept]) for found, kept in zip(boxes, large, strict=True)]
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
@@ -61,17 +63,13 @@ def train_detector(pool: Pool, classes: int, device: torch.device, seconds: floa
         max_size=round(factor * width),
     ).to(device)
     optimizer = torch.optim.SGD(network.parameters(), RATE, momentum=MOMENTUM, weight_decay=DECAY)
-    truth: dict[int, dict[str, torch.Tensor]] = {}
     started, random, steps, skipped = time.perf_counter(), np.random.default_rng(pool.seed), 0, 0
     while (done := (time.perf_counter() - started) / seconds) < 1.0:
         optimizer.param_groups[0]["lr"] = RATE * min(1.0, done / WARM_UP) * (1.0 if done < DECAYED else 0.1)
         chosen = random.integers(pool.count, size=batch).tolist()
-        for index in chosen:
-            if index not in truth:
-                boxes, ids = boxes_of(classified[index].cpu().numpy())
-                truth[index] = {"boxes": torch.from_numpy(boxes).to(device), "labels": torch.from_numpy(ids).to(device)}
+        truth = [{"boxes": boxes, "labels": ids} for boxes, ids in boxes_of(classified[chosen], classes)]
         images = jitter_views(views[chosen, :3].float() / 255, Recipe.jitter)
-        losses = network(list(images), [truth[index] for index in chosen])
+        losses = network(list(images), truth)
         optimizer.zero_grad()
         torch.stack(list(losses.values())).sum().backward()
         finite = bool(torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_NORM).isfinite())
@@ -98,7 +96,7 @@ def average_precision(found: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]
 
     Args:
         found: Of each image, detections as of `detect`.
-        truth: Of each image, boxes and obj_ids as of `boxes_of`.
+        truth: Of each image, boxes (N, 4) [px] and obj_ids (N).
     """
     values = []
     for index in sorted({int(one) for _, ids in truth for one in ids}):
