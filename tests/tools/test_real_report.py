@@ -22,7 +22,7 @@ from tools.options import Row  # noqa: E402
 from tools.reports.real import OBJECT, ablation, interval, training, worker  # noqa: E402
 from tools.reports.real.__main__ import PRESET, make_options, recipe_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
-from tools.reports.real.networks import NETWORKS, enlarge  # noqa: E402
+from tools.reports.real.networks import NETWORKS, double  # noqa: E402
 from tools.reports.real.training import (  # noqa: E402
     Recipe,
     compress_views,
@@ -160,7 +160,7 @@ def test_the_loss_of_known_logits():
 @pytest.mark.parametrize("size", [(6, 8), (5, 9), (1, 1)])
 def test_features_of_twice_the_size_are_pytorchs(size):
     x = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
-    made = enlarge(x, torch.Size(2 * side for side in size))
+    made = double(x)
     known = torch.nn.functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
     assert torch.allclose(made, known)
     assert torch.allclose(*(torch.autograd.grad((one**2).sum(), x)[0] for one in (made, known)))
@@ -233,7 +233,7 @@ def test_views_keep_ahead_of_samples(monkeypatch):
 
 def test_the_command_lines_defaults_are_the_recipes():
     made = recipe_of(make_options().parse_args(["--real", "frames"]))
-    assert made == Recipe(views=24_000, passes=4.0, batch=16, width=48, seconds=270.0, capacity=24_000, half=0.7, dice=1.0, crop=0.5)
+    assert made == Recipe(views=24_000, passes=4.0, batch=16, width=48, seconds=280.0, capacity=24_000, half=0.7, dice=1.0, crop=0.5)
 
 
 def test_a_worker_starts_anew_after_a_run_that_ends_it(monkeypatch, tmp_path):

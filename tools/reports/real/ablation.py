@@ -32,9 +32,8 @@ from tools.options import Row, finite_seconds, make_parser, positive_count, writ
 from tools.reports.real import OBJECT, interval
 from tools.reports.real.worker import Worker
 
-START = 90.0
-"""Overhead of a process's first run, beside its training [s]: imports, loading of kernels and photographs, held-out views,
-compilation of the training's kernels, scoring."""
+START = 60.0
+"""Overhead of a process's first run, beside its training [s]: imports, loading of kernels and photographs, held-out views, scoring."""
 BETWEEN = 15.0
 """Overhead of a later run [s]: scoring, writing of files."""
 FIRST_VIEWS = 20.0
@@ -43,7 +42,7 @@ STREAM_RATE = 650.0
 """Throughput of a stream after its start-up [views/s]: still piles, 8 views each, 640x480, on an H100."""
 REFERENCE_RATE = 7.5
 """Throughput of the path tracer [views/s]: 640x480, 64 paths a pixel."""
-TRAIN_RATE = 800.0
+TRAIN_RATE = 500.0
 """Training throughput of the U-Net of width 48 [samples/s]: 320x240 pixels a sample, bfloat16, on an H100."""
 DETECTOR = 60.0
 """Training time of the detector [s]."""
@@ -99,7 +98,7 @@ class Run:
     seeds: int = 3
     passes: float = PASSES
     rate: float = STREAM_RATE
-    limit: float = 270.0
+    limit: float = 280.0
     """Time limit of rendering and training together [s]."""
     detector: float = 0.0
     """Training time of the detector, if there is enough time left [s]; 0: no detector."""

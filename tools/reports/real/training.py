@@ -1,6 +1,6 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
-AdamW with a warm-up and a cosine schedule; on a GPU mixed precision (bfloat16) and compiled kernels. Augmentation is geometric (scale,
+AdamW with a warm-up and a cosine schedule; on a GPU mixed precision (bfloat16), and kernels compiled on request. Augmentation is geometric (scale,
 rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
@@ -53,7 +53,7 @@ class Recipe:
     width: int
     """Channels of the network's first level."""
     seconds: float
-    """Time limit of rendering and training together [s], by which the schedule ends. Kernels are compiled before."""
+    """Time limit of rendering and training together [s], by which the schedule ends. Compilation comes before."""
     capacity: int
     """Views in the pool, at most."""
     scale: float = 1.5
@@ -72,6 +72,8 @@ class Recipe:
     """Architecture: a key of NETWORKS."""
     depth: bool = False
     """Whether the network sees depth beside colours."""
+    compile: bool = False
+    """Whether the training step is compiled (`torch.compile`)."""
     half: float = 0.7
     """End of the stage with images of half the size, as a fraction of the schedule (progressive resizing)."""
     crop: float = 0.5
@@ -214,7 +216,7 @@ class _Trainer:
         self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
-        self._loss = torch.compile(self._evaluate, dynamic=False) if device.type == "cuda" else self._evaluate
+        self._loss = torch.compile(self._evaluate, dynamic=False) if recipe.compile else self._evaluate
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
@@ -272,7 +274,7 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches(recipe.views - pool.seen)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
-    if device.type == "cuda":
+    if recipe.compile:
         trainer.compile(pool)
     first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started

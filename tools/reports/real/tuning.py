@@ -25,7 +25,7 @@ SLACK = 15.0
 """Time that a trial takes beside its training, for scores and files [s]."""
 
 
-SHARED = ("views", "capacity", "seconds", "depth")
+SHARED = ("views", "capacity", "seconds", "depth", "compile")
 """Hyper-parameters that all trials share, by the options of these names."""
 
 
