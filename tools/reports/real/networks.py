@@ -18,7 +18,8 @@ DEPTHS = (2, 3, 4, 3)
 def enlarge(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
     """Features (B, C, H, W) resized to `size` by bilinear interpolation: PyTorch's operator, or `double` in code that is compiled.
 
-    The operator takes float32 under autocast, and its compiled gradient adds with atomics, for 10 of a step's 27 ms (H200, U-Net of width 48).
+    The operator takes float32 under autocast, and its compiled gradient adds with atomics, for 10 of a step's 27 ms (H200, U-Net of width
+    48).
     """
     if torch.compiler.is_compiling() and tuple(size) == (2 * x.shape[2], 2 * x.shape[3]):
         return double(x)
@@ -26,7 +27,7 @@ def enlarge(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
 
 
 def double(x: torch.Tensor) -> torch.Tensor:
-    """Bilinear upsampling of features (B, C, H, W) to (B, C, 2H, 2W), by slices, which are compiled to one kernel in the precision of `x`."""
+    """Bilinear upsampling of features (B, C, H, W) to (B, C, 2H, 2W) by slices, which compile to one kernel of the precision of `x`."""
     x = x.permute(0, 2, 3, 1)  # Channels are last in memory, and remain so.
     for axis in (1, 2):
         last = x.shape[axis] - 1

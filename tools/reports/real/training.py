@@ -1,6 +1,6 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
-AdamW with a warm-up and a cosine schedule; on a GPU mixed precision (bfloat16), and kernels compiled on request. Augmentation is geometric (scale,
+AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU, compiled on request. Augmentation is geometric (scale,
 rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
