@@ -173,7 +173,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> No
 
 
 def _totals(summary: BakeSummary, failed: int) -> str:
-    """Numbers of episodes and views, and throughput, as a line."""
+    """One line with the numbers of episodes and views and the throughput."""
     rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
     before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     return (

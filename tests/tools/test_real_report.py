@@ -17,10 +17,11 @@ torch = pytest.importorskip("torch", exc_type=ImportError)
 scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
 from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
-from synpick_warp.errors import SynpickError  # noqa: E402
+from synpick_warp.errors import ConfigError, SynpickError  # noqa: E402
+from synpick_warp.system.hardware.device import pick_device  # noqa: E402
 from tools.options import Row  # noqa: E402
 from tools.reports.real import OBJECT, ablation, interval, training, worker  # noqa: E402
-from tools.reports.real.__main__ import PRESET, make_options, recipe_of  # noqa: E402
+from tools.reports.real.__main__ import PRESET, check_ids, make_options, recipe_of, source_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS, double  # noqa: E402
 from tools.reports.real.training import (  # noqa: E402
@@ -229,6 +230,18 @@ def test_views_keep_ahead_of_samples(monkeypatch):
     recipe = dataclasses.replace(RECIPE, views=40, capacity=40, width=2, seconds=60.0, passes=5.0)
     train(Drawn(), recipe, 2, torch.device("cpu"), 0)
     assert steps == [min(40, 8 + 4 * (1 + step // 4)) for step in range(50)]
+
+
+def test_images_and_objects_that_networks_cannot_have_are_named():
+    options = make_options().parse_args(
+        ["--real", "frames", "--config", "synpick", "--set", "cameras.resolution=[100,96]", "--enlarge", "1"]
+    )
+    with pytest.raises(ConfigError, match=r"100x96 px .* multiples of 16, or --jpeg 0"):
+        source_of(options, 0, pick_device("cpu"))
+    options.jpeg = 0.0
+    assert source_of(options, 0, pick_device("cpu")).config.rig.sizes[0] == (100, 96)
+    with pytest.raises(ConfigError, match="obj_id 22; allowed here: 1 to 21"):
+        check_ids([np.zeros((2, 2), np.uint8), np.full((3, 2), 22, np.uint8)])
 
 
 def test_the_command_lines_defaults_are_the_recipes():

@@ -87,10 +87,11 @@ class _Server:
 
         Args:
             result: Handle of an open file.
-            failed: Server that did not answer this call before, or None. It is replaced, once for all calls that it did not answer.
+            failed: Server of this call's first attempt, which exited without an answer; None at the first attempt. It is replaced once,
+                by whichever of its calls asks first.
 
         Returns:
-            The link to the process's supervisor, and the server.
+            Socket connected to the supervisor of the new process, and the server that was asked.
         """
         ours, theirs = socket.socketpair()
         with theirs, self._lock:

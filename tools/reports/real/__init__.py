@@ -12,7 +12,7 @@ OBJECT = "object"
 
 
 def interval(values: Sequence[float]) -> str:
-    """95 % confidence interval of the mean over seeds by Student's t, as text; for two seeds the two values, for one an empty string."""
+    """95 % confidence interval of the mean over seeds (Student's t), formatted; two values are listed, one gives an empty string."""
     if len(values) < 3:
         return f"({values[0]:.3g}, {values[1]:.3g})" if len(values) == 2 else ""
     reach = float(stats.t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))

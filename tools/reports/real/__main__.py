@@ -24,7 +24,7 @@ try:
     from tools.reports.real.detector import average_precision, boxes_of, detect, train_detector
     from tools.reports.real.networks import NETWORKS
     from tools.reports.real.scores import Scores, draw_overlay, predict, score, score_pool
-    from tools.reports.real.training import Recipe, Trained, train
+    from tools.reports.real.training import BLOCK, Recipe, Trained, train
     from tools.reports.real.views import Pool, Source, hold_out
 except ModuleNotFoundError as missing:
     raise SystemExit(f"reports.real: {missing.name} is not installed; pip install torch") from None
@@ -109,7 +109,20 @@ def open_bench(options: argparse.Namespace) -> Iterator[Bench]:
     with torch.cuda.stream(torch.cuda.Stream(device.alias) if device.is_cuda else None):
         source = source_of(options, 0, device)
         few = replace(source.config, bake=replace(source.config.bake, worlds=min(options.worlds, FEW_WORLDS)))
-        yield Bench(frames, hold_out(replace(source, config=few, episodes=HELD_OUT, cameras=None, depth=True), options.held_out), device)
+        held = hold_out(replace(source, config=few, episodes=HELD_OUT, cameras=None, depth=True), options.held_out)
+        check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])
+        yield Bench(frames, held, device)
+
+
+def check_ids(labels: list[np.ndarray]) -> None:
+    """Check that the networks have a class for each object of label images.
+
+    Raises:
+        ConfigError: An obj_id is larger than MODELS.
+    """
+    largest = max(int(label.max(initial=0)) for label in labels)
+    if largest > MODELS:
+        raise ConfigError(f"an object has obj_id {largest}; allowed here: 1 to {MODELS}, those of YCB-Video")
 
 
 def run_seed(options: argparse.Namespace, seed: int, bench: Bench) -> Iterator[Outcome]:
@@ -156,6 +169,9 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
     if options.enlarge > 1:
         sizes = [(options.enlarge * width, options.enlarge * height) for width, height in config.rig.sizes]
         config = replace(config, camera=tuple(map(resized, config.rig.rows, sizes)))
+    for width, height in config.rig.sizes:
+        if options.jpeg and (width % (2 * BLOCK) or height % (2 * BLOCK)):
+            raise ConfigError(f"images of {width}x{height} px cannot be augmented by JPEG; use multiples of {2 * BLOCK}, or --jpeg 0")
     return Source(config, TRAINING, options.stride, tuple(options.cameras or ()) or None, options.depth)
 
 
@@ -166,7 +182,7 @@ def _detector(options: argparse.Namespace, pool: Pool, bench: Bench) -> float:
         print("detector: torchvision is not installed or does not load; left out")
         return float("nan")
     found = [detect(network, frame.color, bench.size, bench.target) for frame in bench.frames]
-    truth = boxes_of(torch.from_numpy(np.stack([frame.label for frame in bench.frames])), 1 + MODELS)
+    truth = [boxes_of(torch.from_numpy(frame.label)[None], 1 + MODELS)[0] for frame in bench.frames]
     return average_precision(found, [(boxes.numpy(), ids.numpy()) for boxes, ids in truth])
 
 

@@ -65,7 +65,7 @@ PASSES = 6.0
 MAIN_PASSES = 16.0
 """Number of epochs of the first row. It is larger than the time limit allows, so that the whole time is used."""
 SAMPLES = 48_000
-"""Number of training samples of rows with few views: that of the baseline."""
+"""Number of training samples of the baseline and of the rows with fewer views."""
 TRACED_LIMIT = 480.0
 """Time limit of the row with path-traced views [s]: their stream takes 130 s."""
 
@@ -109,7 +109,7 @@ class Run:
         return min(self.limit, FIRST_VIEWS + self.views / self.rate + self.views * self.passes / TRAIN_RATE)
 
     def fit(self, left: float, start: float, slowdown: float = 1.0) -> Run | None:
-        """Check whether the run fits into the remaining time, and leave out its detector if only that does not.
+        """Fit the run into the remaining time, without its detector if there is no time for that.
 
         Args:
             left: Time until the deadline [s].

@@ -20,32 +20,36 @@ MIN_SIDE = 6
 WARM_UP = 0.05
 """Fraction of the training in which the learning rate rises linearly."""
 DECAYED = 0.7
-"""Fraction of the training after which the learning rate is a tenth."""
+"""Fraction of the training after which the learning rate is divided by 10."""
 MIN_HEIGHT = 480
-"""Minimum image height of the detector [px], that of the photographs: smaller images are upsampled. Its smallest anchors have 32 px."""
+"""Minimum height of the detector's input [px], that of the photographs; lower images are upsampled. Its smallest anchors have 32 px."""
 
 
 def boxes_of(labels: torch.Tensor, classes: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Bounding boxes (N, 4) float32 [px], exclusive maxima, and obj_ids (N) int64 of each of the label images (B, H, W), on their device.
+    """Bounding boxes of the objects in label images (B, H, W), of which each pixel has an obj_id less than `classes` or 0.
 
-    An object is all pixels of its obj_id, which is less than `classes`. Boxes narrower or lower than MIN_SIDE are left out.
+    Returns, for each image, boxes (N, 4) float32 [px] with exclusive maxima and their obj_ids (N) int64, on the device of the images. Boxes
+    with a side shorter than MIN_SIDE are left out.
     """
     ids = torch.arange(1, classes, device=labels.device)
     held = labels[:, None] == ids[:, None, None]
-    spans = []
-    for axis in (3, 2):  # Columns, then rows that have a pixel of the object.
-        occurs = held.any(5 - axis).byte()
-        spans.append((occurs.argmax(2), occurs.shape[2] - occurs.flip(2).argmax(2)))
-    (left, right), (top, bottom) = spans
-    large = held.flatten(2).any(2) & (torch.minimum(right - left, bottom - top) >= MIN_SIDE)
+    rows, columns = held.any(3), held.any(2)
+    (left, right), (top, bottom) = _extent(columns), _extent(rows)
+    large = rows.any(2) & (torch.minimum(right - left, bottom - top) >= MIN_SIDE)
     boxes = torch.stack((left, top, right, bottom), 2).float()
     return [(found[kept], ids[kept]) for found, kept in zip(boxes, large, strict=True)]
+
+
+def _extent(occupied: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """First and last index plus one along the last dimension at which a boolean tensor is true; 0 and its length if it is nowhere."""
+    values = occupied.byte()
+    return values.argmax(-1), values.shape[-1] - values.flip(-1).argmax(-1)
 
 
 def train_detector(pool: Pool, classes: int, device: torch.device, seconds: float, batch: int = 16) -> Any:
     """Train Faster R-CNN on the views of a pool for a given time [s]; returns None if torchvision is not installed or does not load.
 
-    Steps with a non-finite gradient are skipped and counted, since they would make all weights NaN.
+    Steps with a non-finite gradient are skipped and counted, as they would turn all weights into NaN.
     """
     try:
         from torchvision.models.detection import fasterrcnn_mobilenet_v3_large_fpn  # pyright: ignore[reportMissingImports]

@@ -91,7 +91,7 @@ class Trained:
     seconds: float
     """Time of rendering and training together [s]."""
     compile_seconds: float
-    """Time to compile kernels, beside `seconds`."""
+    """Compilation time, not included in `seconds`."""
     views: int
     samples: int
     """Views trained on, repeats counted."""
@@ -222,7 +222,7 @@ class _Trainer:
         self.waited = 0.0
         """Time before the first step, in which the first part of the pool was filled [s]."""
         self.compiling = 0.0
-        """Time to compile kernels [s], which is not the schedule's."""
+        """Compilation time, not included in the schedule [s]."""
 
     @property
     def progress(self) -> float:
@@ -237,7 +237,7 @@ class _Trainer:
         return segmentation_loss(logits, classes, self.recipe.dice)
 
     def compile(self, pool: Pool) -> None:
-        """Compile the kernels of a step, with a batch of each size whose gradients are discarded."""
+        """Warm-up: compile the training step by a forward and backward pass on images of each size; gradients are discarded."""
         started = time.perf_counter()
         for progress in (0.0, 1.0):
             self._loss(*self._draw(pool, progress)).backward()
