@@ -56,8 +56,6 @@ RANGES = {
     "crop": number_in(0.1, 1.0),
 }
 """Argument types of the options that are not just non-negative numbers."""
-SCALES = (0.8, 1.0, 1.25)
-"""Factors of the image's size over which predictions are averaged for `Outcome.averaged`: within those of the augmentation."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
 
@@ -68,8 +66,6 @@ class Outcome:
 
     trained: Trained
     real: Scores
-    averaged: Scores
-    """Scores on photographs of predictions that are averaged over SCALES."""
     synthetic: Scores
     overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
@@ -146,15 +142,11 @@ def recipe_of(options: argparse.Namespace) -> Recipe:
 def measure(trained: Trained, depth: bool, bench: Bench) -> Outcome:
     """Scores of a network, which sees colour or colour and depth, on real frames and on held-out views."""
     depths = [frame.depth * DEPTH_SCALE / MILLIMETERS if depth else None for frame in bench.frames]
-
-    def scored(scales: tuple[float, ...]) -> tuple[Scores, list[np.ndarray]]:
-        shown = zip(bench.frames, depths, strict=True)
-        found = [predict(trained.network, frame.color, bench.size, bench.target, measured, scales) for frame, measured in shown]
-        return score([(frame.name, one, frame.label) for frame, one in zip(bench.frames, found, strict=True)], 1 + MODELS), found
-
-    real, found = scored((1.0,))
+    shown = zip(bench.frames, depths, strict=True)
+    found = [predict(trained.network, frame.color, bench.size, bench.target, measured) for frame, measured in shown]
+    real = score([(frame.name, one, frame.label) for frame, one in zip(bench.frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(bench.frames, found, strict=True)]
-    return Outcome(trained, real, scored(SCALES)[0], score_pool(trained.network, bench.held, 1 + MODELS, 3 + depth), overlay)
+    return Outcome(trained, real, score_pool(trained.network, bench.held, 1 + MODELS, 3 + depth), overlay)
 
 
 def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
@@ -196,8 +188,6 @@ def rows_of(outcomes: list[Outcome]) -> list[Row]:
         row("real frames: mIoU", [one.real.mean_iou for one in outcomes]),
         row("real frames: instances with IoU above 0.5", [100 * one.real.found for one in outcomes], "%"),
         row("real frames: background taken for objects", [100 * one.real.background for one in outcomes], "%"),
-        row("real frames, averaged over sizes: mIoU", [one.averaged.mean_iou for one in outcomes]),
-        row("real frames, averaged over sizes: instances with IoU above 0.5", [100 * one.averaged.found for one in outcomes], "%"),
         row("synthetic, held out: mIoU", [one.synthetic.mean_iou for one in outcomes]),
         row("synthetic, held out: instances with IoU above 0.5", [100 * one.synthetic.found for one in outcomes], "%"),
         row("synthetic, held out: background taken for objects", [100 * one.synthetic.background for one in outcomes], "%"),
@@ -267,8 +257,6 @@ def _write(options: argparse.Namespace, outcomes: list[Outcome]) -> None:
             "mean_iou": one.real.mean_iou,
             "found": one.real.found,
             "background": one.real.background,
-            "averaged_mean_iou": one.averaged.mean_iou,
-            "averaged_found": one.averaged.found,
             "synthetic_mean_iou": one.synthetic.mean_iou,
             "instances": one.real.instances,
             "losses": one.trained.losses,

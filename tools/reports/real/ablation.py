@@ -54,8 +54,6 @@ METRICS = {
     "mean_iou": ("mIoU", "", 1.0),
     "found": ("instances with IoU above 0.5", "%", 100.0),
     "background": ("background taken for objects", "%", 100.0),
-    "averaged_mean_iou": ("mIoU, averaged over sizes", "", 1.0),
-    "averaged_found": ("instances with IoU above 0.5, averaged over sizes", "%", 100.0),
     "synthetic_mean_iou": ("synthetic mIoU", "", 1.0),
     "ap50": ("AP50", "", 1.0),
 }

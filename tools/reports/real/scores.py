@@ -51,36 +51,25 @@ class Scores:
 
 
 def predict(
-    network: nn.Module,
-    color: np.ndarray,
-    size: tuple[int, int],
-    device: torch.device,
-    depth: np.ndarray | None = None,
-    scales: Sequence[float] = (1.0,),
+    network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device, depth: np.ndarray | None = None
 ) -> np.ndarray:
-    """Test-time augmentation by size: obj_id of each pixel (H, W) uint8 by probabilities that are averaged over `scales`.
+    """Segmentation of an image: obj_id of each pixel (H, W) uint8.
 
     Args:
         network: Gives logits of an image.
         color: Colour image (H, W, 3) uint8.
-        size: Size (width, height) of the image that the network sees, times each scale [px].
+        size: Size (width, height) of the image that the network sees [px].
         device: Where the network is.
         depth: Depth (H, W) [m], if the network sees it.
-        scales: Factors of the size.
     """
-    shares = []
-    for scale in scales:
-        own = round(scale * size[0]), round(scale * size[1])
-        small = cv2.resize(color, own, interpolation=cv2.INTER_AREA)
-        image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
-        if depth is not None:
-            # A larger image is one from nearer.
-            nearest = cv2.resize((depth / scale).astype(np.float32), own, interpolation=cv2.INTER_NEAREST)
-            image = torch.cat((image, code_depth(torch.from_numpy(nearest))[None, None]), dim=1)
-        with torch.no_grad():
-            logits = network(image.to(device)).float()
-            shares.append(functional.interpolate(logits, size=color.shape[:2], mode="bilinear", align_corners=False).softmax(1)[0])
-    return torch.stack(shares).mean(0).argmax(0).to(torch.uint8).cpu().numpy()
+    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
+    if depth is not None:
+        nearest = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
+        image = torch.cat((image, code_depth(torch.from_numpy(nearest))[None, None]), dim=1)
+    with torch.no_grad():
+        logits = functional.interpolate(network(image.to(device)).float(), size=color.shape[:2], mode="bilinear", align_corners=False)
+    return logits[0].argmax(0).to(torch.uint8).cpu().numpy()
 
 
 def score(predictions: Iterable[tuple[str, np.ndarray, np.ndarray]], classes: int, least: int = 1) -> Scores:
