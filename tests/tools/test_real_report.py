@@ -171,6 +171,24 @@ def test_networks_have_logits_of_the_images_size(name):
     assert NETWORKS[name](5, 4, 4)(torch.zeros(2, 4, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="mixed precision is for GPUs")
+def test_compiled_steps_have_the_gradients_of_others_when_logits_are_large():
+    """Logits of 128 to 255 are rounded to integers, as bfloat16."""
+    torch.manual_seed(0)
+    images, classes = torch.rand(4, 3, 64, 64, device="cuda") - 0.5, torch.randint(22, (4, 64, 64), device="cuda")
+    losses, gradients = [], []
+    for compiled in (False, True):
+        trainer = training._Trainer(dataclasses.replace(RECIPE, compile=compiled), 22, torch.device("cuda"), 0)
+        trainer.network.head.weight.data *= 500
+        loss = trainer.evaluate(images, classes)
+        loss.backward()
+        losses.append(float(loss.detach()))
+        gradients.append(trainer.network.head.bias.grad)
+    assert losses[0] > 20
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=0.0, atol=0.05 * float(gradients[0].abs().max()))
+
+
 def test_a_trial_changes_what_it_names():
     assert changed(RECIPE, "base") == RECIPE
     made = changed(RECIPE, "dice=1,network=residual,width=4")

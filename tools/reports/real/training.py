@@ -216,7 +216,12 @@ class _Trainer:
         self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
-        self._loss = torch.compile(self._evaluate, dynamic=False) if recipe.compile else self._evaluate
+        self._predict, self._criterion = self.network, segmentation_loss
+        if recipe.compile:
+            # Two graphs, between which logits are rounded to bfloat16. In one, the fused softmax divides exponentials of rounded logits by
+            # the sum of those of unrounded ones: with logits of 64 the classes of a pixel add up to as much as 1.17, and gradients are wrong.
+            self._predict = torch.compile(self.network, dynamic=False)
+            self._criterion = torch.compile(segmentation_loss, dynamic=False)
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
@@ -230,17 +235,17 @@ class _Trainer:
         left = max(self.recipe.seconds - self.waited, 1.0)
         return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
 
-    def _evaluate(self, images: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
+    def evaluate(self, images: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
         """Loss of a batch, in mixed precision."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self.network(images)
-        return segmentation_loss(logits, classes, self.recipe.dice)
+            logits = self._predict(images)
+        return self._criterion(logits, classes, self.recipe.dice)
 
     def compile(self, pool: Pool) -> None:
         """Warm-up: compile the training step by a forward and backward pass on images of each size; gradients are discarded."""
         started = time.perf_counter()
         for progress in (0.0, 1.0):
-            self._loss(*self._draw(pool, progress)).backward()
+            self.evaluate(*self._draw(pool, progress)).backward()
         self.optimizer.zero_grad()
         self.compiling = time.perf_counter() - started
         self.started += self.compiling
@@ -255,7 +260,7 @@ class _Trainer:
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        loss = self._loss(*self._draw(pool, done))
+        loss = self.evaluate(*self._draw(pool, done))
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
