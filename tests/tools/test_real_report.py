@@ -172,6 +172,7 @@ def test_networks_have_logits_of_the_images_size(name):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="mixed precision is for GPUs")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's compiler imports what PyTorch has deprecated.
 def test_compiled_steps_have_the_gradients_of_others_when_logits_are_large():
     """Logits of 128 to 255 are rounded to integers, as bfloat16."""
     torch.manual_seed(0)
@@ -244,7 +245,7 @@ def test_views_keep_ahead_of_samples(monkeypatch):
     """An eighth of the views comes first, then a batch of four for each 16 samples."""
     steps, step = [], training._Trainer.step
     monkeypatch.setattr(training._Trainer, "step", lambda self, pool: (steps.append(pool.seen), step(self, pool)))
-    recipe = dataclasses.replace(RECIPE, views=40, capacity=40, width=2, seconds=60.0, passes=5.0)
+    recipe = dataclasses.replace(RECIPE, views=40, capacity=40, width=2, seconds=600.0, passes=5.0)
     train(Drawn(), recipe, 2, torch.device("cpu"), 0)
     assert steps == [min(40, 8 + 4 * (1 + step // 4)) for step in range(50)]
 

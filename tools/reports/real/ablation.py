@@ -44,7 +44,7 @@ REFERENCE_RATE = 7.5
 """Throughput of the path tracer [views/s]: 640x480, 64 paths a pixel."""
 TRAIN_RATE = 500.0
 """Training throughput of the U-Net of width 48 [samples/s]: 320x240 pixels a sample, bfloat16, on an H100."""
-DETECTOR = 60.0
+DETECTOR = 120.0
 """Training time of the detector [s]."""
 SLACK = 1.15
 """Safety factor on expected times: a run starts only if its expected time times SLACK is left."""

@@ -218,8 +218,8 @@ class _Trainer:
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self._predict, self._criterion = self.network, segmentation_loss
         if recipe.compile:
-            # Two graphs, between which logits are rounded to bfloat16. In one, the fused softmax divides exponentials of rounded logits by
-            # the sum of those of unrounded ones: with logits of 64 the classes of a pixel add up to as much as 1.17, and gradients are wrong.
+            # Two graphs, between which logits are rounded to bfloat16. In one, the softmax divides exponentials of rounded logits by a sum
+            # over unrounded ones: with logits of 64, a pixel's probabilities add up to as much as 1.17, and gradients are wrong.
             self._predict = torch.compile(self.network, dynamic=False)
             self._criterion = torch.compile(segmentation_loss, dynamic=False)
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
