@@ -74,7 +74,8 @@ def describe_misuse(error: CycloptsError) -> str:
     if not isinstance(error, MissingArgumentError) or error.argument is None:
         return str(error)
     if error.keyword is None:
-        return str(error) if words else f"{command} needs {error.argument.name}; see synpick-warp {command} --help"
+        extra = f", and {format_value(words[0])} is neither an option nor the value of one" if words else ""
+        return f"{command} needs {error.argument.name}{extra}; see synpick-warp {command} --help"
     value = next(iter(words[words.index(error.keyword) + 1 :]), "") if error.keyword in words else ""
     return f"{error.keyword} has no value" + (f"; if {value} is one, write {error.keyword}={value}" if value.startswith("-") else "")
 

@@ -154,6 +154,13 @@ def test_incomplete_command_lines(arguments):
     mistake(*arguments)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"), [([], ""), (["set"], ""), (["set", "a.csv"], ', and "a.csv" is neither an option nor the value of one')]
+)
+def test_a_missing_option_is_named_with_a_word_too_many(words, said):
+    assert mistake("eval", *words) == f"eval needs --results{said}; see synpick-warp eval --help"
+
+
 def test_formats_and_share_are_passed_on(tmp_path, bakes):
     assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--formats=zarr, bop", "--shard=1/3"]) == 0
     [(config, _, shard, _)] = bakes.calls
