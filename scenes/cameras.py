@@ -1,8 +1,9 @@
-"""Cameras of a rig: matrices and poses in float64, and what each episode draws of them."""
+"""Cameras of a rig: matrices and poses in float64, what each episode draws of them, and which stand in the gripper's way."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,12 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.codes import Stream
 from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig, lens_map
+from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.episodes.manipulation import Pick
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.random_numbers import stream_key, uniform
@@ -77,6 +83,24 @@ def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarra
     return np.stack([right, np.cross(forward, right), forward])
 
 
+def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
+    """Whether a position lies in the gripper's swept volume during picks from a bin, where a camera sees only the shaft."""
+    top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
+    aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
+    return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
+
+
+def describe_blocked(config: Config) -> list[str]:
+    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none where no episode picks."""
+    rig, bins = config.rig, config.cell.bins
+    fixed = [camera for camera in make_cameras(rig) if camera.fixed_to == WORLD] if may_pick(config.bake, config.splits) else []
+    return [
+        f"camera {camera.name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
+        for camera in fixed
+        if any(is_in_way(camera.center, each, config.gripper, config.pick) for each in bins)
+    ]
+
+
 class EpisodeCameras:
     """Cameras of episodes and views, where these are not those of the rig: in float64, from seed, episode and camera alone.
 
@@ -127,7 +151,7 @@ class EpisodeCameras:
         matrix = camera.matrix.copy()
         matrix[[0, 1], [0, 1]] *= 1.0 + focal_length
         matrix[:2, 2] += center
-        at = position - camera.rotation.T @ camera.translation
+        at = position + camera.center
         turned = Rotation.from_rotvec(rotation, degrees=True).as_matrix().T @ camera.rotation
         lens = with_matrix(camera.lens, matrix)
         return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at, lens=lens)

@@ -217,6 +217,11 @@ class Camera:
     """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
 
     @property
+    def center(self) -> np.ndarray:
+        """Optical centre (3) in the frame that the camera is fixed to [m]."""
+        return -self.rotation.T @ self.translation
+
+    @property
     def distortion(self) -> dict[str, Any]:
         """Model and OpenCV's coefficients of the lens, as keys of BOP's files; none of a pinhole."""
         return {} if self.lens is None else {"cam_dist_model": self.lens.lens.model, "cam_dist": list(self.lens.lens.coefficients)}

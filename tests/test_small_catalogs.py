@@ -20,6 +20,9 @@ SETTINGS = {key: value for key, value in (QUICK | PICKING | TINY).items() if not
 }
 """Settings of quick bakes, with the budget and the capacity of the preset `smoke`: 3 litres, 24 objects."""
 
+IN_WAY, ASIDE = [0.1, 0.1, 0.6], [0.0, 0.6, 1.0]
+"""Positions of cameras [m]."""
+
 
 @pytest.mark.parametrize(
     ("mode", "sizes"),
@@ -61,10 +64,11 @@ def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
     """There was one object in the tote, and no word."""
     (tmp_path / "models").mkdir()
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "models" / "box.ply")
-    config = load_config("smoke", SETTINGS | {"bake.mode": "pick", "bake.models": str(tmp_path / "models")})
+    settings = {"bake.mode": "pick", "bake.models": str(tmp_path / "models"), "cameras.positions": [IN_WAY, ASIDE, IN_WAY]}
     progress = Notes()
-    summary = run_bake(config, tmp_path / "out", progress)
+    summary = run_bake(load_config("smoke", SETTINGS | settings), tmp_path / "out", progress)
     assert [row.objects for row in summary.episodes] == [3]
+    assert [line.split(" stands")[0] for line in progress.lines if "in the gripper's way" in line] == ["camera camera_0", "camera camera_2"]
     assert "1 objects take 0.001 of 0.003 m³ together, so that they repeat in an episode" in progress.lines
 
 

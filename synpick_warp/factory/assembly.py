@@ -30,7 +30,7 @@ from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
-from synpick_warp.scenes.cameras import EpisodeCameras
+from synpick_warp.scenes.cameras import EpisodeCameras, describe_blocked
 from synpick_warp.scenes.capacities import FEW, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
@@ -221,7 +221,7 @@ def build_stages(
     episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
     cameras = episode_cameras.cameras
     bins = make_bins(config.cell.bins)
-    for line in (line for one in bins for line in one.notes):
+    for line in [*(line for one in bins for line in one.notes), *describe_blocked(config)]:
         progress.note(line)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)

@@ -13,14 +13,13 @@ import pytest
 import trimesh
 
 from synpick_warp.apps.viz.cell.frusta import project
-from synpick_warp.apps.viz.cell.poses import describe_blocked
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.cell.rig import intrinsics
 from synpick_warp.configs.files.cell_file import WIDTH
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.cameras import describe_blocked, make_cameras
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import OBJ, exported, put
@@ -147,7 +146,7 @@ def test_a_camera_is_that_of_its_calibration_and_sees_the_bin(tmp_path, drawn, f
         pixels, depth = project(camera, np.array(config.cell.bins[0].corners))
         assert (depth > 0.0).all()
         assert ((pixels > 0.0) & (pixels < (320.0, 240.0))).all()
-        assert not describe_blocked(config.bake.mode, config.rig, config.cell.bins, config.gripper, config.pick)
+        assert not describe_blocked(config)
         # No farther than needed: the bin reaches a border that is kept free.
         assert np.min([pixels, (320.0, 240.0) - pixels]) < 0.06 * 320
     assert path.read_bytes() == before

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_camera, footprint, image_border, project, rays
-from synpick_warp.apps.viz.cell.poses import describe_blocked
+from synpick_warp.apps.viz.cell.frusta import Canvas, draw_camera, footprint, image_border, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.bin_meshes.loading import load_settings
+from synpick_warp.scenes.cameras import describe_blocked
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
@@ -139,7 +139,7 @@ def test_what_a_camera_covers_is_said():
 )
 def test_a_camera_in_the_way_of_the_gripper_is_named(settings, blocked):
     config = load_config("smoke", {"bake.mode": "pick"} | settings)
-    lines = describe_blocked(config.bake.mode, config.rig, config.cell.bins, config.gripper, config.pick)
+    lines = describe_blocked(config)
     assert [int(line[14]) for line in lines] == blocked
     assert all(line.startswith("camera camera_") and " stands over the t" in line for line in lines)
 
@@ -151,7 +151,7 @@ def test_a_camera_on_the_gripper_is_where_the_gripper_is_drawn():
     placed = scene.placed(replace(TOP, fixed_to="gripper"))
     # The gripper's shaft ends at the wrist axis, a cup's length above the cup, which is 0.15 m over the rim.
     rim = config.tote.outer_size[2] - config.tote.wall
-    assert center(placed) == pytest.approx((0.1, 0.2, 2.0 + rim + 0.15 + config.gripper.cup_length))
+    assert placed.center == pytest.approx((0.1, 0.2, 2.0 + rim + 0.15 + config.gripper.cup_length))
     assert (placed.fixed_to, scene.placed(TOP)) == ("world", TOP)
 
 

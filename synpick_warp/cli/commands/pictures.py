@@ -154,12 +154,12 @@ def draw_cell(
         SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
     """
     config = load_settings(preset_or_file)
-    from synpick_warp.apps.viz.cell.poses import describe_blocked
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
+    from synpick_warp.scenes.cameras import describe_blocked
 
     scene = CellScene(config, progress, say, objects)
-    for line in describe_blocked(config.bake.mode, config.rig, config.cell.bins, config.gripper, config.pick):
+    for line in describe_blocked(config):
         say(line)
     progress.stage(f"rendering {len(config.rig)} cameras")
     write_cell_sheet(scene, config.rig, config.bins, name, out)

@@ -51,11 +51,6 @@ def rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([flat, np.ones(len(flat))]) @ camera.rotation
 
 
-def center(camera: Camera) -> np.ndarray:
-    """Optical centre (3) [m]."""
-    return -camera.rotation.T @ camera.translation
-
-
 def image_border(camera: Camera, points: int = _EDGE) -> np.ndarray:
     """Points (4 points, 2) along the border of an image, clockwise from its top left corner [px]."""
     along = np.arange(points) / points
@@ -66,7 +61,7 @@ def image_border(camera: Camera, points: int = _EDGE) -> np.ndarray:
 def footprint(camera: Camera, height: float, most: float) -> tuple[np.ndarray, np.ndarray]:
     """Where the rays of an image's border meet a horizontal plane (n, 3), and whether they do within a depth of `most` [m]; of the others,
     the point at that depth."""
-    at, along = center(camera), rays(camera, image_border(camera))
+    at, along = camera.center, rays(camera, image_border(camera))
     with np.errstate(divide="ignore"):
         depth = np.where(along[:, 2] < 0.0, (height - at[2]) / along[:, 2], np.inf)
     meets = (depth > 0.0) & (depth <= most)
@@ -145,7 +140,7 @@ class Canvas:
 def draw_camera(canvas: Canvas, camera: Camera, label: str, color: Color, *, size: float, floor: float, most: float) -> None:
     """Draw a camera as a pyramid of depth `size`, with a triangle on its upper side, and its rays down to a floor, or to a depth of `most`
     [m]."""
-    at, along = center(camera), rays(camera, image_border(camera, 1))
+    at, along = camera.center, rays(camera, image_border(camera, 1))
     ends = at + size / max(1.0, np.linalg.norm(along, axis=1).max() / _WIDE) * along
     for end in ends:
         canvas.line(at, end, color, 2)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from synpick_warp.apps.viz.cell.frusta import center, project
-from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Cameras, Pose
+from synpick_warp.apps.viz.cell.frusta import project
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.episodes.manipulation import Pick
-from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.cameras import is_in_way, make_cameras
 
 _DIRECTIONS = ((90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))
 """Azimuth and elevation from which the cameras look at the bin [°]: the first from above."""
@@ -34,24 +33,6 @@ def pose_for(row: CameraRow, index: int, sizes: BinSizes) -> Pose:
         if elevation <= _LOWEST or not is_in_way(pose.position or (), sizes, Gripper(), Pick()):
             return pose
         elevation -= _STEP
-
-
-def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
-    """Whether a position lies in the gripper's swept volume during picks from a bin, where a camera sees only the shaft."""
-    top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
-    aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
-    return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
-
-
-def describe_blocked(mode: str, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
-    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none in mode move, which does not pick."""
-    named = zip(rig.names, make_cameras(rig), strict=True) if mode != "move" else ()
-    fixed = ((name, center(camera)) for name, camera in named if camera.fixed_to == WORLD)
-    return [
-        f"camera {name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
-        for name, place in fixed
-        if any(is_in_way(place, each, gripper, pick) for each in bins)
-    ]
 
 
 def _nearest(row: CameraRow, azimuth: float, elevation: float, up: tuple[float, float, float], sizes: BinSizes) -> Pose:

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.cell.frusta import Canvas, center, draw_axes, draw_camera, project, rays
+from synpick_warp.apps.viz.cell.frusta import Canvas, draw_axes, draw_camera, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, scaled_down
 from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, check_picture_name, put_text, write_picture
 from synpick_warp.configs.cell.bins import Bins
@@ -71,7 +71,7 @@ def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
     """Overview camera whose image contains all cameras, bins and the gripper; a shifted principal point centres them."""
     corners = np.array([corner for one in scene.sizes for corner in one.corners])
     top = (*scene.tcp[:2], scene.tcp[2] + scene.config.gripper.cup_length + scene.config.gripper.finger_length)
-    points = np.concatenate([corners, [center(camera) for camera in cameras], [scene.tcp, top]])
+    points = np.concatenate([corners, [camera.center for camera in cameras], [scene.tcp, top]])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
     azimuth, elevation = math.radians(_AZIMUTH), math.radians(_ELEVATION)
     back = np.array((math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)))
@@ -96,7 +96,7 @@ def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
 
 def _size_of(cameras: tuple[Camera, ...], scene: CellScene) -> float:
     """Size of a cell [m]: its largest extent."""
-    points = [corner for one in scene.sizes for corner in one.corners] + [tuple(center(camera)) for camera in cameras]
+    points = [corner for one in scene.sizes for corner in one.corners] + [tuple(camera.center) for camera in cameras]
     return float(np.ptp(np.array(points), axis=0).max())
 
 
@@ -147,7 +147,7 @@ def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
     pixels, depth = project(camera, np.array(bin.inner_corners))
     inside = (depth > 0.0) & (pixels >= 0.0).all(axis=1) & (pixels <= (width, height)).all(axis=1)
     forward = camera.rotation[2]
-    distance = (bin.origin[2] - center(camera)[2]) / forward[2] if forward[2] < 0.0 else math.inf
+    distance = (bin.origin[2] - camera.center[2]) / forward[2] if forward[2] < 0.0 else math.inf
     floor = f"{distance:.2f} m to the floor, {1e3 * distance / fx:.2g} mm/px" if distance < math.inf else "looks up"
     return [
         f"{name}: {width} x {height} px, {across:.1f} x {down:.1f} deg",
