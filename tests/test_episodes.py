@@ -42,13 +42,15 @@ def test_each_capacity_of_physics_is_named_after_one_overflow():
     assert [sum(f"{name} (" in remedy(ending, *SECTIONS) for ending in OVERFLOWS) for name in capacities] == [1] * 4
 
 
-@pytest.mark.parametrize(("name", "noun"), [("", "tote"), ("tote", "tote"), ("table", "table"), ("kanban", "bin")])
-def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, noun):
+@pytest.mark.parametrize(
+    ("name", "place"), [("", "in the tote"), ("tote", "in the tote"), ("table", "on the table"), ("kanban", "in the bin")]
+)
+def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, place):
     record = bin_record(name, np.array([0.1, -0.2, 0.0, 0.0, 0.0, -0.5, np.sqrt(0.75)], np.float32)) if name else None
     assert record is None or record == {"name": name, "position": [0.1, -0.2, 0.0], "yaw": pytest.approx(-np.pi / 3, abs=1e-6)}
     row = EpisodeRow(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", bin=record)
     line = row.as_json()
     assert ("bin" in line) == bool(name)
-    assert line["sentence"] == f"no object is left in the {noun}"
+    assert line["sentence"] == f"no object is left {place}"
     assert EpisodeRow.from_json(line) == row
     assert check_content(json.loads(json.dumps(line)), Row, "a line").split == "val"

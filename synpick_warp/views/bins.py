@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 _DIGITS = 6
+_FLAT = ("table", "pallet")
+"""Names of bins without walls."""
 
 
 def bin_record(name: str, pose: np.ndarray) -> dict[str, Any]:
@@ -22,4 +24,7 @@ def name_bin(sentence: str, record: Mapping[str, Any] | None) -> str:
     """Sentence on an episode's tote, said of the bin that it has; None: a tote that is always in its place."""
     if record is None:
         return sentence
-    return sentence.replace("tote", record["name"] if record["name"] in ("tote", "table", "pallet") else "bin")
+    name = record["name"]
+    if name in _FLAT:
+        sentence = sentence.replace("in the tote", "on the tote")
+    return sentence.replace("tote", name if name in ("tote", *_FLAT) else "bin")
