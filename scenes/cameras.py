@@ -16,9 +16,7 @@ from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig, lens_map
-from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.episodes.manipulation import Pick
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.random_numbers import stream_key, uniform
@@ -90,14 +88,12 @@ def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gri
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 
-def describe_blocked(config: Config) -> list[str]:
-    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none where no episode picks."""
-    rig, bins = config.rig, config.cell.bins
-    fixed = [camera for camera in make_cameras(rig) if camera.fixed_to == WORLD] if may_pick(config.bake, config.splits) else []
+def describe_blocked(rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
+    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each."""
     return [
         f"camera {camera.name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
-        for camera in fixed
-        if any(is_in_way(camera.center, each, config.gripper, config.pick) for each in bins)
+        for camera in make_cameras(rig)
+        if camera.fixed_to == WORLD and any(is_in_way(camera.center, each, gripper, pick) for each in bins)
     ]
 
 

@@ -154,11 +154,13 @@ def test_a_line_is_json_with_the_keys_of_the_format(picked):
     }
 
 
-@pytest.mark.parametrize(("name", "noun"), [(None, "tote"), ("tote", "tote"), ("pallet", "pallet"), ("kanban", "bin")])
-def test_a_line_names_the_bin_of_its_episode(picked, name, noun):
+@pytest.mark.parametrize(
+    ("name", "place"), [(None, "in the tote"), ("tote", "in the tote"), ("pallet", "on the pallet"), ("kanban", "in the bin")]
+)
+def test_a_line_names_the_bin_of_its_episode(picked, name, place):
     unseen = replace(picked.attempts[0], outcome=Outcome.NOTHING_SEEN)
     record = None if name is None else {"name": name, "position": [0.0, 0.0, 0.0], "yaw": 0.0}
-    assert json.loads(unseen.line(record))["sentence"] == f"no object in the {noun} is visible"
+    assert json.loads(unseen.line(record))["sentence"] == f"no object {place} is visible"
 
 
 def test_explain_reads_what_is_written(picked, tmp_path):

@@ -51,12 +51,12 @@ def test_plates_of_a_millimetre_come_to_rest(tmp_path):
     """All 20 arrangements had more contacts than the solver has capacity for by default: 24 plates have 700."""
     (tmp_path / "models").mkdir()
     trimesh.creation.box((0.1, 0.08, 0.001)).export(tmp_path / "models" / "plate.ply")
-    config = load_config("smoke", SETTINGS | {"bake.mode": "move", "bake.models": str(tmp_path / "models")})
+    settings = {"bake.mode": "move", "bake.models": str(tmp_path / "models"), "cameras.positions": [IN_WAY, ASIDE, IN_WAY]}
     progress = Notes()
-    summary = run_bake(config, tmp_path / "out", progress)
+    summary = run_bake(load_config("smoke", SETTINGS | settings), tmp_path / "out", progress)
     assert [(row.ending.delivers, row.objects) for row in summary.episodes] == [(True, 24)]
     assert summary.views > 0
-    assert not any("more contacts arose" in line for line in progress.lines)
+    assert not any("more contacts arose" in line or "in the gripper's way" in line for line in progress.lines)
     assert sum("thin objects: capacity for" in line for line in progress.lines) == 1
 
 

@@ -221,7 +221,7 @@ def build_stages(
     episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
     cameras = episode_cameras.cameras
     bins = make_bins(config.cell.bins)
-    for line in [*(line for one in bins for line in one.notes), *describe_blocked(config)]:
+    for line in (line for one in bins for line in one.notes):
         progress.note(line)
     catalog = load_catalog(config, report=progress.note)
     lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
@@ -271,6 +271,8 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
     if may_pick(config.bake, config.splits):
         check_reach(config.gripper, config.suction, catalog)
+        for line in describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick):
+            progress.note(line)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

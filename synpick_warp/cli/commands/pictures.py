@@ -156,11 +156,13 @@ def draw_cell(
     config = load_settings(preset_or_file)
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
+    from synpick_warp.configs.dataset.modes import may_pick
     from synpick_warp.scenes.cameras import describe_blocked
 
     scene = CellScene(config, progress, say, objects)
-    for line in describe_blocked(config):
-        say(line)
+    if may_pick(config.bake, config.splits):
+        for line in describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick):
+            say(line)
     progress.stage(f"rendering {len(config.rig)} cameras")
     write_cell_sheet(scene, config.rig, config.bins, name, out)
 
