@@ -14,7 +14,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,6 +128,25 @@ def read_frame(folder: Path, name: str) -> RealFrame:
         )
     except (KeyError, TypeError, ValueError) as fault:
         raise DatasetError(f"{path} is no record of poses: {fault}") from None
+
+
+def copy_frames(folder: Path, labels: Mapping[str, np.ndarray], out: Path) -> None:
+    """Copy frames with other labels, such as predicted ones; files of these names are replaced.
+
+    Args:
+        folder: Frames.
+        labels: obj_id of each pixel (H, W) uint8, by name of the frame.
+        out: Folder, which is made if it is missing, in one that exists.
+
+    Raises:
+        OutputError: `out` cannot be written.
+    """
+    with output_errors(out):
+        out.mkdir(exist_ok=True)
+        for name, label in labels.items():
+            for ending in ("color.png", "depth.png", "poses.json"):
+                shutil.copyfile(folder / f"{name}-{ending}", out / f"{name}-{ending}")
+            cv2.imwrite(str(out / f"{name}-label.png"), label)
 
 
 def _read(path: Path) -> bytes:
