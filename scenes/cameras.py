@@ -88,11 +88,11 @@ def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gri
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 
-def describe_blocked(rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
-    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each."""
+def describe_blocked(picks: bool, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
+    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none if no episode `picks`."""
     return [
         f"camera {camera.name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
-        for camera in make_cameras(rig)
+        for camera in (make_cameras(rig) if picks else ())
         if camera.fixed_to == WORLD and any(is_in_way(camera.center, each, gripper, pick) for each in bins)
     ]
 

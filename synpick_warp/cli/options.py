@@ -69,13 +69,13 @@ def one_line(text: str) -> str:
 def describe_misuse(error: CycloptsError) -> str:
     """Message of a command line that does not parse; names the word that is too many, the option that is missing, or has no value."""
     command, words = " ".join(error.command_chain or ()), list(error.unused_tokens or [])
+    extra = f"{format_value(words[0])} is neither an option nor the value of one" if words else ""
     if isinstance(error, UnusedCliTokensError) and words:
-        return f"{format_value(words[0])} is neither an option nor the value of one; see synpick-warp {command} --help"
+        return f"{extra}; see synpick-warp {command} --help"
     if not isinstance(error, MissingArgumentError) or error.argument is None:
         return str(error)
     if error.keyword is None:
-        extra = f", and {format_value(words[0])} is neither an option nor the value of one" if words else ""
-        return f"{command} needs {error.argument.name}{extra}; see synpick-warp {command} --help"
+        return f"{command} needs {error.argument.name}{', and ' if extra else ''}{extra}; see synpick-warp {command} --help"
     value = next(iter(words[words.index(error.keyword) + 1 :]), "") if error.keyword in words else ""
     return f"{error.keyword} has no value" + (f"; if {value} is one, write {error.keyword}={value}" if value.startswith("-") else "")
 

@@ -269,10 +269,11 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
-    if may_pick(config.bake, config.splits):
+    picks = may_pick(config.bake, config.splits)
+    if picks:
         check_reach(config.gripper, config.suction, catalog)
-        for line in describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick):
-            progress.note(line)
+    for line in describe_blocked(picks, config.rig, config.cell.bins, config.gripper, config.pick):
+        progress.note(line)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):
         total = sum(entry.volume for entry in catalog.entries)

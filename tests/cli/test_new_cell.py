@@ -146,7 +146,7 @@ def test_a_camera_is_that_of_its_calibration_and_sees_the_bin(tmp_path, drawn, f
         pixels, depth = project(camera, np.array(config.cell.bins[0].corners))
         assert (depth > 0.0).all()
         assert ((pixels > 0.0) & (pixels < (320.0, 240.0))).all()
-        assert not describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick)
+        assert not describe_blocked(True, config.rig, config.cell.bins, config.gripper, config.pick)
         # No farther than needed: the bin reaches a border that is kept free.
         assert np.min([pixels, (320.0, 240.0) - pixels]) < 0.06 * 320
     assert path.read_bytes() == before

@@ -23,7 +23,7 @@ from tools.options import Row  # noqa: E402
 from tools.reports.real import OBJECT, ablation, interval, training, worker  # noqa: E402
 from tools.reports.real.__main__ import PRESET, check_ids, make_options, recipe_of, source_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
-from tools.reports.real.networks import NETWORKS, double  # noqa: E402
+from tools.reports.real.networks import NETWORKS, upsample_twofold  # noqa: E402
 from tools.reports.real.training import (  # noqa: E402
     Recipe,
     compress_views,
@@ -87,7 +87,7 @@ def test_halved_views_are_means_and_single_pixels():
 
 @pytest.mark.parametrize(("progress", "size"), [(0.0, (48, 64)), (0.69, (48, 64)), (0.7, (48, 64))])
 def test_images_grow_over_the_schedule(progress, size):
-    """Half the size, then crops of half of each side, in which a pixel is one of the image's."""
+    """Images are downsampled by two at first; later they are crops at full resolution, half as wide and high."""
     classes = (torch.arange(96)[:, None] // 8 % 2 + torch.zeros(128, dtype=torch.int64)).expand(2, -1, -1)
     recipe = dataclasses.replace(RECIPE, scale=1.0, rotation=0.0, jitter=0.0, jpeg=0.0, half=0.7)
     images, labels = prepare_batch((classes[:, None] * 255).expand(-1, 3, -1, -1), classes, recipe, progress)
@@ -160,7 +160,7 @@ def test_the_loss_of_known_logits():
 @pytest.mark.parametrize("size", [(6, 8), (5, 9), (1, 1)])
 def test_features_of_twice_the_size_are_pytorchs(size):
     x = torch.randn(2, 3, *size, dtype=torch.float64, requires_grad=True)
-    made = double(x)
+    made = upsample_twofold(x)
     known = torch.nn.functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
     assert torch.allclose(made, known)
     assert torch.allclose(*(torch.autograd.grad((one**2).sum(), x)[0] for one in (made, known)))
@@ -173,8 +173,8 @@ def test_networks_have_logits_of_the_images_size(name):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="mixed precision is for GPUs")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # PyTorch's compiler imports what PyTorch has deprecated.
-def test_compiled_steps_have_the_gradients_of_others_when_logits_are_large():
-    """Logits of 128 to 255 are rounded to integers, as bfloat16."""
+def test_compiled_and_eager_steps_have_the_same_gradients_when_logits_are_large():
+    """In bfloat16, logits between 128 and 256 are rounded to integers."""
     torch.manual_seed(0)
     images, classes = torch.rand(4, 3, 64, 64, device="cuda") - 0.5, torch.randint(22, (4, 64, 64), device="cuda")
     losses, gradients = [], []

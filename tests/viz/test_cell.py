@@ -138,7 +138,8 @@ def test_what_a_camera_covers_is_said():
 )
 def test_a_camera_in_the_way_of_the_gripper_is_named(settings, blocked):
     config = load_config("smoke", settings)
-    lines = describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick)
+    lines, none = (describe_blocked(picks, config.rig, config.cell.bins, config.gripper, config.pick) for picks in (True, False))
+    assert none == []
     assert [int(line[14]) for line in lines] == blocked
     assert all(line.startswith("camera camera_") and " stands over the t" in line for line in lines)
 

@@ -58,12 +58,12 @@ class Network(nn.Module):
             x = level(functional.max_pool2d(x, 2) if skips else x)
             skips.append(x)
         for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
-            x = level(torch.cat((self.enlarge(x, skip.shape[2:]), skip), dim=1))
+            x = level(torch.cat((self.upsample(x, skip.shape[2:]), skip), dim=1))
         return self.head(x)
 
     @staticmethod
-    def enlarge(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
-        """Features resized to `size`, height and width, by bilinear interpolation."""
+    def upsample(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
+        """Bilinear interpolation of features (B, C, H, W) to a height and width of `size`."""
         return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
 
 

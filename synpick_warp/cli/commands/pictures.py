@@ -160,9 +160,8 @@ def draw_cell(
     from synpick_warp.scenes.cameras import describe_blocked
 
     scene = CellScene(config, progress, say, objects)
-    if may_pick(config.bake, config.splits):
-        for line in describe_blocked(config.rig, config.cell.bins, config.gripper, config.pick):
-            say(line)
+    for line in describe_blocked(may_pick(config.bake, config.splits), config.rig, config.cell.bins, config.gripper, config.pick):
+        say(line)
     progress.stage(f"rendering {len(config.rig)} cameras")
     write_cell_sheet(scene, config.rig, config.bins, name, out)
 

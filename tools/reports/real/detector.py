@@ -26,7 +26,7 @@ MIN_HEIGHT = 480
 
 
 def boxes_of(labels: torch.Tensor, classes: int) -> list[tuple[torch.Tensor, torch.Tensor]]:
-    """Bounding boxes of the objects in label images (B, H, W), of which each pixel has an obj_id less than `classes` or 0.
+    """Bounding boxes of the objects in label images (B, H, W) of obj_ids below `classes`; 0 is the background.
 
     Returns, for each image, boxes (N, 4) float32 [px] with exclusive maxima and their obj_ids (N) int64, on the device of the images. Boxes
     with a side shorter than MIN_SIDE are left out.
@@ -41,7 +41,8 @@ def boxes_of(labels: torch.Tensor, classes: int) -> list[tuple[torch.Tensor, tor
 
 
 def _extent(occupied: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """First and last index plus one along the last dimension at which a boolean tensor is true; 0 and its length if it is nowhere."""
+    """Extent of the true elements of a boolean tensor along its last dimension: index of the first, and of the last plus one. Undefined
+    where there are none."""
     values = occupied.byte()
     return values.argmax(-1), values.shape[-1] - values.flip(-1).argmax(-1)
 

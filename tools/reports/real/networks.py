@@ -15,19 +15,19 @@ DEPTHS = (2, 3, 4, 3)
 """Residual blocks of each level."""
 
 
-def enlarge(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
-    """Features (B, C, H, W) resized to `size` by bilinear interpolation: PyTorch's operator, or `double` in code that is compiled.
+def upsample(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
+    """Bilinear interpolation of features (B, C, H, W) to a height and width of `size`.
 
-    The operator takes float32 under autocast, and its compiled gradient adds with atomics, for 10 of a step's 27 ms (H200, U-Net of width
-    48).
+    Compiled code that upsamples by two takes `upsample_twofold`: PyTorch's operator runs in float32 under autocast, and its compiled
+    backward pass accumulates by atomic additions, together 10 of the 27 ms of a training step (H200, U-Net of width 48).
     """
     if torch.compiler.is_compiling() and tuple(size) == (2 * x.shape[2], 2 * x.shape[3]):
-        return double(x)
+        return upsample_twofold(x)
     return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
 
 
-def double(x: torch.Tensor) -> torch.Tensor:
-    """Bilinear upsampling of features (B, C, H, W) to (B, C, 2H, 2W) by slices, which compile to one kernel of the precision of `x`."""
+def upsample_twofold(x: torch.Tensor) -> torch.Tensor:
+    """Bilinear upsampling of features (B, C, H, W) by a factor of two, with slices: they compile to one kernel, in the data type of `x`."""
     x = x.permute(0, 2, 3, 1)  # Channels are last in memory, and remain so.
     for axis in (1, 2):
         last = x.shape[axis] - 1
@@ -38,9 +38,9 @@ def double(x: torch.Tensor) -> torch.Tensor:
 
 
 class UNet(Network):
-    """U-Net of `tools.examples.train_online`, whose upsampling can be compiled well."""
+    """U-Net of `tools.examples.train_online` with the upsampling of this module."""
 
-    enlarge = staticmethod(enlarge)
+    upsample = staticmethod(upsample)
 
 
 class ResidualNetwork(nn.Module):
@@ -69,8 +69,8 @@ class ResidualNetwork(nn.Module):
             x = level(x)
             skips.append(x)
         for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
-            x = level(torch.cat((enlarge(x, skip.shape[2:]), skip), dim=1))
-        return enlarge(self.head(x), size)
+            x = level(torch.cat((upsample(x, skip.shape[2:]), skip), dim=1))
+        return upsample(self.head(x), size)
 
 
 class _Block(nn.Module):

@@ -99,8 +99,8 @@ class Trained:
 
 def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
     """Geometric augmentation of images (B, 3 or 4, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored
-    borders, and a random crop whose sides are the fraction `crop` of H and W. Depth, the fourth channel, is of the nearest pixel, and
-    becomes less as objects become larger."""
+    borders, and a random crop whose sides are the fraction `crop` of H and W. Depth, the fourth channel, is that of the nearest pixel,
+    divided by the scale."""
     count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle, aspect = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation), height / width
@@ -116,7 +116,8 @@ def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
-    """Photometric augmentation of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, blur of half, noise."""
+    """Photometric augmentation of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, noise, and blur of half of
+    them."""
 
     def spread(channels: int, width: float) -> torch.Tensor:
         return torch.exp(width * strength * (torch.rand(len(images), channels, 1, 1, device=images.device) * 2 - 1))
@@ -168,7 +169,8 @@ def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
 
 
 def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Images (B, 3 or 4, H, W) and classes (B, H, W) of half the size: means of colours, depth and class of one pixel of four."""
+    """Downsampling by two of images (B, 3 or 4, H, W) and classes (B, H, W): colours are averaged, depth and class are those of one pixel
+    of four."""
     colors = functional.avg_pool2d(images[:, :3], 2)
     nearest = (..., slice(1, None, 2), slice(1, None, 2))
     return torch.cat((colors, images[:, 3:][nearest]), dim=1), classes[nearest]
@@ -177,7 +179,7 @@ def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tens
 def prepare_batch(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Augmentation and normalization of a batch; the elapsed fraction of the schedule, `progress`, determines the size of its images.
 
-    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W): of half the size, or random crops.
+    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W), both downsampled by two or cropped.
     """
     values, crop = images.float() / 255, 1.0 if progress < recipe.half else recipe.crop
     if recipe.scale > 1 or crop < 1:
@@ -218,8 +220,8 @@ class _Trainer:
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
         self._predict, self._criterion = self.network, segmentation_loss
         if recipe.compile:
-            # Two graphs, between which logits are rounded to bfloat16. In one, the softmax divides exponentials of rounded logits by a sum
-            # over unrounded ones: with logits of 64, a pixel's probabilities add up to as much as 1.17, and gradients are wrong.
+            # Two graphs, so that logits are rounded to bfloat16 in between. Kernels fused across both take rounded logits for the softmax's
+            # numerator and unrounded ones for its denominator: with logits of 64, a pixel's probabilities sum to up to 1.17.
             self._predict = torch.compile(self.network, dynamic=False)
             self._criterion = torch.compile(segmentation_loss, dynamic=False)
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
