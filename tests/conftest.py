@@ -133,7 +133,7 @@ def _times(folder: Path) -> dict[Path, int]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Callable[[int], Path]]:
-    """Makes a file system of so many kB; the test is skipped where nobody may mount one."""
+    """Factory of file systems of a size [kB]; the test is skipped where none may be mounted."""
     folder = tmp_path / "disk"
 
     def mount(size: int) -> Path:

@@ -33,8 +33,8 @@ from synpick_warp.system.stores.opening import open_store, probe
 MAX_CHUNK = 10_000
 """Chunk size of a bake without claims [episodes], to within a block; each chunk starts the worlds anew."""
 HELD_CHUNKS = 3
-"""Prefetch limit of a claiming worker: with the episodes of so many whole chunks it claims no other, which leaves work for workers that
-start later. If the number of workers is known, the limit is at least a worker's share of the plan."""
+"""Prefetch limit of a claiming worker [chunks]: while it holds the episodes of this many, it claims no other, which leaves work for workers
+that start later. If the number of workers is known, the limit is at least a worker's share of the plan."""
 
 Baker = Callable[..., BakeSummary]
 """Function that bakes episodes into a folder, with the arguments of `pipeline.bake_episodes`."""

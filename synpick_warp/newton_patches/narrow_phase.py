@@ -20,8 +20,8 @@ for _type in (bool, float, int, wp.uint64, wp.vec2i, wp.vec3, wp.vec3i, wp.vec4i
     # Newton adds these overloads one launch after the other, and each compiles all of them before it once more.
     wp.overload(newton_model._copy_variant_shape_kernel, {"variant_values": wp.array(dtype=_type), "values": wp.array(dtype=_type)})
 
-# On a GPU, Newton tests convex shapes in one kernel, or in four where all worlds together may have so many pairs. Both round differently:
-# an episode of few objects would depend on the number of worlds.
+# On a GPU, Newton tests convex shapes in one kernel, or in four where the pairs of all worlds together exceed a threshold. They round
+# differently: an episode of few objects would depend on the number of worlds.
 collide._SPLIT_GJK_MPR_LEAN_PAIR_COUNT_THRESHOLD = collide._SPLIT_GJK_MPR_FULL_PAIR_COUNT_THRESHOLD = 0
 BLOCK, BLOCKS, WORLD_BLOCKS = 32, 8, 2
 """Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four

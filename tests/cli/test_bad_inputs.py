@@ -72,7 +72,7 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
 
 
 def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
-    """The base colour of a sheet of so many texels (rows x PIXELS, columns x PIXELS, 3) uint8, as the renderer looks it up."""
+    """Base colour of a sheet of rows x columns texels, as the renderer looks it up (rows x PIXELS, columns x PIXELS, 3) uint8."""
     view = camera(PIXELS * columns, PIXELS * rows, PIXELS / TEXEL, (0.0, 0.0, 1.0))
     toy = ToyScene([entry(sheet(TEXEL * columns, TEXEL * rows), material)], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
     config = replace(Config(), render=replace(Config().render, table=False, layers=("albedo",)))

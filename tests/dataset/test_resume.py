@@ -308,7 +308,7 @@ def test_the_folder_is_removed(server, expected, tmp_path):
 
 @pytest.mark.slow
 def test_a_file_that_cannot_be_written(server, expected, tmp_path):
-    """Files of so many bytes cannot be had, as on a full disk: pictures can, an episode's lists cannot."""
+    """The size of files is limited, as on a full disk: pictures can be written, an episode's lists cannot."""
     out, log = tmp_path / "set", tmp_path / "log"
     assert server.bake(out, settings={"bake.episodes": 2}) == 0
     server.start(out, log=str(log), alone=True, most_bytes=10_000)

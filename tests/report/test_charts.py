@@ -93,7 +93,7 @@ def test_names_stand_in_values_only(statistics):
 
 
 def sampled(rows: dict[int, Namespace], count: int) -> list[tuple[int, int, int]]:
-    """Episode, frame and camera of the views that are sampled of episodes of so many frames."""
+    """Episode, frame and camera of `count` views that are sampled from episodes."""
 
     class Set:
         camera_count = 3

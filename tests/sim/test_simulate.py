@@ -254,7 +254,7 @@ def test_an_object_moves_as_in_a_new_world_whatever_its_slot_had_before(device):
 
 
 def advance(simulation: Simulation, ticks: int) -> np.ndarray:
-    """Poses (world, 7) of the first slots after so many ticks of physics alone; a view of the state."""
+    """Poses (world, 7) of the first slots after a number of ticks of physics alone; a view of the state."""
     for _ in range(ticks):
         simulation.physics.tick(simulation._drive)
     return simulation.physics.state.body_q.numpy().reshape(simulation.layout.worlds, -1, 7)[:, build.GRIPPER_BODIES]

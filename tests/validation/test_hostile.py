@@ -30,7 +30,7 @@ FILES = (
     "config.toml",
 )
 EVERY = 23
-"""One of so many hostile contents of a file is tried; they are listed by place, so all places and values have their turn."""
+"""Stride of the hostile contents of a file that are tried. They are listed by place, so all places and values have their turn."""
 
 
 def run(capsys, *arguments: object) -> tuple[int, list[str], list[str]]:

@@ -33,7 +33,7 @@ INSTANCES = (10, 32, 64, 128, 251)
 WORLDS = 64
 """Most worlds of a heap."""
 SMALL = 4
-"""One in so many objects of the catalog is in a heap: the smallest, of which many are visible."""
+"""Ratio of the catalog's objects to those in a heap, which are the smallest, so that many are visible."""
 DENSITY = 0.5
 """Volume of a heap's objects relative to the heap."""
 MAX_HEIGHT = 0.4

@@ -52,7 +52,7 @@ EPISODES = 8
 POISONED_WORLDS = 16
 """Worlds of the check of arrays."""
 OLDER = 3
-"""Integers are overwritten by their values so many ticks ago."""
+"""Age of the values that integers are overwritten by [ticks]."""
 CONTACTS = "contacts."
 """Prefix of the arrays of contacts in a state on the host."""
 

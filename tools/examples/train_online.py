@@ -33,7 +33,7 @@ from tools.options import configure, fail, make_parser, positive_count
 TRAINING, HELD_OUT = range(100_000), range(100_000, 101_000)
 """Episodes to train on, and to measure on."""
 HELD_OUT_STRIDE = 20
-"""Every so many frames of a held-out episode one is measured on: 1.3 s apart."""
+"""Stride of the measured frames of a held-out episode: 1.3 s."""
 LEARNING_RATE = 2e-3
 MIN_SIDE = 8
 """Least width and height of an image [px]: it is halved three times."""

@@ -43,7 +43,7 @@ MIN_COSINE = wp.constant(0.87)
 """Minimum cosine of the angle between the normals of one surface. Lamps behind a surface count as unblocked, and must not light one that
 bends towards them, such as the bevel between a wall and the floor."""
 MIN_SUPPORT = wp.constant(4)
-"""Of the eight pixels around a pixel, REACH away, so many must lie on its surface, or its fractions are taken from too few rays."""
+"""Minimum number of the eight pixels around a pixel, REACH away, on its surface; with fewer, its fractions come from too few rays."""
 EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
 """Bytes 0, 2, 4, 6, each with room for a sum in 16 bits."""
 SEGMENT_BITS = wp.constant(wp.uint32(0xFF))

@@ -80,7 +80,7 @@ class VertexSearch:
 
 
 def chunks(pairs: int, vertices: int, points: int) -> Iterator[slice]:
-    """Slices of pairs with at most so many points, or of one pair."""
+    """Slices of pairs, each with at most `points` points or of a single pair."""
     step = max(1, points // max(vertices, 1))
     for start in range(0, pairs, step):
         yield slice(start, start + step)

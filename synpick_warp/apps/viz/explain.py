@@ -87,7 +87,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
 
 
 def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int, every: int) -> View:
-    """View of the camera of perception in which an attempt's choice was made, or the last before, as it has one every so many frames."""
+    """View of the camera of perception in which an attempt's choice was made, or the last before: it renders each `every`-th frame."""
     files, frame = scenes.files(attempt.episode, camera), attempt.frame - attempt.frame % every
     if frame not in files.frames():
         raise DatasetError(f"{files.place} has no image {frame}, as {dataset}/attempts.jsonl names frame {attempt.frame}")

@@ -124,7 +124,7 @@ def _put_label(image: Image, text: str, place: Box, color: tuple[int, int, int])
 
 
 def legend_width(height: int, instances: int) -> int:
-    """Width of legends of that height and up to so many instances [px]: one column or several."""
+    """Width of legends of a height [px] with up to `instances` instances [px]: one column or several."""
     return COLUMN * (1 if instances <= _rows(height, _FACTS) else _COLUMNS)
 
 

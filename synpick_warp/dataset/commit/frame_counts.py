@@ -37,7 +37,7 @@ def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: 
         frames: Number of frames that its record states.
 
     Raises:
-        DatasetError: A file is too small for so many.
+        DatasetError: A file is too small for that number.
     """
     for path, size, least in _sizes(folder, layout, episode) if frames > _HARMLESS else ():
         if size / least < frames:

@@ -38,7 +38,7 @@ class Source:
     """Whether images have depth as a fourth channel, by `code_depth`."""
 
     def batches(self, views: int) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8 of so many views in all, valid until the next are taken."""
+        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8 of `views` views in total; a batch is valid until the next one."""
         if views <= 0:
             return
         fields = ("rgb", "classes", "depth") if self.depth else ("rgb", "classes")
