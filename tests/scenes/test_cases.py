@@ -1,4 +1,4 @@
-"""The cases of ../shared/cases, one row each with what its README calls right. Skipped where the folder is absent."""
+"""The meshes of tests/cases, one row each with what is right."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import CatalogEntry
 
-CASES = Path(__file__).parents[3] / "shared" / "cases"
+CASES = Path(__file__).parents[1] / "cases"
 GREY = (0.7, 0.7, 0.7)
 ORANGE = (0.962, 0.588, 0.237)
 """sRGB of the linear colour 60000, 20000, 3000 of 65535."""
-pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason="no ../shared/cases")
 
 
 @dataclass(frozen=True)

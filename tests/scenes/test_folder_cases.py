@@ -19,8 +19,7 @@ from synpick_warp.scenes.types import Catalog
 from tests.scenes.test_fuzz_assets import OBJ, picture
 from tests.worlds.model_files import exported, put
 
-CASES = Path(__file__).resolve().parents[3] / "shared" / "cases"
-needs_cases = pytest.mark.skipif(not CASES.is_dir(), reason="the cases are not here")
+CASES = Path(__file__).resolve().parents[1] / "cases"
 SMALL = OBJ.replace("v 1 ", "v 0.1 ").replace("v 0 1 ", "v 0 0.1 ").replace("v 0 0 1\n", "v 0 0 0.1\n", 1)
 """A textured tetrahedron of 0.1 m."""
 
@@ -41,10 +40,9 @@ def box(*extents: float, kind: str = "ply") -> bytes:
     return exported(trimesh.creation.box(extents), kind)
 
 
-# ---- the cases that came with the issue ----
+# ---- the inputs of tests/cases ----
 
 
-@needs_cases
 @pytest.mark.parametrize(("case", "names"), [("one", ["u"]), ("two", ["a", "b"])])
 def test_where_coacd_crashes_the_hull_stands(tmp_path, monkeypatch, case, names):
     monkeypatch.syspath_prepend(str(CASES / "coacd_crash" / "stub"))
@@ -64,14 +62,12 @@ def restart_server() -> None:
     isolation._server.stop()
 
 
-@needs_cases
 def test_the_diagonal_in_models_info_is_named(tmp_path):
     catalog, (line,) = load(CASES / "models_info_diagonal", tmp_path)
     assert catalog.entries[0].diameter == pytest.approx(0.01)
     assert "diameter 12.81 mm, which is the diagonal of its bounding box; its own, 10 mm, is used" in line
 
 
-@needs_cases
 def test_a_folder_per_object(tmp_path):
     catalog, lines = load(CASES / "gso_layout", tmp_path)
     assert [entry.name for entry in catalog.entries] == ["Shoe"]
@@ -79,7 +75,6 @@ def test_a_folder_per_object(tmp_path):
     assert not lines
 
 
-@needs_cases
 @pytest.mark.parametrize(
     ("case", "brightness", "said"),
     [

@@ -1,0 +1,52 @@
+"""Inputs of users in tests/cases, one row each: what a command says of them, or what is right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+CASES = Path(__file__).parent / "cases"
+KINDS = ("bins", "calibrations", "cells", "parts", "picks", "settings")
+"""Folders whose inputs have a row here; meshes, lights and others have theirs in tests/scenes."""
+Check = Callable[[Path, Path], None]
+"""Takes the path of an input and an empty folder for output; asserts."""
+ROWS: dict[str, Check] = {}
+"""By path below CASES."""
+PENDING = {
+    "bins/hopper.stl",
+    "bins/nofloor.stl",
+    "bins/sloped.stl",
+    "calibrations/D_1e308.yaml",
+    "calibrations/bop_cam_dist_model_weird_132.json",
+    "calibrations/cam_K.txt",
+    "calibrations/cam_K.txt.toml",
+    "calibrations/ros.ini",
+    "calibrations/ros_rational_cols5.yaml",
+    "cells/decomposition_limit.toml",
+    "cells/left.yaml",
+    "cells/right.yaml",
+    "parts/bin_wire",
+    "parts/gltf_skin",
+    "parts/models_info_padded_key",
+    "parts/other_formats_silent",
+    "parts/stl_count_zero",
+    "parts/suction_default_porous",
+    "picks/states_frame_2147483647.parquet",
+    "picks/trials_outcome_255.parquet",
+    "picks/trials_point_floatnan.parquet",
+    "picks/trials_state_-1.parquet",
+    "settings/bom.toml",
+    "settings/posegl.toml",
+}
+
+
+@pytest.mark.parametrize("case", ROWS)
+def test_an_input_of_a_user(tmp_path, case):
+    ROWS[case](CASES / case, tmp_path)
+
+
+def test_every_input_has_a_row():
+    present = {str(path.relative_to(CASES)) for kind in KINDS for path in (CASES / kind).iterdir()}
+    assert present == ROWS.keys() | PENDING
