@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from tests import camera_cases
+
 CASES = Path(__file__).parent / "cases"
 KINDS = ("bins", "calibrations", "cells", "parts", "picks", "settings")
 """Folders whose inputs have a row here; meshes, lights and others have theirs in tests/scenes."""
 Check = Callable[[Path, Path], None]
 """Takes the path of an input and an empty folder for output; asserts."""
-ROWS: dict[str, Check] = {}
+ROWS: dict[str, Check] = {**camera_cases.ROWS}
 """By path below CASES."""
 PENDING = {
     "bins/hopper.stl",
@@ -25,8 +27,6 @@ PENDING = {
     "calibrations/ros.ini",
     "calibrations/ros_rational_cols5.yaml",
     "cells/decomposition_limit.toml",
-    "cells/left.yaml",
-    "cells/right.yaml",
     "parts/bin_wire",
     "parts/gltf_skin",
     "parts/models_info_padded_key",

@@ -231,9 +231,9 @@ def build_stages(
     progress.stage(f"building worlds on {device.alias} (worlds: {config.bake.worlds}, objects: {len(catalog)})")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
     fixtures = make_fixtures(bins, config.gripper)
-    scene = build_render_scene(
-        config.render, bins[0].sizes.ground, catalog, fixtures, cameras, lights, device, looks, config.suction.radius
-    )
+    # Of one image size; each group gets its own, see `_build_group`.
+    first = tuple(cameras[index] for index in config.rig.groups[0])
+    scene = build_render_scene(config.render, bins[0].sizes.ground, catalog, fixtures, first, lights, device, looks, config.suction.radius)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     groups = tuple(_build_group(config, scene, cameras, index) for index in range(len(config.rig.groups)))
     table = name_lights([light.name for light in lights], scene.lights)
