@@ -7,6 +7,7 @@ import functools
 import os
 import typing
 from collections.abc import Callable, Mapping
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,12 @@ def _check_conflicts(config: Config, values: Values) -> None:
 def preset_names() -> list[str]:
     """Names of the presets in this package."""
     return sorted(path.stem for path in _folder().glob("*.toml"))
+
+
+def describe_presets() -> dict[str, str]:
+    """Meaning of each preset by name: the comment at the head of its file."""
+    files = {name: (_folder() / f"{name}.toml").read_text().splitlines() for name in preset_names()}
+    return {name: " ".join(line[2:] for line in takewhile(lambda line: line.startswith("# "), lines)) for name, lines in files.items()}
 
 
 def parse_assignment(text: str) -> tuple[str, object]:

@@ -111,7 +111,7 @@ class PlainProgress:
 
     def note(self, text: str) -> None:
         """Print a line with the time since the start."""
-        self._console.print(f"{_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
+        self._console.print(f"{format_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
         self._console.file.flush()
 
 
@@ -178,7 +178,7 @@ def _totals(summary: BakeSummary, failed: int) -> str:
     before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     return (
         f"{len(summary.episodes) - failed} of {summary.total} episodes{before} and {summary.views:,} views"
-        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements resampled: {summary.resampled}"
+        f" in {format_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements resampled: {summary.resampled}"
     )
 
 
@@ -209,7 +209,9 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
     """Table of episodes, one line each: mode, ending, resamples, frames, simulated time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
-    cells = [[str(row.episode), row.mode, row.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows]
+    cells = [
+        [str(row.episode), row.mode, row.sentence, str(row.arrangement), str(row.frames), format_duration(row.seconds)] for row in rows
+    ]
     if any(row.attempts for row in rows):
         columns += ["attempts", "picked", "lost"]
         for row, line in zip(rows, cells, strict=True):
@@ -254,12 +256,12 @@ def _words(code: Ending | Outcome) -> str:
 
 def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None, remark: object) -> str:
     """Worlds, views, rate, remaining time and a remark in one line."""
-    left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
+    left = "" if seconds_left is None else f" · {format_duration(seconds_left)} left"
     more = f" · {said}" if (said := str(remark)) else ""
     return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}{more}"
 
 
-def _duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Format a duration as 0:07 or 1:02:03."""
     whole = round(seconds)
     minutes = f"{whole // 60 % 60:02}" if whole >= 3600 else str(whole // 60)

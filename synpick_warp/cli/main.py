@@ -22,6 +22,7 @@ from synpick_warp.cli.commands.report import write_page
 from synpick_warp.cli.commands.statistics import show_statistics
 from synpick_warp.cli.commands.validate import validate
 from synpick_warp.cli.commands.verify import verify
+from synpick_warp.cli.examples import EXAMPLES
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output, drop_fetched, name_fetched
 from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
@@ -43,6 +44,7 @@ from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.configs.files.load import (
     COMMAND_LINE,
     DEFAULT_PRESET,
+    describe_presets,
     parse_assignment,
     preset_names,
     sections,
@@ -176,6 +178,7 @@ def bake(
     profile_out: Annotated[
         Path | None, Parameter(help="Trace file of --profile, for ui.perfetto.dev (default: OUT-profile.json beside the data set).")
     ] = None,
+    dry_run: Annotated[bool, Parameter(negative=(), help="Bake nothing: print the expected views, size on disk, memory and time.")] = False,
 ) -> int:
     """Simulate, render and write a data set. After an interruption, the same command resumes with the remaining episodes.
 
@@ -201,6 +204,11 @@ def bake(
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
     crew = parse_engine(engine, workers, price, out, devices or shard, claim)
+    if dry_run:
+        _check_inputs(resolved.bake.models, resolved.bake.lights)
+        from synpick_warp.cli.commands.doctor import print_forecast
+
+        return print_forecast(resolved, out, [episode for split in DataLayout.of(resolved).plan_shard(names, part) for episode in split])
     if out is None:
         from synpick_warp.dataset.commit.manifest import make_manifest
 
@@ -239,15 +247,13 @@ def doctor(
     resolution: ResolutionOption = None,
     device: DeviceOption = None,
     set_: SetOption = None,
+    memory: Annotated[bool, Parameter(negative=(), help="Also list the device arrays of a bake with their memory.")] = False,
 ) -> int:
-    """Show device, versions, kernel cache, and the memory of a bake's device arrays."""
+    """Show device, versions and caches, and whether a bake with these settings fits."""
     resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
-    from synpick_warp.cli.commands.doctor import machine_report, memory_report
-    from synpick_warp.cli.display import make_console
-    from synpick_warp.system.hardware.device import pick_device
+    from synpick_warp.cli.commands.doctor import print_report
 
-    for table in (machine_report(pick_device(resolved.bake.device)), memory_report(resolved)):
-        make_console().print(table)
+    print_report(resolved, with_arrays=memory)
     return 0
 
 
@@ -280,8 +286,16 @@ def warmup(
 
 
 @app.command(name="config")
-def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
+def show_config(
+    *,
+    config: ConfigOption = None,
+    set_: SetOption = None,
+    presets: Annotated[bool, Parameter(negative=(), help="List the presets with their meaning instead.")] = False,
+) -> int:
     """Print all settings as TOML with meaning, unit and range: a template for your own file."""
+    if presets:
+        print(*(f"{name:18}{text}" for name, text in describe_presets().items()), sep="\n")
+        return 0
     print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
     return 0
 
@@ -296,6 +310,8 @@ app.command(show_statistics, name="stats")
 app.command(validate)
 app.command(verify)
 app.command(write_page, name="report")
+for _name, _lines in EXAMPLES.items():
+    app[_name].help_epilogue = "\n".join(["Examples:", "", "```", *(f"{NAME} {line}" for line in _lines), "```"])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

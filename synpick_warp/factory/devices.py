@@ -34,6 +34,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.forecast import check_disk, forecast_bake
 from synpick_warp.factory.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.factory.sizes import count_writers
 from synpick_warp.scenes.build import REPEATS, must_repeat, without_distractors
@@ -275,6 +276,7 @@ def bake_on_devices(
         catalog = load_catalog(config, report=partial(report, "note"))
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, partial(report, "note"), config.objects.strict)
         looks = load_looks(config.randomize, partial(report, "note"), config.objects.strict)
+        check_disk(forecast_bake(config, catalog, output.remaining), output.out, progress)
         prepare_folder(output, needs, catalog, lights, looks)
         labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
         filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config

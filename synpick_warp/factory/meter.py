@@ -11,10 +11,11 @@ from synpick_warp.system.progress import Progress
 class ThroughputMeter:
     """Throughput and remaining time, reported to the observer."""
 
-    def __init__(self, cameras: int, summary: BakeSummary, progress: Progress) -> None:
+    def __init__(self, cameras: int, expected: float, summary: BakeSummary, progress: Progress) -> None:
         self.summary, self.progress = summary, progress
         self.started: float | None = None
-        self.cameras = cameras
+        self.cameras, self.expected = cameras, expected
+        """Number of cameras, and mean number of frames of an episode while none has ended."""
         self.counted = 0
         """Episodes of the summary of which `delivered` and `frames` are the sums."""
         self.delivered = self.frames = 0
@@ -27,10 +28,10 @@ class ThroughputMeter:
         elapsed = now - self.started if self.started is not None else 0.0
         self._count_delivered()
         left = None
-        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and self.delivered and summary.views:
+        if summary.total > summary.resumed and elapsed > 0.0 and summary.views:
             # Short episodes end first: running ones can already be longer than the mean of the ended ones.
-            running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
-            frames = max(self.frames / self.delivered, running)
+            running = summary.views / self.cameras / max(1, len(summary.episodes) - summary.resumed + active)
+            frames = max(self.frames / self.delivered if self.delivered else self.expected, running)
             fraction = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
             left = (1.0 / fraction - 1.0) * elapsed if fraction < 1.0 else None
         self.progress.update(

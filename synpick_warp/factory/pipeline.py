@@ -28,6 +28,7 @@ from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.factory.compilation import make_compiler
 from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
+from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
 from synpick_warp.factory.meter import ThroughputMeter
 from synpick_warp.factory.order import EpisodeSource
@@ -161,6 +162,8 @@ def _fill(
         with scope("build"):
             own = {"longest_first": True, "expected": source.expected}
             factory = build(config, progress, output.remaining, needs.physics, needs.images, **own)
+        if deliver is None:
+            check_disk(forecast_bake(factory.config, factory.catalog, output.remaining), output.out, progress)
     else:
         catalog = load_catalog(config, report=progress.note)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
@@ -233,7 +236,8 @@ class _Run:
         self.stop, self.source = stop, more
         self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
-        self.meter = ThroughputMeter(len(factory.cameras), summary, progress)
+        expected = predict_length(factory.config, factory.catalog, factory.simulation.episodes.numpy()[:SAMPLED])
+        self.meter = ThroughputMeter(len(factory.cameras), expected, summary, progress)
         self.layout, self.picks = DataLayout.of(factory.config), factory.picks
 
     def run(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -17,12 +18,15 @@ import warp as wp
 
 from synpick_warp import __version__
 from synpick_warp.cli.commands import doctor
-from synpick_warp.cli.main import main
+from synpick_warp.cli.examples import EXAMPLES
+from synpick_warp.cli.main import app, main
 from synpick_warp.codes import Ending
-from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.files.load import load_config, preset_names
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.factory import forecast
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory.memory_plan import Term
 from synpick_warp.stages import timing
 from tests.builders import mistake
 from tests.system.test_pool import refuse  # Writer processes import its module, which imports little.
@@ -53,16 +57,6 @@ def bakes(monkeypatch):
     module.calls = calls
     module.run_bake = run_bake
     monkeypatch.setitem(sys.modules, "synpick_warp.factory.pipeline", module)
-    plan = types.ModuleType("synpick_warp.factory.memory_plan")
-
-    def plan_memory(config, device):
-        return [types.SimpleNamespace(rows=[("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)])]
-
-    plan.plan_memory = plan_memory
-    monkeypatch.setitem(sys.modules, "synpick_warp.factory.memory_plan", plan)
-    sizes = types.ModuleType("synpick_warp.factory.sizes")
-    sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda *_: 1
-    monkeypatch.setitem(sys.modules, "synpick_warp.factory.sizes", sizes)
     return module
 
 
@@ -323,12 +317,65 @@ def test_config_prints_what_it_would_use(capsys):
     assert document["arrangement"]["volume"] == load_config("smoke", {}).arrangement.volume
 
 
-def test_doctor(capsys, bakes):
-    assert main(["doctor", "--worlds", "16", "--resolution", "640x360", "--device", "cpu"]) == 0
+@pytest.fixture
+def plans(monkeypatch):
+    """A memory plan of two arrays."""
+
+    def plan_memory(config, *_):
+        rows = [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
+        return [Term("poses", tuple(rows), ("bake.worlds",), (config.bake.worlds,), on_device=False)]
+
+    monkeypatch.setattr(doctor, "plan_memory", plan_memory)
+    monkeypatch.setattr(doctor, "fit_to_device", lambda config, *_: config)
+
+
+def test_doctor(capsys, plans, monkeypatch):
+    command = ["doctor", "--worlds", "16", "--resolution", "640x360", "--device", "cpu"]
+    assert main(command) == 0
     text = capsys.readouterr().out
+    assert "Snapshot.pose" not in text
+    assert text.splitlines()[-1].startswith("verdict: ready: bakes with these settings run on cpu, ")
+    monkeypatch.setattr(doctor, "find_fault", lambda folder: "read-only")
+    assert main([*command, "--memory"]) == 0
+    text = capsys.readouterr().out
+    assert text.splitlines()[-1].startswith("verdict: the kernel cache cannot be written (read-only); the shape cache")
     assert all(word in text for word in ("newton", "numpy", "warp-lang", "CPU cores", "kernel cache"))
     assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00", "smaller arrays: 1"))
     assert "Goals.goal" not in text
+
+
+def test_a_dry_run_tells_what_a_bake_takes_and_writes_nothing(tmp_path, plans, bakes, capsys, monkeypatch):
+    command = ["bake", "--config", "smoke", "--episodes", "1000", "--dry-run", "--device", "cpu", "--out", str(tmp_path / "data")]
+    assert main(command) == 0
+    text = capsys.readouterr().out
+    # Mode move: 409 frames, three cameras of 320 x 180 px; 42.9 kB a view in the format bop.
+    assert all(words in text for words in ("1,000, of some 409 frames", "about 1,227,000", "about 52.6 GB", "at least 0.0 GiB"))
+    disk = types.SimpleNamespace(free=40e9)
+    monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: disk)
+    assert main(command) == 0
+    assert "the disk may run full" in capsys.readouterr().out
+    disk.free = 20e9
+    assert mistake(*command).startswith("1,000 episodes of some 409 frames take about 52.6 GB, and ")
+    assert not bakes.calls
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_are_command_lines_that_help_shows(name, capsys):
+    assert name in {command for command in app if not command.startswith("-")}
+    for line in EXAMPLES[name]:
+        words = shlex.split(line)
+        assert words[0] == name
+        app.parse_args(words, exit_on_error=False, print_error=False)
+    assert main([name, "--help"]) == 0
+    assert f"synpick-warp {EXAMPLES[name][0]}"[:60] in capsys.readouterr().out
+
+
+def test_presets_are_listed(capsys):
+    assert main(["config", "--presets"]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines.keys() == set(preset_names())
+    assert lines["smoke"].startswith("Small and fast, to check an installation")
 
 
 def test_doctor_says_how_many_multiprocessors_can_be_reserved_or_why_none(monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import types
 from collections import Counter
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from rich.console import Console
 from synpick_warp.cli import display
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
+from synpick_warp.factory import meter
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.system.progress import Progress, SilentProgress
 
@@ -100,6 +102,19 @@ def test_progress_displays(kind):
     if kind is PlainProgress:
         lines = ["baking [bold]", "compiling: 0 of 5 modules", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
         assert text.splitlines() == [f"   0:00  {line}" for line in lines]
+
+
+def test_the_remaining_time_is_shown_from_the_first_views_on(monkeypatch):
+    """While no episode has ended, by its predicted length: 100 of 2 x 3 x 50 views in 5 s."""
+    clock = iter((10.0, 15.0))
+    monkeypatch.setattr(meter.time, "perf_counter", lambda: next(clock))
+    left, summary = [], BakeSummary(2, views=1)
+    progress = types.SimpleNamespace(update=lambda **counts: left.append(counts["seconds_left"]))
+    shown = meter.ThroughputMeter(3, 50.0, summary, progress)
+    shown.show(2)
+    summary.views = 100
+    shown.show(2)
+    assert left == [None, pytest.approx(10.0)]
 
 
 def test_silence():

@@ -168,10 +168,11 @@ class Compiler:
         self._report = report
         self._tasks: dict[ModuleBuild, Future[Any]] = {}
         self._seen: set[ModuleBuild] = set()
-        self._extra = 0
         self._owner = threading.current_thread()
         self._load = wp.Module.load
         self._pool = ThreadPoolExecutor(min(count_cores(), MAX_COMPILERS), thread_name_prefix="compile")
+        # Modules that launches wait for do not queue behind the others.
+        self._urgent = ThreadPoolExecutor(1, thread_name_prefix="compile-urgent")
 
     def __enter__(self) -> Self:
         compiler, self._load = self, wp.Module.load
@@ -194,6 +195,7 @@ class Compiler:
         finally:
             wp.Module.load = self._load  # type: ignore[method-assign]
             self._pool.shutdown(cancel_futures=True)
+            self._urgent.shutdown(cancel_futures=True)
 
     def submit(self, builds: Iterable[ModuleBuild]) -> None:
         """Start to compile those modules that the kernel cache lacks, in this order."""
@@ -212,14 +214,14 @@ class Compiler:
             self._load(build.module, build.device, build.block)
 
     def _await(self, build: ModuleBuild) -> None:
-        """Wait for a module that a launch needs; without a task it is counted as one that the launch will compile."""
-        if task := self._tasks.get(build):
-            self._wait([task])
-        elif build not in self._seen:
+        """Wait for a module that a launch needs, which is compiled if nothing else asked for it."""
+        if build not in self._tasks and build not in self._seen:
             self._seen.add(build)
             if not build.is_cached():
-                self._say(1)
-                self._extra += 1
+                self._tasks[build] = self._urgent.submit(self._compile, build)
+                self._say()
+        if task := self._tasks.get(build):
+            self._wait([task])
 
     def _wait(self, tasks: Collection[Future[Any]]) -> None:
         """Wait for compile tasks, and report their progress."""
@@ -230,9 +232,8 @@ class Compiler:
         for task in tasks:
             task.result()
 
-    def _say(self, begun: int = 0) -> None:
-        """Report progress; `begun` modules are about to be compiled by a launch."""
-        self.compiled = self._extra + sum(task.done() for task in self._tasks.values())
-        total = self._extra + begun + len(self._tasks)
-        if total:
-            self._report(self.compiled, total)
+    def _say(self) -> None:
+        """Report progress."""
+        self.compiled = sum(task.done() for task in self._tasks.values())
+        if self._tasks:
+            self._report(self.compiled, len(self._tasks))
