@@ -236,7 +236,7 @@ class _Run:
         self.stop, self.source = stop, more
         self.factory, self.exporters, self.writes_views = factory, exporters, writes_views
         self.commit, self.summary, self.progress = commit, summary, progress
-        expected = predict_length(factory.config, factory.catalog, factory.simulation.episodes.numpy()[:SAMPLED])
+        expected = predict_length(factory.config, factory.catalog, factory.simulation.episodes.numpy()[:SAMPLED].tolist())
         self.meter = ThroughputMeter(len(factory.cameras), expected, summary, progress)
         self.layout, self.picks = DataLayout.of(factory.config), factory.picks
 
