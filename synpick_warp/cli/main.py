@@ -143,6 +143,7 @@ WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: a
 PriceOption = Annotated[
     float, Parameter(help="Price an hour of a worker of --engine or --claim --devices: the progress shows the cost so far.")
 ]
+DryRunOption = Annotated[bool, Parameter(negative=(), help="Bake nothing: print the expected views, size on disk, memory and time.")]
 SplitOption = Annotated[
     str | None,
     Parameter(help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."),
@@ -205,15 +206,8 @@ def bake(
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
     crew = parse_engine(engine, workers, price, out, devices or shard, claim)
     if dry_run:
-        _check_inputs(resolved.bake.models, resolved.bake.lights)
-        from synpick_warp.cli.commands.doctor import print_forecast
-
-        return print_forecast(resolved, out, [episode for split in DataLayout.of(resolved).plan_shard(names, part) for episode in split])
-    if out is None:
-        from synpick_warp.dataset.commit.manifest import make_manifest
-
-        out, choice = choose_output(make_manifest(resolved), resolved.bake, resolved.splits)
-        print(choice, flush=True)
+        return _forecast(resolved, out, part, names)
+    out = out or _choose_out(resolved)
     run = partial(_bake, resolved, out, part, names, several, claim, crew)
     return _profiled(run, profile_out, out) if profiles else run()
 
@@ -406,6 +400,23 @@ def _profiled(bake: Callable[[], int], named: Path | None, out: Path) -> int:
         recorder.write_trace(trace)
     print(f"trace: {trace}")
     return code
+
+
+def _choose_out(config: Config) -> Path:
+    """Choose the default output folder, and print the choice."""
+    from synpick_warp.dataset.commit.manifest import make_manifest
+
+    out, choice = choose_output(make_manifest(config), config.bake, config.splits)
+    print(choice, flush=True)
+    return out
+
+
+def _forecast(config: Config, out: Path | None, shard: tuple[int, int], splits: Sequence[str]) -> int:
+    """Print the forecast of a bake; arguments as of `_bake`."""
+    _check_inputs(config.bake.models, config.bake.lights)
+    from synpick_warp.cli.commands.doctor import print_forecast
+
+    return print_forecast(config, out, [episode for split in DataLayout.of(config).plan_shard(splits, shard) for episode in split])
 
 
 def _check_inputs(models: str, lights: str) -> None:
