@@ -27,6 +27,14 @@ MAX_OBJECTS = 4096
 # Of several meshes in an object's folder, textured ones are preferred, by what their names begin with; then GLB, whose material is richest.
 _PREFERRED = ("textured", "model", "mesh", "visual")
 _FORMATS = (".glb", ".gltf", ".obj", ".ply", ".stl", *STEP_SUFFIXES)
+_READ = "PLY, OBJ, glTF, STL or STEP files"
+_UNREAD = """
+    3dm 3ds 3mf abc ac amf ase asm blend brep brp c4d catpart catproduct ctm dae drc dwg dxf e57 f3d fbx fcstd iam ifc iges
+    igs inp ipt jt las laz lwo lxo ma max mb mesh msh nas off par pcd prt psm sab sat sdf skp sldasm sldprt spz stpz u3d
+    urdf usd usda usdc usdz vrm vrml vtk vtp vtu wrl x x3d x3db x3dv x_b x_t xacro xyz zae ztl
+"""
+"""Endings of files of geometry that are not read."""
+_MAX_LISTED = 8
 
 Say = Callable[[str], None]
 Fault = Callable[[CatalogError], None]
@@ -58,17 +66,21 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
         CatalogError: The folder is missing, cannot be listed or contains no models.
     """
     if not folder.is_dir():
-        raise CatalogError(
-            f"models folder {folder}: no such folder; give one of BOP models, or of PLY, OBJ, glTF, STL or STEP files; {PATH_RULE}"
-        )
+        raise CatalogError(f"models folder {folder}: no such folder; give one of BOP models, or of {_READ}; {PATH_RULE}")
     try:
         entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
         files = _without_sources([entry for entry in entries if entry.suffix.lower() in SUFFIXES], report)
-        found = [] if files else _in_subfolders(entries, report)
+        unread = [entry for entry in entries if _is_unread(entry.name)]
+        found = [] if files else _in_subfolders(entries, unread, report)
     except OSError as error:
         raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
+    names = [ascii(str(path.relative_to(folder)))[1:-1] for path in unread]
+    more = [f"{len(names) - _MAX_LISTED} more"] if len(names) > _MAX_LISTED else []
+    said = f"of a format that is not read: {', '.join(names[:_MAX_LISTED] + more)}; save them as {_READ}"
     if not files and not found:
-        raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply, or PLY, OBJ, glTF, STL or STEP files")
+        raise CatalogError(f"models folder {folder}: {said if unread else f'it contains no models; add obj_NNNNNN.ply, or {_READ}'}")
+    if unread:
+        report(f"models folder {folder}: {said}")
     if max(len(files), len(found)) > MAX_OBJECTS:
         raise CatalogError(f"models folder {folder}: more than {MAX_OBJECTS} meshes; bake a part of them")
     models, faults = _list_bop(files, folder, report)
@@ -101,7 +113,7 @@ def _list_bop(files: list[Path], folder: Path, report: Say) -> tuple[list[ModelF
                 continue
             check_file_name(file, CatalogError)
             if obj_id in models:
-                raise CatalogError(f"{models[obj_id].path} and {file.name} are both object {obj_id}; keep one of them")
+                raise CatalogError(f"{models[obj_id].path} and {file.name} are both object {obj_id}; the first is used, keep one of them")
             models[obj_id] = ModelFile(obj_id, file, file.stem, folder, True)
         except CatalogError as error:
             faults.append(error)
@@ -127,7 +139,8 @@ def _list_own(files: list[Path], found: list[tuple[Path, Path]], folder: Path) -
             check_file_name(place if place != folder else path, CatalogError)
             check_file_name(path, CatalogError)
             if name in names:
-                raise CatalogError(f"models folder {folder}: {names[name].name} and {path.name} have the same name; keep one of them")
+                said = f"{names[name].name} and {path.name} have the same name; the first is used, keep one of them"
+                raise CatalogError(f"models folder {folder}: {said}")
             names[name] = path
             models.append(ModelFile(obj_id, path, name, place, False))
         except CatalogError as error:
@@ -135,11 +148,16 @@ def _list_own(files: list[Path], found: list[tuple[Path, Path]], folder: Path) -
     return models, faults
 
 
-def _in_subfolders(entries: list[Path], report: Say) -> list[tuple[Path, Path]]:
-    """Folder and mesh of each object that has a folder of its own."""
+def _is_unread(name: str) -> bool:
+    """Whether a file's name is that of geometry in a format that is not read."""
+    return Path(name.lower()).suffix[1:] in _UNREAD.split()
+
+
+def _in_subfolders(entries: list[Path], unread: list[Path], report: Say) -> list[tuple[Path, Path]]:
+    """Folder and mesh of each object that has a folder of its own; files of formats that are not read are added to `unread`."""
     found = []
     for place in entries:
-        if place.is_dir() and (meshes := _meshes_below(place)):
+        if place.is_dir() and (meshes := _meshes_below(place, unread)):
             bop = next((mesh for mesh in meshes if bop_obj_id(mesh) is not None), None)
             if bop is not None:
                 raise CatalogError(f"models folder {place.parent}: its folder {bop.parent.name} has BOP models; give {bop.parent}")
@@ -149,8 +167,12 @@ def _in_subfolders(entries: list[Path], report: Say) -> list[tuple[Path, Path]]:
     return found
 
 
-def _meshes_below(place: Path) -> list[Path]:
-    """The meshes in an object's folder and its subfolders, the preferred one first. Links to folders are not followed."""
+def _meshes_below(place: Path, unread: list[Path]) -> list[Path]:
+    """The meshes in an object's folder and its subfolders, the preferred one first. Links to folders are not followed.
+
+    Without any, files of formats that are not read are added to `unread`.
+    """
+    others: list[Path] = []
     meshes: list[Path] = []
     seen = 0
     for root, folders, files in os.walk(place):
@@ -158,8 +180,10 @@ def _meshes_below(place: Path) -> list[Path]:
         folders[:] = sorted(name for name in folders if not name.startswith(".")) if depth < MAX_DEPTH else []
         seen += len(files) + len(folders)
         meshes += [Path(root, name) for name in sorted(files) if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")]
+        others += [Path(root, name) for name in sorted(files) if _is_unread(name)]
         if seen > MAX_ENTRIES:
             break
+    unread += [] if meshes else others
     return sorted(meshes, key=lambda path: _preference(path, place))
 
 

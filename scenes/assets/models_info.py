@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Callable, Iterable
@@ -22,6 +23,7 @@ MAX_INFO = 2**24
 MAX_DEPTH = 16
 """Maximum nesting of models_info.json; BOP's has five levels."""
 
+_KEY = re.compile(r"\s*\+?0*([0-9]{1,10})\s*", re.ASCII)
 _NAME = re.compile(r"obj_([0-9]+)\.ply", re.IGNORECASE)
 _MILLIMETRE = 1e-3
 ROTATION_TOLERANCE = 1e-3
@@ -241,15 +243,25 @@ def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) ->
 def read_entries(path: Path) -> dict[str, Any] | None:
     """Read the objects' entries in models_info.json as they are, by obj_id in decimal; None if the file is missing.
 
+    Keys are integers in decimal: "000001" is object 1. Others have no object, and are left out.
+
     Raises:
-        CatalogError: The file is not a JSON object, or nested too deeply to be written again.
+        CatalogError: The file is not a JSON object, nested too deeply to be written again, or gives an object twice.
     """
     if not os.path.lexists(path):
         return None
     content = read_json(path, dict[str, Any], CatalogError, f"repair it, {_ADVICE}", MAX_INFO)
     if _depth(content) > MAX_DEPTH:
         raise CatalogError(f"{path}: nested deeper than {MAX_DEPTH}; repair it, {_ADVICE}")
-    return content
+    entries: dict[str, tuple[str, Any]] = {}
+    # msgspec would take the last of equal keys; the pairs of nested objects stay lists.
+    for key, _ in json.loads(path.read_bytes(), object_pairs_hook=list):
+        if (match := _KEY.fullmatch(key)) is None:
+            continue
+        if match[1] in entries:
+            raise CatalogError(f"{path}: the keys {entries[match[1]][0]!a} and {key!a} are both object {match[1]}; keep one of them")
+        entries[match[1]] = key, content[key]
+    return {obj_id: entry for obj_id, (_, entry) in entries.items()}
 
 
 def _depth(content: Any) -> int:

@@ -17,7 +17,7 @@ from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
 from synpick_warp.scenes.assets.ply_binary import read_binary
 from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
-from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.scenes.assets.text import check_decimals, decode_text
 from synpick_warp.system.inputs.files import read_file
 
 MAX_HEADER = 2**16
@@ -182,6 +182,7 @@ def _check_ascii(data: bytes, start: int, rows: int, values: int, path: Path) ->
         raise CatalogError(f"{path}: too large for an ASCII file; save it as binary PLY")
     body = data[start:]
     if body.translate(None, _NUMBERS):
+        check_decimals(decode_text(body), path)
         raise CatalogError(f"{path}: not readable as PLY (its body has characters that are not part of numbers)")
     if body.count(b"\n") + body.count(b"\r") > 4 * MAX_ROWS:
         raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; save it as binary PLY")

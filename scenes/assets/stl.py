@@ -10,7 +10,7 @@ import numpy as np
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, MeshPart, Notes
-from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.scenes.assets.text import check_decimals, decode_text
 from synpick_warp.system.inputs.files import read_file
 
 _HEADER = 84
@@ -40,11 +40,18 @@ def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def _binary(data: bytes, count: int, path: Path, notes: Notes) -> np.ndarray:
-    """Triangle corners (F, 3, 3) float64 of a binary STL file."""
-    if count > MAX_ROWS:
-        raise CatalogError(f"{path}: announces {count} triangles; allowed: at most {MAX_ROWS}; decimate the mesh")
-    if len(data) < _HEADER + count * _TRIANGLE.itemsize:
-        raise CatalogError(f"{path}: not readable as STL (its header announces {count} triangles, its body is shorter); it is cut short")
+    """Triangle corners (F, 3, 3) float64 of a binary STL file: as many as its body holds, unless other bytes follow those announced.
+
+    Programs that write triangles as they come leave the number in the header at 0.
+    """
+    held, rest = divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
+    if max(count, held) > MAX_ROWS:
+        raise CatalogError(f"{path}: announces {count} triangles, holds {held}; allowed: at most {MAX_ROWS}; decimate the mesh")
+    if held < count:
+        raise CatalogError(f"{path}: not readable as STL (its header announces {count} triangles, its body holds {held}); it is cut short")
+    if held > count or rest:
+        announced, count = count, count if count and rest else held
+        notes.said.append(f"its header announces {announced} triangles, its body holds {held}: {count} are read")
     triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
     if np.any(triangles["attribute"]):
         notes.ignored.append("colours or other attributes of triangles")
@@ -62,4 +69,5 @@ def _text(data: bytes, path: Path) -> np.ndarray:
     try:
         return np.array(numbers, dtype=np.float64).reshape(-1, 3, 3)
     except ValueError:
+        check_decimals(text, path)
         raise CatalogError(f"{path}: not readable as STL (its {len(numbers)} vertices are not three numbers each, three a facet)") from None

@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import codecs
+import re
+from pathlib import Path
+
+from synpick_warp.errors import CatalogError
 
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"))
 _MARKS += ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 _SAMPLE = 1024
+_COMMA = re.compile(r"(?im)^[ \t]*(?=v|facet +normal|[-+.0-9]).*?(?<![\w,.])([-+]?[0-9]+,[0-9]+(?:e[-+]?[0-9]+)?)(?![\w.])")
+"""Decimal comma in a line of coordinates."""
+
+
+def check_decimals(text: str, path: Path) -> None:
+    """Raise CatalogError if coordinates in an unreadable mesh file have decimal commas, as programs write them under some locales."""
+    if (match := _COMMA.search(text)) is not None:
+        raise CatalogError(f"{path}: its numbers have decimal commas, such as {match[1][:40]}; export it with decimal points")
 
 
 def decode_text(data: bytes) -> str:

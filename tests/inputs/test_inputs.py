@@ -149,10 +149,21 @@ def test_ordinary_toml_is_decoded():
     assert decode_toml("'a.b.c.d.e.f.g.h.i.j' = 'a.b.c.d.e.f.g.h.i.j.k'")
 
 
-def test_toml_files_are_bounded_and_a_byte_order_mark_is_named(tmp_path):
-    (tmp_path / "bom.toml").write_bytes(b"\xef\xbb\xbfa = 1")
-    (tmp_path / "latin.toml").write_bytes(b"a = '\xe4'")
-    (tmp_path / "large.toml").write_bytes(b"#" * (MAX_TOML + 1))
-    for name, message in (("bom", "byte order mark"), ("latin", "byte 5 is not UTF-8"), ("large", "larger than 1 MiB")):
-        with pytest.raises(DatasetError, match=message):
-            read_toml(tmp_path / f"{name}.toml", DatasetError)
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"a = '\xe4'", "byte 5 is not UTF-8"),
+        (b"#" * (MAX_TOML + 1), "larger than 1 MiB"),
+        *((" = 1".join("ab").encode(kind), "is text in UTF-16 or UTF-32") for kind in ("utf-16", "utf-16-le", "utf-16-be", "utf-32")),
+    ],
+    ids=str,
+)
+def test_toml_files_are_bounded_and_in_utf_8(tmp_path, data, message):
+    (tmp_path / "a.toml").write_bytes(data)
+    with pytest.raises(DatasetError, match=message):
+        read_toml(tmp_path / "a.toml", DatasetError)
+
+
+def test_a_byte_order_mark_is_no_part_of_toml(tmp_path):
+    (tmp_path / "a.toml").write_bytes(b"\xef\xbb\xbfa = 1\r\n")
+    assert read_toml(tmp_path / "a.toml", DatasetError) == {"a": 1}

@@ -168,7 +168,7 @@ def test_duplicate_objects(tmp_path):
     own.mkdir()
     write_box(own / "a.ply")
     write_box(own / "a.obj")
-    fails(config_for(own), tmp_path, "a.obj and a.ply have the same name")
+    fails(config_for(own), tmp_path, "a.obj and a.ply have the same name; the first is used, keep one of them")
 
 
 @pytest.mark.parametrize(
@@ -307,6 +307,9 @@ def test_objects_larger_than_the_volume_budget_are_reported(tmp_path):
         ("{", ("is damaged", "repair it")),
         ("[]", ("expected object, got array",)),
         ({}, ("no entry for object 1",)),
+        ({"-1": {}, "1_0": {}, "obj_000001": {}, "²": {}}, ("no entry for object 1",)),
+        ({"1": {}, "01": {}}, ("the keys '1' and '01' are both object 1; keep one of them",)),
+        ('{"1": {}, "1": {"diameter": 5}}', ("the keys '1' and '1' are both object 1",)),
         ({"1": 5}, ("no entry for object 1",)),
         ({"1": {"diameter": "big"}}, ("diameter", "diameter above 0")),
         ({"1": {"diameter": 0}}, ("> 0.0", "diameter above 0")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -103,6 +104,20 @@ def test_light_maps_of_all_kinds(case, brightness, said):
         assert light.radiance[-1].mean() == pytest.approx(0.1729 * brightness, rel=1e-3)
     assert len(lines) == bool(said)
     assert said in "".join(lines)
+
+
+@pytest.mark.parametrize(("names", "beside"), [(["a.usdz", "B.Blend"], ""), (["a.step.abc", "x.urdf"], "part.stl"), (["Part/a.dae"], "")])
+def test_files_of_formats_that_are_not_read_are_named(tmp_path, names, beside):
+    for name in names:
+        put(tmp_path / "models" / name, b"")
+    said = f"models folder {tmp_path / 'models'}: of a format that is not read: {', '.join(sorted(names))}; save them as PLY, OBJ, glTF, "
+    if not beside:
+        with pytest.raises(CatalogError, match=re.escape(said)):
+            load(tmp_path / "models", tmp_path)
+        return
+    put(tmp_path / "models" / beside, box(0.1, 0.1, 0.1, kind=beside[-3:]))
+    _, (line, *_) = load(tmp_path / "models", tmp_path)
+    assert line.startswith(said)
 
 
 # ---- one bad file ----

@@ -21,7 +21,7 @@ CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint16)
 UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)
 KINDS = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
-SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
 
 
 class Builder:
@@ -254,6 +254,57 @@ def test_transforms_of_nodes_are_chained(tmp_path):
     mesh, _, _ = builder.read(tmp_path)
     turned = np.column_stack([-CORNERS[:, 1], CORNERS[:, 0], CORNERS[:, 2]])
     assert mesh.vertices[:4] == pytest.approx(2 * turned + (1, 2, 3), abs=1e-6)
+
+
+BOUND = np.array([[2, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
+"""Transform of a joint in the pose of binding."""
+BEND = np.array([[2, 0], [2, 0], [1, 1], [0, 3]], np.float32)
+"""Weights of two joints that are not normalized."""
+
+
+@pytest.mark.parametrize(
+    ("joints", "inverse", "weights", "expected"),
+    [
+        ([{}], None, None, CORNERS),
+        ([{}], None, np.zeros((4, 1), np.float32), CORNERS),
+        # In the pose of binding, beside a joint that is not used.
+        ([{"translation": [1, 2, 3], "scale": [2, 2, 2]}] * 2, BOUND, np.ones((4, 1), np.float32), CORNERS),
+        ([{"scale": [3, 3, 3]}], None, np.ones((4, 1), np.float32), 3 * CORNERS),
+        ([{}, {"translation": [2, 0, 0]}], None, BEND, CORNERS + np.array([[0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0]])),
+    ],
+    ids=["no joints", "no weights", "bound", "scaled", "bent"],
+)
+def test_joints_move_a_mesh_with_a_skin_and_its_node_does_not(tmp_path, joints, inverse, weights, expected):
+    """glTF 2.0, section 3.7.3.3."""
+    builder = Builder()
+    skin: dict[str, Any] = {"joints": [2 + index for index in range(len(joints))]}
+    if inverse is not None:
+        skin["inverseBindMatrices"] = builder.add(np.tile(np.linalg.inv(inverse).T.reshape(16), (len(joints), 1)).astype(np.float32))
+    if weights is not None:
+        used = weights.shape[1]
+        builder.attribute("JOINTS_0", np.tile(np.r_[np.arange(used), np.zeros(4 - used)], (4, 1)).astype(np.uint8))
+        builder.attribute("WEIGHTS_0", np.pad(weights, ((0, 0), (0, 4 - used))))
+    # A parent of the mesh, the mesh, and joints outside of the scene.
+    builder.content["nodes"] = [{"children": [1], "scale": [7, 7, 7]}, {"mesh": 0, "skin": 0, "translation": [0, 9, 0]}, *joints]
+    builder.content["skins"] = [skin]
+    mesh, _, said = builder.read(tmp_path)
+    assert np.unique(mesh.vertices.round(4), axis=0) == pytest.approx(np.unique(expected, axis=0), abs=1e-4)
+    assert not said
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"skins": [{"joints": [5]}]}, "refers to node 5"),
+        ({}, "refers to skin 0"),
+        ({"skins": [{"joints": [0]}]}, "a skin whose joints and weights do not fit"),
+    ],
+)
+def test_damaged_skins_are_one_line(tmp_path, change, said):
+    builder = Builder().attribute("JOINTS_0", np.full((4, 4), 3, np.uint8)).attribute("WEIGHTS_0", np.ones((4, 4), np.float32))
+    builder.content |= {"nodes": [{"mesh": 0, "skin": 0}], **change}
+    with pytest.raises(CatalogError, match=said):
+        builder.read(tmp_path)
 
 
 def test_parts_have_one_order(tmp_path):

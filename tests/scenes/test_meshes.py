@@ -18,7 +18,7 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import smooth_normals
-from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, glb, picture, put, read
+from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, exported, glb, picture, put, read
 
 SMOOTH = MeshOptions(crease_angle=180.0)
 
@@ -182,6 +182,22 @@ def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
     mesh, finish = read(tmp_path / "a.stl", data if isinstance(data, bytes) else data + data)
     assert len(mesh.vertices) == len(ball.vertices)
     assert finish.color == (0.7, 0.7, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("announced", "more", "count"), [(12, 0, 12), (0, 0, 12), (0, 3, 12), (5, 0, 12), (12, 3, 12), (11, 60, 11), (13, 0, 0), (2**24, 0, 0)]
+)
+def test_a_binary_stl_has_as_many_triangles_as_its_body(tmp_path, announced, more, count):
+    """Unless bytes that are no triangles follow those announced."""
+    data, said = exported(trimesh.creation.box((1, 1, 1)), "stl"), []
+    path = put(tmp_path / "a.stl", data[:80] + struct.pack("<I", announced) + data[84:] + bytes(more))
+    if not count:
+        with pytest.raises(CatalogError, match=f"announces {announced} triangles"):
+            read_mesh(path, 1.0)
+        return
+    assert len(read_mesh(path, 1.0, report=said.append)[0].faces) == count
+    assert len(said) == ((announced, more) != (12, 0))
+    assert all(f"its header announces {announced} triangles, its body holds " in line for line in said)
 
 
 def test_what_is_ignored_of_a_ply_is_one_line(tmp_path):
@@ -355,6 +371,9 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.stl", b"\x00" * 80 + struct.pack("<I", 2) + bytes(50), "cut short"),
         ("a.stl", b"\x00" * 80 + struct.pack("<I", 2**32 - 1), "announces 4294967295 triangles"),
         ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\n", "not readable as STL"),
+        ("a.stl", "solid x\nvertex 0,0 0 0\nvertex 1 0 0\nvertex 0 -1,5 0\n", "decimal commas, such as 0,0; export it with decimal points"),
+        ("a.obj", "o 1,5\nv 0 0 0\nv 1 0 0\nv 0 1e-2 0,5\nf 1 2 3\n", "decimal commas, such as 0,5; "),
+        ("a.ply", ascii_ply([(0, 0, 0), ("-1,5e-3", 0, 0), (0, 1, 0), (0, 0, 1)]), "decimal commas, such as -1,5e-3; "),
         ("a.stl", "solid x\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 nan 0\n", "not finite"),
         ("a.gltf", "{}", "no triangles"),
         ("a.gltf", "hello", "a.gltf is damaged"),

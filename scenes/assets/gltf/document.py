@@ -34,6 +34,7 @@ GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 _IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
+_ATTRIBUTES = ("POSITION", "NORMAL", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_")
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
@@ -124,6 +125,13 @@ class Node(_Struct):
     translation: Three = (0.0, 0.0, 0.0)
     rotation: Four = (0.0, 0.0, 0.0, 1.0)
     scale: Three = (1.0, 1.0, 1.0)
+
+
+class Skin(_Struct):
+    """glTF skin: nodes that are joints, and the accessor of their inverse bind matrices (None: identities)."""
+
+    joints: list[Index]
+    inverseBindMatrices: Index | None = None  # noqa: N815
 
 
 class Scene(_Struct):
@@ -235,7 +243,7 @@ class Gltf(_Struct):
     materials: list[Material] = []
     meshes: list[Mesh] = []
     nodes: list[Node] = []
-    skins: list[Any] = []
+    skins: list[Skin] = []
     animations: list[Any] = []
     scenes: list[Scene] = []
     scene: Index = 0
@@ -281,7 +289,7 @@ def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:
         advice = "export it without compression" if any(name in _COMPRESSED for name in refused) else advice
         raise CatalogError(f"{path}: requires the extension {', '.join(refused[:8])}, which is not implemented; {advice}")
     notes.ignored += [ascii(name)[1:-1][:80] for name in sorted(set(gltf.extensionsUsed) | set(needed)) if name not in _IMPLEMENTED]
-    notes.ignored += [name for name in ("animations", "skins") if getattr(gltf, name)]
+    notes.ignored += ["animations"] if gltf.animations else []
 
 
 def _split_chunks(data: bytes, path: Path) -> tuple[bytes, list[bytes]]:
@@ -309,7 +317,7 @@ def item_at(items: list[_Item], index: int, what: str, path: Path) -> _Item:
 
 def _check_sizes(gltf: Gltf, path: Path) -> None:
     """Check what would be allocated: views and accessors in bytes, vertices and triangles of all meshes and of all nodes."""
-    for name in ("buffers", "bufferViews", "accessors", "images", "textures", "materials", "meshes", "nodes"):
+    for name in ("buffers", "bufferViews", "accessors", "images", "textures", "materials", "meshes", "nodes", "skins"):
         limit = MAX_PARTS * (8 if name in ("bufferViews", "accessors") else 1)
         if len(getattr(gltf, name)) > limit:
             raise CatalogError(f"{path}: {len(getattr(gltf, name))} {name}; allowed: {limit}; merge the meshes' parts")
@@ -329,7 +337,7 @@ def _check_sizes(gltf: Gltf, path: Path) -> None:
 
 def _primitive_rows(gltf: Gltf, primitive: Primitive, path: Path) -> int:
     """Vertices or triangles of a primitive, whichever are more."""
-    used = {key: index for key, index in primitive.attributes.items() if key in ("POSITION", "NORMAL", "COLOR_0") or "TEXCOORD_" in key}
+    used = {key: index for key, index in primitive.attributes.items() if key.startswith(_ATTRIBUTES)}
     if "POSITION" not in used:
         raise CatalogError(f"{path}: a mesh has no positions; export it again")
     for key, index in (*used.items(), *([("indices", primitive.indices)] if primitive.indices is not None else ())):
@@ -346,6 +354,9 @@ def _check_tree(gltf: Gltf, path: Path) -> None:
     """Check that nodes form trees, as glTF demands: one parent each, roots without, and no deeper than MAX_DEPTH."""
     parents: dict[int, int] = {}
     for number, node in enumerate(gltf.nodes):
+        if node.skin is not None:
+            for joint in item_at(gltf.skins, node.skin, "skin", path).joints:
+                item_at(gltf.nodes, joint, "node", path)
         for child in node.children:
             item_at(gltf.nodes, child, "node", path)
             if parents.setdefault(child, number) != number or child == number:

@@ -38,6 +38,7 @@ from synpick_warp.scenes.assets.gltf.document import (
     Node,
     Pbr,
     Primitive,
+    Skin,
     TextureInfo,
     View,
     item_at,
@@ -51,6 +52,8 @@ _FACTOR_TOLERANCE = 1e-3
 _DIELECTRIC = 0.04
 """Reflectance of a dielectric at normal incidence (glTF 2.0, appendix B)."""
 _CLAMP, _MIRROR = 33071, 33648
+_RIGID = 1e-6
+"""Relative difference up to which the joints of a skin move alike, as they do in the pose of binding."""
 
 
 def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshPart]:
@@ -81,21 +84,61 @@ class _Reader:
         self.pixels = 0
 
     def parts(self) -> list[MeshPart]:
-        """Mesh parts of the default scene, depth first; without scenes, of all nodes."""
+        """Mesh parts of the default scene, depth first; without scenes, of all nodes.
+
+        A node's transform holds for its mesh unless it has a skin; then those of the skin's joints hold alone (glTF 2.0, section 3.7.3.3).
+        """
         nodes, scenes = self.gltf.nodes, self.gltf.scenes
         children = {child for node in nodes for child in node.children}
         roots = [number for number in range(len(nodes)) if number not in children]
-        roots = item_at(scenes, self.gltf.scene, "scene", self.path).nodes if scenes else roots
-        stack = [(root, np.eye(4)) for root in reversed(roots)]
+        drawn = self.placed(item_at(scenes, self.gltf.scene, "scene", self.path).nodes if scenes else roots)
+        # Joints may lie outside of the scene.
+        placed = self.placed(roots) if self.gltf.skins else drawn
         parts: list[MeshPart] = []
+        for number, transform in drawn.items():
+            skin, mesh = nodes[number].skin, nodes[number].mesh
+            for each in () if mesh is None else self.gltf.meshes[mesh].primitives:
+                part = self.part(each)
+                parts.append(_transform(part, transform) if skin is None else self.skinned(part, each, self.gltf.skins[skin], placed))
+        return parts
+
+    def placed(self, roots: list[int]) -> dict[int, np.ndarray]:
+        """Transforms (4, 4) of nodes and all below them to the scene, by number, depth first."""
+        stack = [(root, np.eye(4)) for root in reversed(roots)]
+        placed: dict[int, np.ndarray] = {}
         while stack:
             number, parent = stack.pop()
-            node = nodes[number]
-            transform = parent @ _node_matrix(node)
-            if node.mesh is not None:
-                parts += [_transform(self.part(each), transform) for each in self.gltf.meshes[node.mesh].primitives]
-            stack += [(child, transform) for child in reversed(node.children)]
-        return parts
+            placed[number] = parent @ _node_matrix(self.gltf.nodes[number])
+            stack += [(child, placed[number]) for child in reversed(self.gltf.nodes[number].children)]
+        return placed
+
+    def skinned(self, part: MeshPart, primitive: Primitive, skin: Skin, placed: dict[int, np.ndarray]) -> MeshPart:
+        """Linear blend skinning in the pose of the file: vertices by the weighted mean of the transforms of their joints."""
+        count, names = len(part.vertices), primitive.attributes
+        sets = [number for number in range(len(names)) if f"JOINTS_{number}" in names and f"WEIGHTS_{number}" in names]
+        if not sets:
+            return part
+        joints, weights = (
+            np.concatenate([self.values(names[f"{name}_{number}"], name, (4,)) for number in sets], axis=1)
+            for name in ("JOINTS", "WEIGHTS")
+        )
+        if len(joints) != count or len(weights) != count or joints.max(initial=0) >= len(skin.joints):
+            raise CatalogError(f"{self.path}: a skin whose joints and weights do not fit its vertices; export it again")
+        matrices = np.stack([placed[joint] for joint in skin.joints])
+        if skin.inverseBindMatrices is not None:
+            inverse = self.values(skin.inverseBindMatrices, "inverseBindMatrices", (16,))
+            if len(inverse) < len(matrices):
+                raise CatalogError(f"{self.path}: {len(inverse)} inverse bind matrices for {len(matrices)} joints; export it again")
+            matrices = matrices @ inverse[: len(matrices)].reshape(-1, 4, 4).transpose(0, 2, 1)
+        if np.ptp(matrices, axis=0).max() <= _RIGID * np.abs(matrices).max():
+            return _transform(part, matrices[0])
+        total = weights.sum(axis=1)
+        weights[total <= 0.0, 0] = 1.0
+        blend = np.einsum("vj,vjab->vab", weights / np.where(total > 0.0, total, 1.0)[:, None], matrices[joints.astype(np.int64)])
+        if part.normals is not None:
+            self.notes.ignored.append("normals of a mesh that its skin bends")
+        moved = np.einsum("vab,vb->va", blend[:, :3, :3], part.vertices) + blend[:, :3, 3]
+        return replace(part, vertices=moved, normals=None)
 
     def part(self, primitive: Primitive) -> MeshPart:
         """Geometry and material of a primitive as a mesh part."""

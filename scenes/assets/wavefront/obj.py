@@ -23,7 +23,7 @@ from synpick_warp.scenes.assets.asset_files import (
     reading_as,
 )
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes
-from synpick_warp.scenes.assets.text import decode_text
+from synpick_warp.scenes.assets.text import check_decimals, decode_text
 from synpick_warp.scenes.assets.wavefront.mtl import MtlMaterial, TexturePixels, parse_library, read_material
 from synpick_warp.scenes.assets.wavefront.obj_text import normalize_text
 from synpick_warp.system.inputs.files import read_file
@@ -59,8 +59,12 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
         notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
-    with reading_as("OBJ", path):
-        parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
+    try:
+        with reading_as("OBJ", path):
+            parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
+    except CatalogError:
+        check_decimals(text, path)
+        raise
     if not parts:
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     return parts

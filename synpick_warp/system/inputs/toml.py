@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import tomllib
 from pathlib import Path
@@ -39,18 +40,18 @@ def decode_toml(text: str) -> dict[str, Any]:
 
 
 def read_toml(path: Path, error: type[SynpickError]) -> dict[str, Any]:
-    """Read a TOML file.
+    """Read a TOML file, with a byte order mark or without.
 
     Raises:
         SynpickError: As `error`, in one line: it cannot be read, is too large, is not UTF-8, or is not TOML.
     """
     data = read_file(path, MAX_TOML, error)
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in data[:4]:
+        raise error(f"{path} is text in UTF-16 or UTF-32, which TOML does not allow; save it as UTF-8")
     try:
-        return decode_toml(data.decode("utf-8"))
+        return decode_toml(data.decode("utf-8-sig"))
     except UnicodeDecodeError as fault:
         raise error(f"{path} is not valid TOML: byte {fault.start} is not UTF-8") from None
     except ValueError as fault:
-        if data.startswith(b"\xef\xbb\xbf"):
-            raise error(f"{path} begins with a byte order mark, which TOML does not allow; save it as UTF-8 without BOM") from None
         text = str(fault)
         raise error(f"{path} is not valid TOML: {text[:1].lower()}{text[1:]}") from None
