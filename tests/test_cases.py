@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from tests import camera_cases, mesh_cases
+from tests import camera_cases, mesh_cases, pick_cases
 
 CASES = Path(__file__).parent / "cases"
 KINDS = ("bins", "calibrations", "cells", "parts", "picks", "settings")
 """Folders whose inputs have a row here; meshes, lights and others have theirs in tests/scenes."""
 Check = Callable[[Path, Path], None]
 """Takes the path of an input and an empty folder for output; asserts."""
-ROWS: dict[str, Check] = {**camera_cases.ROWS, **mesh_cases.ROWS}
+ROWS: dict[str, Check] = {**camera_cases.ROWS, **mesh_cases.ROWS, **pick_cases.ROWS}
 """By path below CASES."""
 PENDING = {
     "bins/hopper.stl",
@@ -29,10 +29,6 @@ PENDING = {
     "cells/decomposition_limit.toml",
     "parts/bin_wire",
     "parts/suction_default_porous",
-    "picks/states_frame_2147483647.parquet",
-    "picks/trials_outcome_255.parquet",
-    "picks/trials_point_floatnan.parquet",
-    "picks/trials_state_-1.parquet",
     "settings/posegl.toml",
 }
 

@@ -113,11 +113,21 @@ def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
     return pa.schema(fields)
 
 
-def read_type(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype | None:
-    """Structured dtype of a stored table's rows; None: its schema is not that of `columns`."""
+def check_schema(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype:
+    """Structured dtype of a stored table's rows.
+
+    Raises:
+        ValueError: A column is missing, unknown, twice there, or of another type than that of `columns`.
+    """
     sizes = [item.type.list_size for item in schema if item.name == "visible" and pa.types.is_fixed_size_list(item.type)]
-    kind = row_type(columns, *sizes)
-    return kind if schema.equals(table_schema(columns, kind)) else None
+    kind = row_type(columns, *sizes[:1])
+    known = table_schema(columns, kind)
+    for name in [*known.names, *schema.names]:
+        if (count := schema.names.count(name)) != known.names.count(name):
+            raise ValueError(f"it has {count} columns {name}; allowed: {known.names.count(name)}")
+        if (found := schema.field(name).type) != (wanted := known.field(name).type):
+            raise ValueError(f"column {name} has the type {found}; allowed: {wanted}")
+    return kind
 
 
 def from_table(table: pa.Table, columns: Sequence[Column], kind: np.dtype) -> np.recarray:
@@ -130,7 +140,8 @@ def from_table(table: pa.Table, columns: Sequence[Column], kind: np.dtype) -> np
     for column in columns:
         values = table[column.name].combine_chunks()
         flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
-        if values.null_count or flat.null_count:
-            raise ValueError(f"{column.name} lacks values")
+        for part, size in ((values, 1), (flat, len(flat) // max(len(values), 1))):
+            if part.null_count:
+                raise ValueError(f"column {column.name}, row {part.is_null().index(True).as_py() // size} has no value")
         rows[column.name] = flat.to_numpy(zero_copy_only=False).reshape(rows[column.name].shape)
     return rows

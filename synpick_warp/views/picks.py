@@ -7,6 +7,7 @@ executes a candidate from the state, possibly perturbed. One trial is one row.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -17,12 +18,14 @@ from synpick_warp.codes import Ending, Outcome, Share
 
 MOVED = 5e-3
 """Displacement above which another object counts as moved [m]; resting piles creep far less."""
+REACH = 1e4
+"""Largest coordinate of a grasp point [m]; no cell is as large."""
 ORDER = ("state", "candidate", "repeat")
 """Columns that identify a trial within its episode, and by which its table is sorted."""
 
 
 class Column(NamedTuple):
-    """Schema of a column: name, type, unit (1: none), meaning, components (1: a scalar), and enumeration of its codes."""
+    """Schema of a column: name, type, unit (1: none), meaning, components (1: a scalar), enumeration of its codes, and domain."""
 
     name: str
     dtype: str
@@ -33,6 +36,17 @@ class Column(NamedTuple):
     """Components of a value: 3 is a vector."""
     codes: type[enum.IntEnum] | None = None
     """Enumeration whose values it holds."""
+    low: float = -math.inf
+    """Least value; infinite ones are not allowed."""
+    high: float = math.inf
+    """Largest value."""
+    undefined: bool = False
+    """Whether it may be NaN."""
+
+    @property
+    def is_direction(self) -> bool:
+        """Whether values are unit vectors."""
+        return self.size > 1 and self.unit == "1"
 
     @property
     def field(self) -> tuple[str, str, tuple[int, ...]]:
@@ -41,50 +55,52 @@ class Column(NamedTuple):
 
 
 COLUMNS = (
-    Column("state", "<i4", "1", "Index of the state within the episode."),
-    Column("frame", "<i4", "1", "Frame of the episode at which the state was saved, and from which the candidate was drawn."),
-    Column("candidate", "<i4", "1", "Index of the candidate within the state."),
-    Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed."),
+    Column("state", "<i4", "1", "Index of the state within the episode.", low=0),
+    Column("frame", "<i4", "1", "Frame of the episode at which the state was saved, and from which the candidate was drawn.", low=0),
+    Column("candidate", "<i4", "1", "Index of the candidate within the state.", low=0),
+    Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed.", low=0),
     Column("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
-    Column("weight", "<f4", "1", "Inverse probability weight of its pixel in a draw, for unbiased estimates over pixels; 0: own grasp."),
-    Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states."),
-    Column("row", "<i4", "px", "Pixel in the perception image, from the top."),
-    Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none."),
-    Column("obj_id", "<i4", "1", "Its object id; -1: none."),
-    Column("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3),
+    Column(
+        "weight", "<f4", "1", "Inverse probability weight of its pixel in a draw, for unbiased estimates over pixels; 0: own grasp.", low=0
+    ),
+    Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states.", low=0),
+    Column("row", "<i4", "px", "Pixel in the perception image, from the top.", low=0),
+    Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none.", low=-1),
+    Column("obj_id", "<i4", "1", "Its object id; -1: none.", low=-1),
+    Column("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3, low=-REACH, high=REACH),
     Column("normal", "<f4", "1", "Unit surface normal there in the world, out of the object, smoothed as perception does.", 3),
     Column("yaw", "<f4", "rad", "Rotation of the gripper shaft about the vertical."),
     Column("tilt", "<f4", "rad", "Rotation of the cup about the wrist axis."),
     Column("approach", "<f4", "1", "Unit direction in which the cup is pressed on, in the world.", 3),
-    Column("seal", "<f4", "1", "Analytic seal score of SuctionNet at the pixel, 0 to 1."),
-    Column("wrench", "<f4", "1", "Analytic wrench score of SuctionNet at the pixel, 0 to 1."),
-    Column("offset", "<f4", "m", "Perturbation of the grasp point.", 3),
-    Column("rotation", "<f4", "rad", "Perturbation of the cup's orientation, as a rotation vector in the world.", 3),
-    Column("friction", "<f4", "1", "Factor on all coefficients of friction."),
+    Column("seal", "<f4", "1", "Analytic seal score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
+    Column("wrench", "<f4", "1", "Analytic wrench score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
+    Column("offset", "<f4", "m", "Perturbation of the grasp point.", 3, low=-1, high=1),
+    Column("rotation", "<f4", "rad", "Perturbation of the cup's orientation, as a rotation vector in the world.", 3, low=-4, high=4),
+    Column("friction", "<f4", "1", "Factor on all coefficients of friction.", low=0, high=2),
     Column("outcome", "|u1", "1", "Outcome of the attempt; none: the simulation ended first.", codes=Outcome),
     Column("ending", "|u1", "1", "Why the simulation ended during the trial; running: it did not.", codes=Ending),
     Column("success", "|b1", "1", "Whether any object hung on the cup after lift and hold."),
     Column("intended", "|b1", "1", "Whether the intended instance hung on the cup after lift and hold."),
-    Column("hits", "<i4", "1", "Suction rays that hit an object when the suction was switched on."),
-    Column("sealed", "<i4", "1", "Cups with a good seal: bit k, cup k."),
-    Column("picked", "<i4", "1", "First instance on the cup at the end; -1: none."),
-    Column("peak_force", "<f4", "N", "Largest force of any seal, seals that broke included."),
-    Column("margin", "<f4", "1", "Least margin of a seal: 1 - force / break force; 0 or less: it broke. NaN: there was no seal."),
-    Column("time_to_break", "<f4", "s", "Time from suction on until the last seal broke. NaN: it did not, or there was none."),
-    Column("held", "<f4", "s", "Time with an object on the cup."),
-    Column("moved", "<i4", "1", f"Collateral: other objects displaced by more than {1e3 * MOVED:.0f} mm."),
-    Column("farthest", "<f4", "m", "Largest displacement of another object."),
-    Column("lost", "<i4", "1", "Objects that left the bin without being picked."),
-    Column("duration", "<f4", "s", "Simulated duration of the trial."),
+    Column("hits", "<i4", "1", "Suction rays that hit an object when the suction was switched on.", low=0),
+    Column("sealed", "<i4", "1", "Cups with a good seal: bit k, cup k.", low=0),
+    Column("picked", "<i4", "1", "First instance on the cup at the end; -1: none.", low=-1),
+    Column("peak_force", "<f4", "N", "Largest force of any seal, seals that broke included.", low=0),
+    Column("margin", "<f4", "1", "Least margin of a seal: 1 - force / break force; 0 or less: it broke. NaN: there was no seal.", high=1, undefined=True),
+    Column("time_to_break", "<f4", "s", "Time from suction on until the last seal broke. NaN: it did not, or there was none.", low=0, undefined=True),
+    Column("held", "<f4", "s", "Time with an object on the cup.", low=0),
+    Column("moved", "<i4", "1", f"Collateral: other objects displaced by more than {1e3 * MOVED:.0f} mm.", low=0),
+    Column("farthest", "<f4", "m", "Largest displacement of another object.", low=0),
+    Column("lost", "<i4", "1", "Objects that left the bin without being picked.", low=0),
+    Column("duration", "<f4", "s", "Simulated duration of the trial.", low=0),
 )
 """Columns of the table of trials, in the order of files."""
 STATES = (
-    Column("state", "<i4", "1", "Index of the state within the episode."),
-    Column("frame", "<i4", "1", "Frame of the episode at which it was saved."),
-    Column("camera", "<i4", "1", "Index of the camera from whose perception image the candidates were drawn."),
-    Column("width", "<i4", "px", "Width of its perception image."),
-    Column("height", "<i4", "px", "Height of its perception image."),
-    Column("candidates", "<i4", "1", "Number of candidates."),
+    Column("state", "<i4", "1", "Index of the state within the episode.", low=0),
+    Column("frame", "<i4", "1", "Frame of the episode at which it was saved.", low=0),
+    Column("camera", "<i4", "1", "Index of the camera from whose perception image the candidates were drawn.", low=0),
+    Column("width", "<i4", "px", "Width of its perception image.", low=1),
+    Column("height", "<i4", "px", "Height of its perception image.", low=1),
+    Column("candidates", "<i4", "1", "Number of candidates.", low=0),
     Column("visible", "|b1", "1", "Whether each instance is visible in the perception image."),
 )
 """Columns of the table of states. `visible` has a component for each instance of the episode."""
@@ -139,13 +155,12 @@ def sort_rows(rows: np.ndarray) -> np.ndarray:
     return rows[np.lexsort(_keys(rows)[::-1])]
 
 
-def are_sorted(rows: np.ndarray) -> bool:
-    """Whether rows are sorted by ORDER, with unique keys."""
+def are_sorted(rows: np.ndarray) -> np.ndarray:
+    """Whether each row (row) follows the previous one by ORDER, with unique keys."""
     keys = np.stack(_keys(rows)).astype(np.int64)
-    steps = np.diff(keys, axis=1)
+    steps = np.diff(keys, axis=1, prepend=keys[:, :1] - 1)
     # The first key that differs decides.
-    decisive = np.take_along_axis(steps, (steps != 0).argmax(axis=0)[None], axis=0)
-    return bool((decisive > 0).all())
+    return np.take_along_axis(steps, (steps != 0).argmax(axis=0)[None], axis=0)[0] > 0
 
 
 def _keys(rows: np.ndarray) -> list[np.ndarray]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -20,8 +22,8 @@ from synpick_warp.dataset import picks as reader
 from synpick_warp.dataset.grasp_maps import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.picks import FOLDER, PicksExporter, make_table
-from synpick_warp.views.picks import COLUMNS, are_sorted, make_rows, sort_rows
+from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files
+from synpick_warp.views.picks import COLUMNS, STATES, are_sorted, make_rows, sort_rows
 from tests.harness import scripted_bake
 from tests.harness.exporter_contract import export
 from tests.worlds.box_sets import write_pick_set, write_set
@@ -92,39 +94,71 @@ def test_the_file_beside_a_scene_has_the_candidates_of_its_frames(whole):
     assert {one["trials"] for one in found} == {REPEATS}
 
 
-def damage(place: Path, change: str) -> None:
-    """Damage a table."""
-    table = pq.read_table(place)
-    if change == "cut":
+def replaced(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    """A table with another column in a column's place."""
+    return table.set_column(table.column_names.index(name), name, values)
+
+
+DAMAGE = {
+    "column gone": (lambda table: table.drop_columns("seal"), "it has 0 columns seal; allowed: 1"),
+    "column renamed": (lambda table: table.rename_columns({"seal": "Seal"}), "it has 0 columns seal; allowed: 1"),
+    "column twice": (lambda table: table.append_column("seal", table["seal"]), "it has 2 columns seal; allowed: 1"),
+    "another column": (lambda table: table.append_column("more", table["seal"]), "it has 1 columns more; allowed: 0"),
+    "type": (lambda table: replaced(table, "seal", table["seal"].cast("double")), "column seal has the type double; allowed: float"),
+    "size": (lambda table: replaced(table, "point", table["seal"]), r"column point has the type float; allowed: fixed_size_list.*\[3\]"),
+    "null": (lambda table: replaced(table, "hits", pa.array([1, None] * 24, "int32")), "column hits, row 1 has no value"),
+    "null in a list": (
+        lambda table: replaced(table, "point", pa.array([[0, 0, 0], [0, None, 0]] * 24, pa.list_(pa.float32(), 3))),
+        "column point, row 1 has no value",
+    ),
+    "order": (lambda table: table.take([1, 0, *range(2, 48)]), "column state, row 1 is 0; allowed: rows sorted by state, candidate and"),
+    "twice": (lambda table: table.take([0, 0, *range(2, 48)]), "column state, row 1 is 0; allowed: .* none twice"),
+    "empty": (lambda table: table.slice(0, 0), r"states.000002.parquet, column candidates, row 0 is 12; allowed: 0"),
+    "cut": (None, "000002.parquet cannot be read: "),
+    "missing": ("gone", "there is no file .*000002.parquet"),
+}
+
+
+@pytest.fixture
+def copied(whole, tmp_path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "set"))
+
+
+@pytest.mark.parametrize("change", DAMAGE)
+def test_damaged_tables_are_refused(copied, change):
+    place, (damage, message) = copied / FOLDER / "000002.parquet", DAMAGE[change]
+    if damage is None:
         place.write_bytes(place.read_bytes()[:-9])
-    elif change == "column":
-        pq.write_table(table.drop_columns("seal"), place)
-    elif change == "order":
-        pq.write_table(table.take(np.arange(len(table))[::-1]), place)
-    elif change == "twice":
-        rows = make_rows(COLUMNS, pick_batch(2).trials)
-        pq.write_table(make_table(COLUMNS, sort_rows(np.concatenate((rows, rows[:1])))), place)
-    else:
+    elif damage == "gone":
         place.unlink()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("cut", "000002.parquet cannot be read: "),
-        ("column", "000002.parquet does not have the columns of picks"),
-        ("order", "000002.parquet is not sorted, or has a row twice"),
-        ("twice", "000002.parquet is not sorted, or has a row twice"),
-        ("missing", "there is no file .*000002.parquet"),
-    ],
-)
-def test_damaged_tables_are_refused(whole, tmp_path, change, message):
-    shutil.copytree(whole, tmp_path / "set")
-    damage(tmp_path / "set" / FOLDER / "000002.parquet", change)
-    data = synpick_warp.open(tmp_path / "set")
+    else:
+        pq.write_table(damage(pq.read_table(place)), place)
+    data = synpick_warp.open(copied)
     with pytest.raises(DatasetError, match=message):
         data[2].picks  # noqa: B018
     assert len(data[0].picks)
+
+
+WRONG = {"f": (np.nan, np.inf, -np.inf), "i": (-2, -(2**31)), "u": (255, 77)}
+"""Values that no column allows, by kind of its type."""
+BOUNDED = ("frame", "candidate", "column", "row", "instance", "picked", "camera", "candidates")
+"""Columns that refer to something, so that no number is too large for their type alone."""
+
+
+@pytest.mark.parametrize(("place", "columns"), list(zip(pick_files(2), (COLUMNS, STATES), strict=True)), ids=("trials", "states"))
+def test_each_column_has_its_domain(copied, place, columns):
+    """One wrong value in the last row of a column: table, column, row and value are named."""
+    table = pq.read_table(copied / place)
+    for column in columns:
+        values = [*WRONG.get(np.dtype(column.dtype).kind, ()), *[2**31 - 1] * (column.name in BOUNDED), *[1.5] * (column.high == 1)]
+        for value in values[column.undefined :]:
+            rows, row = from_table(table, columns, check_schema(table.schema, columns)), len(table) - 1
+            rows[column.name][row] = value
+            pq.write_table(make_table(columns, rows), copied / place)
+            with pytest.raises(DatasetError, match=rf"parquet, column {column.name}, row {row} is \S.*; allowed: \S") as fault:
+                synpick_warp.open(copied)[2].pick_states  # noqa: B018
+            assert str(copied / place) in str(fault.value)
+            assert re.search(rf"is \[?{re.escape(str(rows[column.name][row].ravel()[0]))}", str(fault.value))
 
 
 def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
@@ -144,11 +178,10 @@ def test_a_data_set_of_picks_alone_has_its_episodes(tmp_path):
 
 def test_order_of_rows():
     rows = sort_rows(make_rows(COLUMNS, pick_batch(0).trials))
-    assert are_sorted(rows)
-    assert are_sorted(rows[:1])
-    assert are_sorted(rows[:0])
-    assert not are_sorted(rows[[1, 0]])
-    assert not are_sorted(rows[[0, 0]])
+    assert are_sorted(rows).all()
+    assert are_sorted(rows[:1]).all()
+    assert are_sorted(rows[:0]).all()
+    assert are_sorted(rows[[1, 0, 2, 2]]).tolist() == [True, False, True, False]
 
 
 def test_a_bake_is_verified_joined_and_converted_with_its_picks(tmp_path):

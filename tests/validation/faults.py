@@ -328,11 +328,11 @@ RENDERED: Faults = {
     "depth of something else": ("depth-rendered", "", depth_of_something_else),
 }
 PICKS: Faults = {
-    "table cut": ("picks-states", "cannot be read", raw("picks/000000.parquet", lambda data: data[:-5])),
-    "frame of a trial": ("picks-states", "its frame is not its state's", trials(lambda rows: put_value(rows, "frame", 1))),
-    "trials of a candidate gone": ("picks-states", "has trials of 11 candidates", trials(lambda rows: rows[rows["candidate"] > 0])),
-    "normal too long": ("picks-geometry", "normal is no unit vector", trials(lambda rows: put_value(rows, "normal", (0.0, 0.0, 2.0)))),
-    "seal above 1": ("picks-geometry", "seal is not between 0 and 1", trials(lambda rows: put_value(rows, "seal", 1.5))),
+    "table cut": ("picks-tables", "cannot be read", raw("picks/000000.parquet", lambda data: data[:-5])),
+    "frame of a trial": ("picks-tables", "column frame, row 0 is 1; allowed: the fr", trials(lambda rows: put_value(rows, "frame", 1))),
+    "trials of a candidate gone": ("picks-tables", "row 0 is 12; allowed: 11, which", trials(lambda rows: rows[rows["candidate"] > 0])),
+    "normal too long": ("picks-tables", "allowed: a unit vector", trials(lambda rows: put_value(rows, "normal", (0.0, 0.0, 2.0)))),
+    "seal above 1": ("picks-tables", "row 0 is 1.5; allowed: 0 to 1", trials(lambda rows: put_value(rows, "seal", 1.5))),
     "pixel beside": (
         "picks-pixels",
         "does not project to its pixel",

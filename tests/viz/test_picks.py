@@ -7,6 +7,9 @@ import re
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 
 import synpick_warp
@@ -17,6 +20,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.picks import pick_files
 from tests.builders import mistake
 from tests.worlds.box_sets import write_pick_set
 from tools.reports import picks as report
@@ -131,13 +135,33 @@ def test_samples_of_pytorch_have_candidates(data):
     np.testing.assert_array_equal(sample["pick_success"], view.graspable[rows, columns])
 
 
-def test_the_page_has_a_section_of_picks(data, tmp_path, monkeypatch):
+@pytest.fixture(autouse=True)
+def _no_attempts(monkeypatch):
     monkeypatch.setattr(compose, "choose_attempts", lambda *_: [])  # That of the boxes was never seen.
+
+
+def test_the_page_has_a_section_of_picks(data, tmp_path):
     page = compose.write_report(data, tmp_path / "report.html", frames=1, threads=1).read_text(encoding="utf-8")
     section = page.partition('<section id="picks">')[2].partition("</section>")[0]
     assert section.count('src="data:image/webp;base64,') == 4
     assert "By object: all candidates, seal x wrench" in section
     assert '"name":"calibration"' in page
+
+
+def test_own_grasps_alone_have_maps_but_no_scores(tmp_path):
+    """As with picks.candidates = 1: the report is written, and says why no score is evaluated."""
+    folder = write_pick_set(tmp_path / "set")
+    for index in (0, 2):
+        trials, states = pick_files(index)
+        table = pq.read_table(folder / trials).filter(pc.field("candidate") == 0)
+        pq.write_table(table.set_column(4, "share", pa.array([0] * len(table), "uint8")), folder / trials)
+        table = pq.read_table(folder / states)
+        pq.write_table(table.set_column(5, "candidates", pa.array([1] * len(table), "int32")), folder / states)
+    page = compose.write_report(synpick_warp.open(folder), tmp_path / "report.html", frames=1, threads=1).read_text(encoding="utf-8")
+    section = page.partition('<section id="picks">')[2].partition("</section>")[0]
+    assert section.count('src="data:image/webp;base64,') == 4
+    assert "picks.candidates = 1" in section
+    assert '"name":"calibration"' not in page
 
 
 def test_figures_of_hand_made_trials():

@@ -93,7 +93,8 @@ def write_report(
     config = data_set.config if data_set.found is None else None
     picks = find_picks(data_set, DRAWS)
     tried = [] if picks is None else [Part("picks", "Picks", PICKS_LEAD, picks_section(data_set, picks))]
-    parts, calibration = _parts(data_set, shown, samples, findings, versions), [] if picks is None else [calibration_chart(picks)]
+    parts = _parts(data_set, shown, samples, findings, versions)
+    calibration = [calibration_chart(picks)] if picks is not None and picks.scores else []
     page = Page(
         title=data_set.folder.resolve().name or "data set",
         lead=_lead(data_set, statistics, findings),

@@ -24,6 +24,9 @@ PICKS_LEAD = (
     "Grasps that were tried in simulation from states of the episodes: heat maps of success between the tried points, beside the analytic"
     " score of SuctionNet at the same points, and how well that score predicts success."
 )
+_NO_SCORES = (
+    "No score is evaluated: no trial of a sampled candidate has an outcome. With picks.candidates = 1, only the episodes' own grasps are tried."
+)
 _SEARCHED = 64
 """Most episodes that are searched for states."""
 _MAP_WIDTH = 640
@@ -102,6 +105,8 @@ def picks_section(data_set: DataSet, figures: PickFigures) -> Html:
         DatasetError: A file is missing or damaged.
     """
     tables = [table_html(table) for table in picks_tables(figures) if table.name != "pick_calibration"]
+    if not figures.scores:
+        tables = [element("p", _NO_SCORES, class_="empty")]
     return join([*_state_maps(data_set), *tables])
 
 
@@ -109,11 +114,9 @@ def _state_maps(data_set: DataSet) -> Iterator[Html]:
     """Figures of the heat maps of states; none if the data set has no colour images."""
     found = []
     for _, episode in zip(range(_SEARCHED), data_set.values(), strict=False):
-        states = episode.pick_states
-        if len(states) and (best := states[states["candidates"].argmax()])["candidates"]:
-            found.append((int(best["candidates"]), episode, best))
-    for _, episode, state in sorted(found, key=lambda one: -one[0])[:STATES]:
-        view = episode.view(int(state["frame"]), int(state["camera"]))
+        if best := max(episode.state_views(), key=lambda one: one[0]["candidates"], default=None):
+            found.append((episode, *best))
+    for episode, state, view in sorted(found, key=lambda one: -one[1]["candidates"])[:STATES]:
         if not (view.has("rgb") and view.has("mask_visib")):
             continue
         for caption, picture in draw_pick_maps(view, episode.picks[episode.picks["state"] == state["state"]], _MAP_WIDTH):

@@ -105,12 +105,10 @@ def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], dra
         names: Name of each object.
         draws: Bootstrap resamples of the intervals.
 
-    Raises:
-        DatasetError: There is no trial of a sampled candidate with an outcome.
+    Returns:
+        The figures; without scores and objects if no trial of a sampled candidate has an outcome, as with picks.candidates = 1.
     """
     counted = trials[(trials["share"] != Share.OWN) & (trials["outcome"] != Outcome.NONE)]
-    if not len(counted):
-        raise DatasetError("no trial of a sampled candidate has an outcome; bake with more of picks.candidates")
     both = {"seal x wrench": counted["seal"] * counted["wrench"], "seal": counted["seal"], "wrench": counted["wrench"]}
     uniform, weight = counted["share"] == Share.UNIFORM, counted["weight"]
     faced = uniform & (counted["angle"] <= FACING)
@@ -142,7 +140,7 @@ def _by_object(trials: np.ndarray, scored: Scored, names: dict[int, str], draws:
 
 
 def picks_figures(data_set: DataSet, draws: int = DRAWS) -> PickFigures:
-    """Collect and evaluate the picks of a data set. Errors: see `collect_picks` and `evaluate_picks`."""
+    """Collect and evaluate the picks of a data set. Errors: see `collect_picks`."""
     trials, episodes = collect_picks(data_set)
     return evaluate_picks(trials, episodes, names_of(data_set), draws)
 

@@ -145,4 +145,9 @@ class CheckPicks:
         """See `Task`."""
         from synpick_warp.apps.validation.rules.trials import PicksSubject
 
-        return Checked(list(apply_rules(PicksSubject(state.layout.root, self.index))))
+        violations = []
+        for violation in apply_rules(PicksSubject(state.layout.root, self.index)):
+            violations.append(violation)
+            if violation.rule == "picks-tables":
+                break  # The other rules read the same tables.
+        return Checked(violations)

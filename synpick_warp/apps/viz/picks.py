@@ -208,9 +208,9 @@ def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: i
         raise DatasetError(f"episode {chosen.index} has no state {index}; it has {len(states)} states")
     row = states[states["state"] == index][0]
     picks = chosen.picks[chosen.picks["state"] == index]
-    view = chosen.view(int(row["frame"]), int(row["camera"]))
-    if not len(picks):
-        raise DatasetError(f"state {index} of episode {chosen.index} has no trials")
+    view = next((view for found, view in chosen.state_views() if found["state"] == index), None)
+    if view is None:
+        raise DatasetError(f"camera {row['camera']} has no picture in frame {row['frame']}, of state {index} of episode {chosen.index}")
     return write_picture(out, _compose(view, picks, choose_trial(picks, candidate), names_of(data_set), data_set.config.suction.radius))
 
 
@@ -227,13 +227,12 @@ def write_pick_maps(data_set: DataSet, out: Path, count: int) -> Path:
         OutputError: The picture cannot be written.
     """
     check_picture_name(out)
-    states = [(episode, state) for episode in data_set.values() for state in episode.pick_states if state["candidates"]]
+    states = [(episode, state, view) for episode in data_set.values() for state, view in episode.state_views()]
     if not states:
-        raise DatasetError(f"{data_set.folder} has no state from which picks were tried")
+        raise DatasetError(f"{data_set.folder} has no state from which picks were tried, with a picture")
     rows = []
     for place in np.linspace(0, len(states) - 1, min(count, len(states))).round().astype(int).tolist():
-        episode, state = states[place]
-        view = episode.view(int(state["frame"]), int(state["camera"]))
+        episode, state, view = states[place]
         picks = episode.picks[episode.picks["state"] == state["state"]]
         rows.append(_maps_row(f"Episode {episode.index}, frame {view.frame}: {len(picks):,} trials from one state", view, picks))
     return write_picture(out, np.concatenate(rows))
