@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from synpick_warp.dataset.view import View
     from synpick_warp.dataset.reading import Episode
     from synpick_warp.dataset.view import View
     from synpick_warp.views.picks import Column
@@ -82,7 +81,9 @@ class PickTables:
         except ImportError as error:
             raise DatasetError(f"picks cannot be read: {error}; install it by pip install 'synpick-warp[picks]'") from None
         if not (self.folder / FOLDER).is_dir():
-            raise DatasetError(f"{self.folder} has no picks; bake it with --formats picks, which can be combined with others, as in bop,picks")
+            raise DatasetError(
+                f"{self.folder} has no picks; bake it with --formats picks, which can be combined with others, as in bop,picks"
+            )
         episode = cast("Episode", self)
         places = [self.folder / name for name in pick_files(self.index)]
         trials, states = (_read(place, columns) for place, columns in zip(places, (COLUMNS, STATES), strict=True))
@@ -133,7 +134,10 @@ def _check_columns(columns: Sequence[Column], rows: np.recarray) -> Iterator[_Fa
         right = (column.low <= values) & (values <= column.high) & np.isfinite(values)
         allowed = f"{column.low:g} to {column.high:g}" if np.isfinite(column.low) else "finite numbers"
         if column.codes:
-            right, allowed = np.isin(values, list(column.codes)), ", ".join(f"{code} {name}" for code, name in enumerate(names(column.codes)))
+            right, allowed = (
+                np.isin(values, list(column.codes)),
+                ", ".join(f"{code} {name}" for code, name in enumerate(names(column.codes))),
+            )
         elif column.is_direction:
             right, allowed = np.abs(np.linalg.norm(values.astype(np.float64), axis=1, keepdims=True) - 1.0) <= _UNIT, "a unit vector"
         elif column.undefined:
@@ -162,7 +166,9 @@ def _check_trials(trials: np.recarray, states: np.recarray) -> Iterator[_Fault]:
     import numpy as np
 
     row = np.minimum(np.searchsorted(states["state"], trials["state"]), max(len(states) - 1, 0))
-    yield _Fault("state", states["state"][row] != trials["state"] if len(states) else np.ones(len(trials), bool), "a row of the table of states")
+    yield _Fault(
+        "state", states["state"][row] != trials["state"] if len(states) else np.ones(len(trials), bool), "a row of the table of states"
+    )
     if not len(states):
         return
     start, instances = states[row], states["visible"].shape[1]

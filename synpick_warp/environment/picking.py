@@ -26,7 +26,7 @@ from synpick_warp.environment.settings import (
 )
 from synpick_warp.errors import ActionError, StateError
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
-from synpick_warp.stages.sim.states import State
+from synpick_warp.stages.sim.states import State, check_array
 
 TWIST_SPEED, TWIST_RATE = 0.25, 1.0
 """Velocity [m/s] and angular rates [rad/s] that a twist of 1 commands; whole picks descend the last 5 cm at 0.1 m/s."""
@@ -171,15 +171,11 @@ class PickingEnvironment:
         """Copy a checkpoint from the host to the device: the inverse of `state_to_host`.
 
         Raises:
-            StateError: It is of another version, other objects, cell or capacities, or an array is missing or has another shape or type.
+            StateError: It is of another version, other objects, cell or capacities, or an array is missing, has another shape or
+                type, or is not finite.
         """
-        counters = {}
-        for name, like in vars(self.episodes).items():
-            if (key := f"episodes.{name}") not in arrays:
-                raise StateError(f"the state lacks {key}; it is of worlds, not of environments")
-            counters[name] = values = np.array(arrays[key])
-            if (values.shape, values.dtype) != (like.shape, like.dtype):
-                raise StateError(f"{key} of the state is {values.dtype} {values.shape}; allowed: {like.dtype} {like.shape}")
+        likes = vars(self.episodes)
+        counters = {name: check_array(f"episodes.{name}", arrays, like.dtype, like.shape) for name, like in likes.items()}
         return EnvironmentState(self.worlds.simulation.states.from_host(arrays), Episodes(**counters))
 
     def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:

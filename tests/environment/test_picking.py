@@ -241,7 +241,7 @@ def test_a_state_continues_as_before(environment):
     ("ask", "message"),
     [
         (lambda one: one.branch(0, [2]), "there is no environment 2; there are 0 to 1"),
-        (lambda one: one.state_from_host({}), "the state lacks episodes.seed; it is of worlds"),
+        (lambda one: one.state_from_host({}), "the state lacks episodes.seed; allowed: all arrays"),
         (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"version": np.array(0)}), "the state has version 0"),
         (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"catalog": np.array("ab")}), "of another catalog"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 
@@ -162,14 +163,26 @@ def test_a_state_survives_a_file(scene, device, tmp_path):
         ({"catalog": np.array("0123456789")}, "the state is of another catalog of objects"),
         ({"cell": np.array("0123456789")}, "the state is of another cell or gripper \\(01234567, not "),
         ({"cell": None}, "the state is of another cell or gripper \\(unknown, not "),
-        ({"plan.point": None}, "plan.point of the state does not have the shape and type"),
-        ({"worlds.stuck": np.zeros((2, 9), np.int32)}, "worlds.stuck of the state does not have the shape and type"),
+        ({"plan.point": None}, "the state lacks plan.point"),
+        ({"worlds.stuck": np.zeros((2, 9), np.int32)}, r"worlds.stuck of the state is int32 \(2, 9\); allowed: int32 \(2, "),
+        ({"plan.yaw": np.array([0.0, np.nan], np.float32)}, "plan.yaw of the state has a value that is not finite, in row 1"),
+        ({"contacts.count": np.array([3, -1], np.int32)}, "contacts.count of the state is -1; allowed: 0 or more"),
     ],
 )
 def test_a_state_that_does_not_fit_is_refused(acting, changes, message):
     arrays = acting.states.to_host(acting.get_state([0, 1])) | changes
     with pytest.raises(StateError, match=message):
         acting.states.from_host({name: array for name, array in arrays.items() if array is not None})
+
+
+def test_each_array_of_a_state_has_its_shape_and_type(acting):
+    """Empty, of one row less, of another shape, type or kind: the message names the array, whichever it is."""
+    arrays = acting.states.to_host(acting.get_state([0, 1]))
+    for name in arrays.keys() - {"version", *states.ORIGINS}:
+        like = arrays[name]
+        for wrong in (like[:0], like[:1], like[..., None], like[0].ravel()[0], like.astype(complex), like.astype(object), None):
+            with pytest.raises(StateError, match=f"^{re.escape(name)} of the state is .*; allowed: {like.dtype} "):
+                acting.states.from_host(arrays | {name: wrong})
 
 
 def test_a_state_of_another_cell_is_refused(acting, device):

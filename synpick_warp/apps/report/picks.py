@@ -25,7 +25,7 @@ PICKS_LEAD = (
     " score of SuctionNet at the same points, and how well that score predicts success."
 )
 _NO_SCORES = (
-    "No score is evaluated: no trial of a sampled candidate has an outcome. With picks.candidates = 1, only the episodes' own grasps are tried."
+    "No score is evaluated: no sampled candidate has an outcome. With picks.candidates = 1 only the episodes' own grasps are tried."
 )
 _SEARCHED = 64
 """Most episodes that are searched for states."""

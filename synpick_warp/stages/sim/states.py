@@ -34,6 +34,8 @@ WORD = 4
 """Size of a word [bytes]."""
 VARIANTS = "physics.body_variant"
 """Field of the body variants, by which a world gets the shapes and masses of its objects."""
+COUNT = "contacts.count"
+"""Array of the numbers of contacts (row)."""
 ORIGINS = {"catalog": "catalog of objects", "cell": "cell or gripper"}
 """Key of a checksum of `WorldStates.origin` -> noun in messages."""
 
@@ -206,7 +208,7 @@ class WorldStates:
         words, contacts = state.words.numpy(), state.contacts
         arrays = {name: words[:, field.first : field.first + field.words].view(field.dtype) for name, field in self.fields.items()}
         arrays = {name: array.reshape(len(state), *self.fields[name].shape) for name, array in arrays.items()}
-        arrays["contacts.count"] = contacts.count.numpy()
+        arrays[COUNT] = contacts.count.numpy()
         for name in contacts.history._cls.vars:
             values = getattr(contacts.history, name).numpy()
             arrays[f"contacts.{name}"] = values.reshape(len(state), contacts.capacity, *values.shape[1:])
@@ -216,23 +218,23 @@ class WorldStates:
         """Copy a state of `to_host` to the device.
 
         Raises:
-            StateError: It is of another version, of other objects, cell or capacities, or an array is missing.
+            StateError: It is of another version, of other objects, cell or capacities, or as of `check_array`.
         """
         given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", *ORIGINS)}
         if given["version"] != str(VERSION):
             raise StateError(f"the state has version {given['version']}, but this release reads version {VERSION}")
         self._check_origin(given)
-        empty = self.to_host(self.allocate(1))
-        rows = len(arrays[VARIANTS]) if VARIANTS in arrays else 0
-        for name, like in empty.items():
-            known = arrays[name].shape[1:] == like.shape[1:] and arrays[name].dtype == like.dtype if name in arrays else False
-            if not known:
-                raise StateError(f"{name} of the state does not have the shape and type that these settings give it: {like.shape[1:]}")
+        empty = {name: like for name, like in self.to_host(self.allocate(1)).items() if like.ndim}
+        lengths = [np.shape(arrays[name])[0] for name in empty if name in arrays and np.shape(arrays[name])]
+        rows = max(set(lengths), key=lengths.count, default=0)
+        arrays = {name: check_array(name, arrays, like.dtype, (rows, *like.shape[1:])) for name, like in empty.items()}
+        if (arrays[COUNT] < 0).any():
+            raise StateError(f"{COUNT} of the state is {arrays[COUNT].min()}; allowed: 0 or more")
         state = self.allocate(rows)
         words = [np.ascontiguousarray(arrays[name]).reshape(rows, -1).view(np.uint32) for name in self.fields]
         state.words.assign(np.concatenate(words, axis=1))
         state.contacts.start.assign(np.arange(rows) * state.contacts.capacity)
-        state.contacts.count.assign(arrays["contacts.count"])
+        state.contacts.count.assign(arrays[COUNT])
         for name in state.contacts.history._cls.vars:
             target = getattr(state.contacts.history, name)
             target.assign(arrays[f"contacts.{name}"].reshape(target.shape[0], *arrays[f"contacts.{name}"].shape[2:]))
@@ -251,6 +253,22 @@ class WorldStates:
         if len(set(worlds)) < len(worlds):
             raise StateError("a world is named twice")
         return worlds
+
+
+def check_array(name: str, arrays: Mapping[str, np.ndarray], dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    """Array of a state on the host, copied.
+
+    Raises:
+        StateError: It is missing, has another type or shape, or a number that is not finite.
+    """
+    if name not in arrays:
+        raise StateError(f"the state lacks {name}; allowed: all arrays of `state_to_host`")
+    values = np.array(arrays[name])
+    if (values.dtype, values.shape) != (dtype, shape):
+        raise StateError(f"{name} of the state is {values.dtype} {values.shape}; allowed: {dtype} {shape}")
+    if not np.isfinite(values).all():
+        raise StateError(f"{name} of the state has a value that is not finite, in row {np.argwhere(~np.isfinite(values))[0][0]}")
+    return values
 
 
 def checksum(catalog: Catalog) -> str:

@@ -92,7 +92,7 @@ class PicksSubject:
 
 @rule(PicksSubject, "picks-tables", "bake the episode again, or restore the table")
 def check_tables(subject: PicksSubject) -> Findings:
-    """The tables of picks can be read: types, ranges and codes are those of their columns, and each trial starts from a state of its episode."""
+    """Tables of picks have the types, ranges and codes of their columns; each trial starts from a state of its episode, at its frame."""
     try:
         subject.episode.picks  # noqa: B018
     except DatasetError as error:
