@@ -29,7 +29,7 @@ from synpick_warp.errors import (
     StateError,
     SynpickError,
 )
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import parse_place
 from synpick_warp.system.processes.garbage import collection_paused
 
 if TYPE_CHECKING:
@@ -116,14 +116,15 @@ def bake(
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
     if isinstance(devices, str):
         devices = tuple(name.strip() for name in devices.split(","))
-    if (url := as_url(out)) is not None:
+    out = parse_place(out)
+    if isinstance(out, str):
         from synpick_warp.cloud.start import Crew, Job, start_bake
 
         crew = Crew(engine, workers) if engine else None
-        return start_bake(Job(config, url), progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
+        return start_bake(Job(config, out), progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
     if claim or engine:
         raise ConfigError("claiming workers share out the episodes of a prefix in an object store; name one as the place of the data set")
-    return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
+    return run_bake(config, out, progress if progress is not None else SilentProgress(), shard, splits, devices)
 
 
 def stream(
@@ -265,10 +266,10 @@ def open(folder: Path | str) -> DataSet:
     Raises:
         DatasetError: The folder holds no data set.
     """
-    if (url := as_url(folder)) is not None:
+    if isinstance(place := parse_place(folder), str):
         from synpick_warp.cloud.reading import open_store_set
 
-        return open_store_set(url)
+        return open_store_set(place)
     from synpick_warp.dataset.reading import open_data_set
 
-    return open_data_set(folder)
+    return open_data_set(place)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from synpick_warp.cli.options import one_line
 from synpick_warp.configs.schema import Bake, Split
 from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
@@ -181,7 +181,7 @@ def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] 
         DatasetError: There is none.
     """
     if named is not None:
-        url = as_url(named)
+        url = store_url(named)
         return named if url is None else _fetch(url)
     try:
         found = [_Found(True, 0, Path.cwd())] if is_data_set(".") else sorted(_list_data_sets(), reverse=True)

@@ -54,7 +54,7 @@ from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import resolve_word, store_url
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt, raising_sigterm
 
@@ -329,7 +329,7 @@ def _run(arguments: list[str]) -> int:
     """Run the command line; mistakes are one line on the standard error, except those of the standard output."""
     try:
         with raising_sigterm(), KeptInterrupt():
-            return app(arguments, exit_on_error=False, print_error=False) or 0
+            return app(list(map(resolve_word, arguments)), exit_on_error=False, print_error=False) or 0
     except StreamError:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
@@ -363,12 +363,13 @@ def _resolve(
 
 def _check_store_options(out: Path | None, *, claim: bool, shard: str | None, profile: bool) -> None:
     """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
-    if claim and as_url(out) is None:
+    url = store_url(out)
+    if claim and url is None:
         raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
     if claim and shard is not None:
         raise ConfigError("--claim and --shard both share out the episodes; drop one of them")
-    if as_url(out) is not None and profile:
-        raise ConfigError(f"--profile writes beside a data set, and --out is {as_url(out)}; profile a bake into a folder")
+    if url is not None and profile:
+        raise ConfigError(f"--profile writes beside a data set, and --out is {url}; profile a bake into a folder")
 
 
 def check_trace_file(trace: Path, out: Path) -> None:
@@ -455,7 +456,7 @@ def _bake(
     elif crew is None:
         pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
-    url = as_url(out)
+    url = store_url(out)
     if url is None:
         check_output_folder(out)
     bake: Callable[..., BakeSummary]

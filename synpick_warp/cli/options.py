@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import CycloptsError, MissingArgumentError, Parameter, Token, UnusedCliTokensError
 
 from synpick_warp.errors import ConfigError, escape, format_value
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
     from synpick_warp.cloud.crew import Crew
@@ -142,7 +142,7 @@ def parse_engine(engine: str | None, workers: int, price: float, out: Path | Non
     crew = Crew(engine or "", workers, price)
     if engine is None:
         return crew
-    if as_url(out) is None:
+    if store_url(out) is None:
         raise ConfigError("--engine has workers claim episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
     if beside is not None:
         raise ConfigError("--engine has workers claim episodes; drop --devices and --shard")

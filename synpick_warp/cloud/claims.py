@@ -21,8 +21,8 @@ import msgspec
 
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.errors import StoreError, SynpickError
-from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import CONTROL
+from synpick_warp.system.stores.store import SMALL, Store
 
 CLAIMS = f"{CONTROL}/claims"
 LEASE = 120.0
@@ -218,7 +218,7 @@ class Chunks:
         store, key = self._ledger.store, f"{self._place}/plan.json"
         store.create(key, msgspec.json.encode(sizes.chunk))
         try:
-            chunk = msgspec.json.decode(store.get(key), type=int)
+            chunk = msgspec.json.decode(store.get(key, SMALL), type=int)
         except (ValueError, FileNotFoundError):  # msgspec's errors are ValueErrors.
             chunk = 0
         if chunk < 1:

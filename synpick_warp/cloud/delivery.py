@@ -24,8 +24,10 @@ from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, commi
 from synpick_warp.errors import OutputError, StoreError, SynpickError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
+from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.progress import ForwardingProgress, Progress
-from synpick_warp.system.stores.base import Store, TransientError, persist
+from synpick_warp.system.stores.base import TransientError, persist
+from synpick_warp.system.stores.store import Store
 
 FILES_AT_ONCE, EPISODES_AT_ONCE = 16, 4
 """Concurrent uploads, of files and of episodes: requests of small files wait for the store, not for a core."""
@@ -154,7 +156,7 @@ class Delivery:
         ledger.put_settings()
         lines = (folder / f"{CONSTANTS}.sha256").read_bytes()
         try:
-            if store.get(f"{CONSTANTS}.sha256") == lines and store.stat(f"{CONSTANTS}.json") is not None:
+            if store.get(f"{CONSTANTS}.sha256", MAX_JSON) == lines and store.stat(f"{CONSTANTS}.json") is not None:
                 return
         except FileNotFoundError:
             pass

@@ -63,8 +63,6 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew
     ranges = DataLayout.of(config).plan(job.splits)
     planned = sum(map(len, ranges))
     names = pick_processes(config, devices, planned)
-    if job.url.startswith("memory:"):  # It is this process's.
-        return bake_into_store(config, job.url, progress, splits=job.splits, devices=names[:1], bake=job.bake, claim=True, lease=job.lease)
     needs, summary, crew = Needs.of(config), _Totals(planned), crew or Crew("")
     writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
     with tempfile.TemporaryDirectory(prefix="synpick-workers-") as folder:

@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from synpick_warp.cloud.bundles import join_bundles, split_bundles, unpack_bundle
+from synpick_warp.cloud.bundles import MAX_BUNDLE, join_bundles, split_bundles, unpack_bundle
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, send_file
-from synpick_warp.cloud.ledger import DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
+from synpick_warp.cloud.ledger import BLOCK, DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import (
@@ -30,6 +30,8 @@ from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.sizes import count_writers
 from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.json import MAX_JSON
+from synpick_warp.system.stores.store import SMALL
 
 
 def close_blocks(ledger: Ledger, folder: Path, only: Sequence[int] | None = None) -> int:
@@ -58,7 +60,7 @@ def close_blocks(ledger: Ledger, folder: Path, only: Sequence[int] | None = None
                 marked = spans[start : start + MARK_SPANS]
                 names = [f"{INDEX}/{episode:06d}.tar.gz" for span in marked for episode in span]
                 with path.open("wb") as file, ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:
-                    join_bundles(pool.map(ledger.store.get, names), file)
+                    join_bundles(pool.map(lambda name: ledger.store.get(name, MAX_BUNDLE), names), file)
                 ledger.store.put_file(f"{DONE}/{block:06d}_{spell_spans(marked)}", path)
     return missing
 
@@ -118,7 +120,7 @@ def _put_indices(ledger: Ledger, work: Path) -> None:
     for suffix in (".sha256", ".json"):
         store.put(f"{INDICES}{suffix}", (work / f"{INDICES}{suffix}").read_bytes())
     store.put(FINISHED, plan)
-    if store.get(FINISHING) != plan:
+    if store.get(FINISHING, SMALL) != plan:
         store.put(FINISHING, b"")  # The other one fails too, if it has not read this object yet; else `finished` goes after its write.
         store.delete(FINISHED)
         raise StoreError(f"another bake finalized {store.url} for other episodes at the same time; when it has ended, run the larger again")
@@ -132,12 +134,12 @@ def _gather(ledger: Ledger, work: Path) -> list[int]:
     for name in (ENTRIES, Path(LINES), *shared_files(Needs.of(ledger.config).classes, layout).folders):
         if not name.name.endswith("*"):
             make_folder(work / name)
-    (work / MANIFEST_FILE).write_bytes(store.get(MANIFEST_FILE))
+    (work / MANIFEST_FILE).write_bytes(store.get(MANIFEST_FILE, MAX_JSON))
     (work / CONFIG_FILE).write_text(config_to_toml(ledger.config))
-    constants = parse_checksums(store.get(f"{CONSTANTS}.sha256"), work, work / f"{CONSTANTS}.sha256", "resume the bake")
+    constants = parse_checksums(store.get(f"{CONSTANTS}.sha256", MAX_JSON), work, work / f"{CONSTANTS}.sha256", "resume the bake")
     for name in filter(indexed.fullmatch, constants):
         (work / name).parent.mkdir(parents=True, exist_ok=True)
-        (work / name).write_bytes(store.get(name))
+        (work / name).write_bytes(store.get(name, MAX_JSON))
     episodes: list[int] = []
     for episode, source, bundle in _bundles(ledger):
         episodes.append(episode)
@@ -166,5 +168,7 @@ def _bundles(ledger: Ledger) -> Iterator[tuple[int, str, bytes]]:
 def _read_mark(ledger: Ledger, key: str, spans: Sequence[range]) -> Iterator[tuple[int, str, bytes]]:
     """Lazily yield the items of `_bundles` for the episodes of one batched mark, sorted by episode."""
     source = f"{ledger.store.url}/{key}"
-    for episode, bundle in split_bundles(ledger.store.blocks(key), [episode for span in spans for episode in span], source):
+    for episode, bundle in split_bundles(
+        ledger.store.blocks(key, BLOCK * MAX_BUNDLE), [episode for span in spans for episode in span], source
+    ):
         yield episode, source, bundle

@@ -7,8 +7,6 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import msgspec
-
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
@@ -22,8 +20,10 @@ from synpick_warp.dataset.commit.manifest import (
     make_manifest,
 )
 from synpick_warp.errors import ConfigError, OutputError, StoreError
-from synpick_warp.system.stores.base import Store
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.toml import MAX_TOML
 from synpick_warp.system.stores.opening import CONTROL, Probe, open_store
+from synpick_warp.system.stores.store import SMALL, Store
 
 BLOCK = 1000
 """Indices that a block, and so a batched mark, spans: as many as a page of a listing has keys."""
@@ -34,7 +34,8 @@ FINISHING, FINISHED = f"{CONTROL}/finishing", f"{CONTROL}/finished"
 _SPAN = "[0-9]{6,12}-[0-9]{6,12}"
 _MARK = re.compile(rf"{re.escape(DONE)}/([0-9]{{6,9}})_({_SPAN}(?:_{_SPAN})*)")
 _SPANS = re.compile(rf"{_SPAN}(?:_{_SPAN})*")
-_ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6,12}})\.json")
+ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6}}|[1-9][0-9]{{6,11}})\.json")
+"""Keys of done marks."""
 _ADVICE = "resume with the same, or name another prefix with --out"
 
 
@@ -83,7 +84,7 @@ class Ledger:
         """Read the manifest, and compare it with the settings; None: the prefix is empty. Raises as the constructor."""
         url = self.store.url
         try:
-            data = self.store.get(MANIFEST_FILE)
+            data = self.store.get(MANIFEST_FILE, MAX_JSON)
         except FileNotFoundError:
             first = next(self.store.list(""), None)
             if first is not None and first[0].startswith(f"{CONTROL}/"):
@@ -94,10 +95,7 @@ class Ledger:
                 ) from None
             self._check_outside()
             return None
-        try:
-            known: dict[str, Any] = msgspec.json.decode(data, type=dict[str, Any])
-        except (ValueError, RecursionError):  # msgspec's errors are ValueErrors.
-            raise OutputError(f"{url}/{MANIFEST_FILE} is damaged; restore it, or name another prefix with --out") from None
+        known = decode_json(data, dict[str, Any], f"{url}/{MANIFEST_FILE}", OutputError, "restore it, or name another prefix with --out")
         said = describe_differences(make_manifest(self.config), {name: known[name] for name in known if name != INPUTS})
         if said:
             raise ConfigError(f"{url} was started with other settings: {said}; {_ADVICE}")
@@ -107,10 +105,10 @@ class Ledger:
         """Check that no outer prefix is a data set, as far as it may be read; raises OutputError."""
         scheme, _, place = self.store.url.partition("://")
         parts = place.split("/")
-        for count in range(len(parts) - 1, 1 if place.startswith("/") else 0, -1):
+        for count in range(len(parts) - 1, 0, -1):
             outer = f"{scheme}://{'/'.join(parts[:count])}"
             with contextlib.suppress(StoreError):  # Nobody has to have rights outside of the prefix.
-                if scheme != "memory" and open_store(outer).stat(MANIFEST_FILE) is not None:
+                if open_store(outer).stat(MANIFEST_FILE) is not None:
                     raise OutputError(f"--out is {self.store.url}, in the data set {outer}; name a prefix outside of it")
 
     # ---- blocks ----
@@ -157,7 +155,7 @@ class Ledger:
         for key, size in self.store.list(str(ENTRIES), f"{ENTRIES}/{first:06d}"):
             if key > stop:
                 break
-            if size and (match := _ENTRY.fullmatch(key)) and first <= int(match[1]) < end:
+            if size and (match := ENTRY.fullmatch(key)) and first <= int(match[1]) < end:
                 found.add(int(match[1]))
         return found
 
@@ -186,7 +184,7 @@ class Ledger:
                 self.store.create(MANIFEST_FILE, data)
             elif self.store.stat(MANIFEST_FILE) is None:  # Another worker may have started meanwhile.
                 self.store.put(MANIFEST_FILE, data)
-            self.manifest = self.store.get(MANIFEST_FILE)
+            self.manifest = self.store.get(MANIFEST_FILE, MAX_JSON)
         if self.manifest != data:
             raise ConfigError(f"{self.store.url} was started with other settings, objects or lights by another worker; {_ADVICE}")
 
@@ -194,7 +192,7 @@ class Ledger:
         """Write the settings of this bake, unless the same are there; those of an earlier bake are replaced."""
         text = config_to_toml(self.config).encode()
         try:
-            if self.store.get(CONFIG_FILE) == text:
+            if self.store.get(CONFIG_FILE, MAX_TOML) == text:
                 return
         except FileNotFoundError:
             pass
@@ -214,7 +212,7 @@ class Ledger:
     def finished(self) -> bool:
         """Whether the indices cover all planned episodes."""
         try:
-            text = self.store.get(FINISHED).decode(errors="replace")
+            text = self.store.get(FINISHED, SMALL).decode(errors="replace")
         except FileNotFoundError:
             return False
         covered = _parse_spans(text) if _SPANS.fullmatch(text) else []

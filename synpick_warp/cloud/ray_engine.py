@@ -24,7 +24,7 @@ from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_worker import Board, Report, Worker
 from synpick_warp.cloud.run import Job
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.errors import DeviceError, StoreError
+from synpick_warp.errors import DeviceError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.system.hardware.cores import count_cores
@@ -73,8 +73,6 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
     planned = sum(map(len, ranges))
     address = find_address(crew.engine)
     ray = import_ray(address)
-    if url.startswith("memory:"):
-        raise StoreError(f"{url} is in the memory of one process, and Ray's workers have their own; name a store that all of them reach")
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
     claims = open_claims(ledger, job.lease)

@@ -5,21 +5,25 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
-import json
 import os
 import re
 import shutil
+import sys
 import tempfile
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+import msgspec
+
 from synpick_warp.cloud.delivery import FILES_AT_ONCE
+from synpick_warp.cloud.ledger import ENTRY
 from synpick_warp.configs.dataset.splits import episode_range
+from synpick_warp.dataset.annotations import ADVICE, Index
 from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
     CONSTANTS,
@@ -36,31 +40,47 @@ from synpick_warp.dataset.commit.manifest import (
 from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
+from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.toml import MAX_TOML
+from synpick_warp.system.inputs.urls import SCHEMES
 from synpick_warp.system.progress import Report, ignore_progress
-from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import CONTROL, open_store
+from synpick_warp.system.stores.store import SizeError
 
 CACHE_BYTES = 8 << 30
 """Default limit of an opened set's cache of episodes [B]; the least recently used are evicted."""
 FREE_PART = 0.5
 """Fraction of the temporary folder's free space that a copied set may take."""
-_ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6,12}})\.json")
+
+
+class _Length(msgspec.Struct):
+    """Schema of a line of the episode list, as far as it is read here."""
+
+    episode: Index
+    frames: Index
 
 
 class Copier:
     """Downloader: copies objects of a data set into a folder, under the same names."""
 
     def __init__(self, url: str, folder: Path) -> None:
-        self.store: Store = open_store(url, make=False)
+        self.store = open_store(url)
         self.folder = folder
 
-    def fetch(self, name: str, digest: str | None = None) -> bool:
-        """Download an object atomically, unless it is in the folder; returns whether it is there then. `digest`: expected SHA-256.
+    def fetch(self, name: str, digest: str | None = None, limit: int = MAX_JSON) -> bool:
+        """Download an object atomically, unless it is in the folder; returns whether it is there then.
+
+        Args:
+            name: Its key.
+            digest: Expected SHA-256; None: unchecked.
+            limit: Largest size [B].
 
         Raises:
             DatasetError: Its checksum differs, or its name leads out of the folder.
             OutputError: The folder cannot be written.
+            SizeError: It is larger.
         """
         path, state = path_inside(self.folder, name, self.store.url, DatasetError), hashlib.sha256()
         if path.exists():
@@ -69,7 +89,7 @@ class Copier:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with part.open("wb") as file:
-                for block in self.store.blocks(name):
+                for block in self.store.blocks(name, limit):
                     state.update(block)
                     file.write(block)
             if digest is not None and state.hexdigest() != digest:
@@ -85,11 +105,18 @@ class Copier:
                 part.unlink()
         return True
 
-    def fetch_all(self, names: dict[str, str | None], report: Report = ignore_progress) -> None:
-        """Download objects in parallel, given their SHA-256 by name (None: unchecked). Missing objects are skipped."""
+    def fetch_all(self, names: Mapping[str, tuple[str | None, int]], report: Report = ignore_progress) -> None:
+        """Download objects in parallel, given SHA-256 (None: unchecked) and largest size [B] by name. Missing objects are skipped."""
         with ThreadPoolExecutor(FILES_AT_ONCE, "download") as pool:
-            for done, _ in enumerate(pool.map(lambda item: self.fetch(*item), names.items()), 1):
+            for done, _ in enumerate(pool.map(lambda item: self.fetch(item[0], *item[1]), names.items()), 1):
                 report("files copied", done, len(names))
+
+    def fetch_files(self, entry: Path, *, check: bool = True) -> dict[str, str]:
+        """Download the files of a manifest entry that is in the folder, none larger than all of them together; returns their SHA-256 by
+        name. `check`: whether to compare it."""
+        names, limit = read_checksums(self.folder, entry), (read_entry(self.folder, entry) or {"bytes": 0})["bytes"]
+        self.fetch_all({name: (digest if check else None, limit) for name, digest in names.items()})
+        return names
 
     def fetch_records(self) -> None:
         """Download manifest and settings.
@@ -100,9 +127,9 @@ class Copier:
         """
         if not self.fetch(MANIFEST_FILE):
             with contextlib.suppress(FileNotFoundError):
-                self.store.get(MANIFEST_FILE)  # Raises StoreError if there is no bucket, which HEAD does not tell.
+                self.store.get(MANIFEST_FILE, MAX_JSON)  # Raises StoreError if there is no bucket, which HEAD does not tell.
             raise DatasetError(f"{self.store.url} has no {MANIFEST_FILE}; name the prefix of a data set that synpick-warp baked")
-        self.fetch(CONFIG_FILE)
+        self.fetch(CONFIG_FILE, limit=MAX_TOML)
         (self.folder / ENTRIES).mkdir(exist_ok=True)
 
     def fetch_entry(self, entry: Path) -> bool:
@@ -112,7 +139,7 @@ class Copier:
     def episodes(self) -> Iterator[int]:
         """Yield the episodes that have a done mark, in the order of their keys, lazily."""
         for key, _ in self.store.list(str(ENTRIES)):
-            if match := _ENTRY.fullmatch(key):
+            if match := ENTRY.fullmatch(key):
                 yield int(match[1])
 
 
@@ -131,19 +158,20 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
     copier = Copier(url, folder)  # Refuses URLs whose last part would lead elsewhere.
     folder.mkdir()
     copier.fetch_records()
-    names, size = [], 0
+    names: dict[str, tuple[str | None, int]] = {}
+    size = 0
     free = int(FREE_PART * shutil.disk_usage(folder).free)
     for name, length in copier.store.list(""):
         if name.startswith(f"{CONTROL}/") or not wanted(name):
             continue
-        names.append(name)
+        names[name] = None, MAX_JSON if name.startswith(f"{ENTRIES}/") else length
         size += length
         if size > free:
             raise DatasetError(
                 f"{url} has more than the {free / 1e9:.1f} GB that may be copied to {folder.parent}; set TMPDIR to a larger disk, or read "
                 "it by synpick_warp.open, which keeps a few episodes at a time"
             )
-    copier.fetch_all(dict.fromkeys(names), report)
+    copier.fetch_all(names, report)
 
 
 def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
@@ -168,7 +196,7 @@ def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
                 report("episodes", min(done, len(episodes)), len(episodes))
                 if entry == INDICES:
                     finished = listed == episodes
-        except (ConfigError, DatasetError) as error:
+        except (ConfigError, DatasetError, SizeError) as error:
             return Verdict(str(error).replace(name, url), len(episodes), files, finished)
     names = (f"{episode_entry(episode)}.json" for episode in sorted(set(listed) - set(episodes)))
     gone = next((name for name in names if copier.store.stat(name) is None), None)  # Others were committed meanwhile.
@@ -185,8 +213,7 @@ def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
         if entry == INDICES:
             return 0, []
         raise DatasetError(f"{copier.store.url}/{entry}.json or .sha256 is missing; resume the bake")
-    names, folder = read_checksums(copier.folder, entry), copier.folder
-    copier.fetch_all(dict.fromkeys(names))
+    folder, names = copier.folder, copier.fetch_files(entry, check=False)
     checked = check_part(folder, CheckPart(entry))
     if checked.problem:
         raise DatasetError(checked.problem)
@@ -212,7 +239,7 @@ class StoreCache:
         self.copier.fetch_records()
         for entry in (CONSTANTS, INDICES):
             if self.copier.fetch_entry(entry):
-                self.copier.fetch_all(dict(read_checksums(self.folder, entry)))
+                self.copier.fetch_files(entry)
 
     def has(self, episode: int) -> bool:
         """Whether an episode is committed: cached, or its done mark is in the store."""
@@ -229,8 +256,7 @@ class StoreCache:
             return
         entry = episode_entry(episode)
         self.copier.fetch_entry(entry)
-        names = read_checksums(self.folder, entry)
-        self.copier.fetch_all(dict(names))
+        names = self.copier.fetch_files(entry)
         missing = next((name for name in names if not (self.folder / name).exists()), None)
         if missing is not None:
             raise DatasetError(f"{self.copier.store.url}/{missing} is missing")
@@ -253,20 +279,11 @@ class StoreDataSet(DataSet):
 
     def __init__(self, cache: StoreCache, episodes: range | None = None) -> None:
         super().__init__(cache.folder, episodes)
-        self._made = cache
-
-    @property
-    def _cache(self) -> StoreCache:
-        """Cache of this process; after a fork a new one, since the other's folder, locks and connections are the parent's."""
-        if self._made.process != os.getpid():
-            cache, only = StoreCache(self._made.copier.store.url, self._made.limit), self._only
-            self.__dict__.clear()
-            StoreDataSet.__init__(self, cache, only)
-        return self._made
+        self._cache = cache
 
     def __reduce__(self) -> tuple[Callable[..., DataSet], tuple[Any, ...]]:
         """Pickle as an order to open the set again, such as for the spawned workers of a DataLoader."""
-        return open_store_set, (self._made.copier.store.url, self._made.limit, self._only)
+        return open_store_set, (self._cache.copier.store.url, self._cache.limit, self._only)
 
     @cached_property
     def splits(self) -> dict[str, DataSet]:
@@ -295,8 +312,12 @@ class StoreDataSet(DataSet):
         path = self.folder / EPISODES_FILE
         if not path.exists():
             return {}
-        with path.open() as file:
-            return {row["episode"]: row["frames"] for row in map(json.loads, file)}
+        lines = enumerate(read_file(path, MAX_JSON, DatasetError).splitlines(), 1)
+        rows = (
+            decode_json(line, _Length, f"{self._cache.copier.store.url}/{path.name}, line {row},", DatasetError, ADVICE)
+            for row, line in lines
+        )
+        return {row.episode: row.frames for row in rows}
 
 
 def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = None) -> DataSet:
@@ -317,7 +338,7 @@ def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = 
 def list_shards(url: str) -> list[str]:
     """List the URLs of a set's webdataset shards, sorted, also those of episodes that are not committed. `stream_shards` lets
     `webdataset.WebDataset` read them without a copy."""
-    store = open_store(url, make=False)
+    store = open_store(url)
     return [f"{store.url}/{name}" for name, _ in store.list("") if re.fullmatch(r"[^/]+_web/shard-[0-9]+\.tar", name)]
 
 
@@ -355,11 +376,11 @@ def open_stream(url: str, mode: str = "rb", *_: object, **__: object) -> IO[byte
     if "r" not in mode:
         raise StoreError(f"{url} can be streamed for reading only; write to a local file")
     place, _slash, name = url.rpartition("/")
-    return _Stream(open_store(place, make=False).blocks(name))  # type: ignore[return-value]
+    return _Stream(open_store(place).blocks(name, sys.maxsize))  # type: ignore[return-value]
 
 
 def stream_shards() -> None:
-    """Register `open_stream` with webdataset as the opener of s3, gs, az and memory URLs, in place of the programs aws and gsutil."""
+    """Register `open_stream` with webdataset as the opener of URLs of stores, in place of the programs aws and gsutil."""
     openers = importlib.import_module("webdataset.gopen").gopen_schemes
-    for scheme in ("s3", "gs", "az", "memory"):
+    for scheme in SCHEMES:
         openers[scheme] = open_stream

@@ -39,6 +39,7 @@ from synpick_warp.errors import DatasetError, format_value
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
 from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.urls import parse_place
 
 if TYPE_CHECKING:
     import numpy as np
@@ -492,6 +493,9 @@ def open_data_set(folder: Path | str) -> DataSet:
 
     Raises DatasetError if the folder is neither one that a bake wrote, or is still writing, nor another BOP data set.
     """
-    data_set = DataSet(Path(folder))
+    place = parse_place(folder)
+    if isinstance(place, str):
+        raise DatasetError(f"{place} is in an object store; open it by synpick_warp.open")
+    data_set = DataSet(place)
     data_set.found  # noqa: B018
     return data_set

@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import pytest
 
-from synpick_warp.system.stores import base
+from synpick_warp.system.stores import base, opening
 from tests.builders import once
 from tests.harness import scripted_bake
 
@@ -101,10 +101,17 @@ def prefix(server: Server) -> str:
 
 
 @pytest.fixture
-def memory() -> str:
-    """An empty store in this process's memory."""
-    pytest.importorskip("obstore")
-    return f"memory://{uuid4().hex}"
+def memory(monkeypatch: pytest.MonkeyPatch) -> str:
+    """URL of an empty store in this process's memory."""
+    return keep_in_memory(monkeypatch)
+
+
+def keep_in_memory(monkeypatch: pytest.MonkeyPatch) -> str:
+    """A new bucket; all prefixes below it are stores in memory, each by itself."""
+    bucket, stores, real = f"s3://memory-{uuid4().hex[:12]}", {}, opening.connect
+    kind = pytest.importorskip("obstore.store").MemoryStore
+    monkeypatch.setattr(opening, "connect", lambda url: stores.setdefault(url, kind()) if url.startswith(bucket) else real(url))
+    return bucket
 
 
 @pytest.fixture(scope="session")

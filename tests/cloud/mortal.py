@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import CONTROL, open_store
+from synpick_warp.system.stores.store import Store
 
 
 class Killed(BaseException):
@@ -17,7 +17,7 @@ class MortalStore:
     """`Store` that passes `lives` requests on, then raises at each one; every second death comes after its request was carried out."""
 
     def __init__(self, store: Store, lives: int) -> None:
-        self._store, self.lives, self.url, self.conditional = store, lives, store.url, store.conditional
+        self._store, self.lives, self.url = store, lives, store.url
         self._late, self._lock = lives % 2 == 1, threading.Lock()
 
     def __getattr__(self, name: str) -> Any:
@@ -39,4 +39,4 @@ class MortalStore:
 def stored(url: str) -> dict[str, bytes]:
     """Files of the data set in a store."""
     store = open_store(url)
-    return {key: store.get(key) for key, _ in store.list("") if not key.startswith(f"{CONTROL}/")}
+    return {key: store.get(key, 1 << 30) for key, _ in store.list("") if not key.startswith(f"{CONTROL}/")}

@@ -71,11 +71,6 @@ def test_ray_is_missing_or_of_another_version(ray, said, monkeypatch):
     assert said in mistake(*S3, "--engine", "ray")
 
 
-def test_stores_of_one_process_are_refused(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(__version__="2.60.0"))
-    assert "Ray's workers have their own" in mistake(*S3[:-1], "memory://x", "--engine", "ray")
-
-
 def test_a_worker_reports_sums_over_chunks_and_stops_on_request():
     """What the board has not handed over adds up; a request to stop comes with the answer to a report, and is a signal."""
     board, got = Board(), []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import multiprocessing
 import pickle
 import signal
@@ -74,30 +76,22 @@ def test_a_training_set_knows_its_length_without_its_episodes(sets, place, monke
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(views))[0]["rgb"], local[0]["rgb"])
 
 
-def test_forked_workers_have_caches_of_their_own(picked_set, place):
-    """Over fsspec; a store of obstore says that it cannot, and is opened again by a worker that is started otherwise."""
-    opened = [reading.open_store_set(f"{scheme}://{picked_set}", limit=1) for scheme in ("local", "file")]
-    told = FORK.SimpleQueue()
+def test_forked_workers_are_told_and_open_the_set_again_by_its_url(sets, place):
+    opened, told = synpick_warp.open(sets[0]), FORK.SimpleQueue()
 
     def work():
-        there = opened[0][1]
-        told.put((there.row, there.folder))
         with pytest.raises(StoreError, match="start workers by spawn or forkserver"):
-            opened[1][1]
+            opened[1]
         told.put("told")
-        opened.clear()
 
-    before = opened[0][0]
     worker = FORK.Process(target=work, daemon=True)
     worker.start()
     worker.join(30)
     worker.kill()
-    row, folder = told.get() if worker.exitcode == 0 else (None, None)
-    assert row == opened[0][1].row
-    assert folder != before.folder
-    assert list(opened[0].folder.glob("manifest.json"))
+    assert worker.exitcode == 0
     assert told.get() == "told"
-    assert list(pickle.loads(pickle.dumps(opened[1]))) == list(opened[1])
+    assert list(opened.folder.glob("manifest.json"))
+    assert list(pickle.loads(pickle.dumps(opened))) == list(opened)
 
 
 @pytest.mark.parametrize(
@@ -159,7 +153,7 @@ def test_damage_is_named_by_its_address(sets, place, monkeypatch):
     url, _ = sets
     store = open_store(url)
     name = next(name for name, _ in store.list("") if name.endswith(".tar"))
-    data = store.get(name)
+    data = store.get(name, 1 << 30)
     store.put(name, data[:-1] + b"x")
     ran = run("verify", url)
     assert (ran.code, ran.out) == (1, f"{url}/{name} has changed since it was written: its checksum differs\n")
@@ -182,6 +176,37 @@ def test_an_episode_that_the_indices_list_and_is_gone_is_named(sets, place):
         open_store(url).delete(f"manifest/{last:06d}.{end}")
     ran = run("verify", url)
     assert (ran.code, ran.out) == (1, f"{url}/manifest/{last:06d}.json is missing\n")
+
+
+@pytest.mark.parametrize("data", [b"[", b'{"episode": 1}', b'{"episode": -1, "frames": 2}', b"[" * 100_000, b"\xff", b"[]"])
+def test_a_damaged_list_of_episodes_is_named(sets, place, data):
+    open_store(sets[0]).put("episodes.jsonl", data)
+    lines = hashlib.sha256(data).hexdigest() + "  episodes.jsonl\n"
+    entry = {"files": 1, "bytes": len(data), "checksum": hashlib.sha256(lines.encode()).hexdigest(), "episodes": []}
+    for end, content in (("sha256", lines), ("json", json.dumps(entry))):
+        open_store(sets[0]).put(f"manifest/joined.{end}", content.encode())
+    with pytest.raises(DatasetError, match=r"s3://memory-.*/episodes.jsonl, line 1, is damaged"):
+        list(synpick_warp.open(sets[0]))
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "config.toml", "manifest/000000.json", "manifest/constants.sha256"])
+def test_a_record_beyond_its_limit_is_not_copied(sets, place, monkeypatch, name):
+    for limit in ("MAX_JSON", "MAX_TOML"):
+        monkeypatch.setattr(reading, limit, 1 << 19)
+    monkeypatch.setattr(reading.Copier.fetch, "__defaults__", (None, 1 << 19))
+    open_store(sets[0]).put(name, bytes((1 << 19) + 1))
+    for command in ("stats", "verify") if name == "manifest.json" else ("stats",):
+        assert f"{name} is larger than 512 KiB" in mistake(command, sets[0])
+    assert list((place / "temporary").iterdir()) == []
+
+
+def test_a_file_larger_than_all_of_its_entry_is_not_copied(sets, place):
+    url, folder = sets
+    name = next(str(path.relative_to(folder)) for path in folder.glob("*_web/*.tar"))
+    open_store(url).put(name, bytes(1 << 26))
+    ran = run("verify", url)
+    assert ran.code == 1
+    assert ran.out.startswith(f"{url}/{name} is larger than")
 
 
 def test_a_url_whose_last_part_leads_out_of_the_temporary_folder_is_refused(memory, place):

@@ -63,7 +63,7 @@ def test_shares_are_joined_by_whoever_ends_last(memory, local):
 
 def test_a_set_grows(memory, local):
     bake(memory, tiny(2))
-    assert open_store(memory).get(FINISHED) == b"000000-000001"
+    assert open_store(memory).get(FINISHED, 1 << 30) == b"000000-000001"
     assert bake(memory).total == EPISODES - 2
     assert stored(memory) == local
     bake(memory, tiny(2))  # Fewer than are there: nothing is left to do.
@@ -141,7 +141,7 @@ def test_the_worker_that_ends_a_block_marks_it(memory, local, monkeypatch):
     assert [key for key, _ in store.list(".store/done")] == [".store/done/000000_000000-000001"]
     bake(memory, shard=(0, 2))
     real = type(store).get
-    monkeypatch.setattr(type(store), "get", lambda self, key: read.append(key) or real(self, key))
+    monkeypatch.setattr(type(store), "get", lambda self, key, limit: read.append(key) or real(self, key, limit))
     bake(memory)
     assert stored(memory) == local
     assert [key for key in read if ".store/index" in key] == [".store/index/000002.tar.gz", ".store/index/000003.tar.gz"]
@@ -167,7 +167,7 @@ def test_another_set_or_other_settings_are_refused(memory):
 def test_other_objects_are_refused(memory, monkeypatch):
     bake(memory, shard=(0, 2))
     monkeypatch.setattr(scripted_bake, "INPUTS", {"objects": 64 * "2", "lights": 64 * "1"})
-    with pytest.raises(ConfigError, match=r"memory://.* was started with other objects"):
+    with pytest.raises(ConfigError, match=r"s3://memory-.* was started with other objects"):
         bake(memory)
 
 
@@ -178,7 +178,7 @@ def test_a_manifest_that_another_worker_wrote_meanwhile_is_compared(memory):
     store.put("manifest.json", b"theirs")
     with pytest.raises(ConfigError, match="by another worker"):
         ledger.put_manifest(b"ours")
-    assert store.get("manifest.json") == b"theirs"
+    assert store.get("manifest.json", 1 << 30) == b"theirs"
 
 
 def test_a_damaged_batched_mark_is_named(memory):
@@ -186,18 +186,10 @@ def test_a_damaged_batched_mark_is_named(memory):
     store = open_store(memory)
     (key,) = (key for key, _ in store.list(".store/done"))
     store.delete(FINISHED)
-    for data in (store.get(key)[:-1], b"none"):
+    for data in (store.get(key, 1 << 30)[:-1], b"none"):
         store.put(key, data)
         with pytest.raises(DatasetError, match=rf"{key} is damaged: it is cut off"):
             bake(memory)
-
-
-def test_what_is_refused_leaves_nothing_in_a_folder(tmp_path):
-    (tmp_path / "notes").write_text("")
-    with pytest.raises(OutputError, match="is not empty: it has notes"):
-        bake(f"file://{tmp_path}")
-    assert "typo is no folder; name one that is" in mistake("verify", f"file://{tmp_path}/typo")
-    assert [path.name for path in tmp_path.iterdir()] == ["notes"]
 
 
 def test_a_prefix_in_another_set_is_refused(prefix):
@@ -232,25 +224,16 @@ def _fail(fault: str, *methods: str):
         (_fail("403 RequestTimeTooSkewed", "PUT"), None, "the clock of this machine differs"),
         (_fail("late clock", "HEAD"), None, "the clock of this machine differs"),
         (_fail("", ""), "s3://", "names no bucket"),
-        (_set_endpoint("127.0.0.1:9"), None, "AWS_ENDPOINT_URL_S3 is 127.0.0.1:9; set it to the address of a server"),
+        (
+            _set_endpoint("127.0.0.1:9"),
+            None,
+            "AWS_ENDPOINT_URL_S3 is 127.0.0.1:9, which is no plain address; set it to the address of a server",
+        ),
         (_fail("", ""), "nowhere://a/b", "nowhere"),
-        (_fail("", ""), "memory://a/..", "has a part . or .."),
-        (_fail("", ""), "file:///proc/none", "cannot be opened"),
-        (_fail("", ""), "file:///tmp/typo-of/a-folder", "typo-of is no folder; make it"),
+        (_fail("", ""), "s3://a/..", "has a part . or .."),
+        (_fail("", ""), "file:///proc/none", "/proc/none"),
     ],
-    ids=[
-        "credentials",
-        "bucket",
-        "read-only",
-        "skew refused",
-        "skew measured",
-        "no bucket",
-        "endpoint",
-        "scheme",
-        "dots",
-        "folder",
-        "parent",
-    ],
+    ids=["credentials", "bucket", "read-only", "skew refused", "skew measured", "no bucket", "endpoint", "scheme", "dots", "folder"],
 )
 def test_what_cannot_be_used_is_one_line_before_anything_is_simulated(server, prefix, monkeypatch, prepare, url, said):
     prepare(server, monkeypatch)

@@ -18,18 +18,19 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
-from uuid import uuid4
+
+import pytest
 
 from synpick_warp.cloud import finish
-from synpick_warp.cloud.bundles import join_bundles
+from synpick_warp.cloud.bundles import MAX_BUNDLE, join_bundles
 from synpick_warp.cloud.ledger import BLOCK, DONE, FINISHED, INDEX, Ledger
 from synpick_warp.cloud.run import bake_into_store
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores.base import Store
 from synpick_warp.system.stores.opening import Probe, open_store
-from tests.cloud.conftest import tiny
+from synpick_warp.system.stores.store import Store
+from tests.cloud.conftest import keep_in_memory, tiny
 from tests.harness import scripted_bake
 from tools.figures import finish_report
 from tools.options import Row, make_parser, positive_count
@@ -47,13 +48,13 @@ def peak() -> float:
 
 def open_with_marks(episodes: int, kind: str, make: bool) -> Store:
     """Make a store with the records of a data set of format `kind`, and batched marks of `episodes` episodes. `make`: with index files."""
-    url = f"memory://{uuid4().hex}"
+    url = keep_in_memory(pytest.MonkeyPatch())
     store = open_store(url)
     with mock.patch.object(scripted_bake, "FRAMES", FRAMES if make else 1):
         bake_into_store(tiny(1, (kind,)), url, SilentProgress(), bake=scripted_bake.bake_episodes)
     for key in (FINISHED, *(key for key, _ in list(store.list(DONE)))):
         store.delete(key)
-    with tarfile.open(fileobj=io.BytesIO(gzip.decompress(store.get(f"{INDEX}/000000.tar.gz")))) as archive:
+    with tarfile.open(fileobj=io.BytesIO(gzip.decompress(store.get(f"{INDEX}/000000.tar.gz", MAX_BUNDLE)))) as archive:
         members = [(info.name, file.read()) for info in archive if (file := archive.extractfile(info)) is not None]
     for first in range(0, episodes, BLOCK):
         last, data = min(first + BLOCK, episodes) - 1, io.BytesIO(b"mark")

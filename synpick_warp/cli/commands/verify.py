@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import find_data_set
 from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber, check_range
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
     from synpick_warp.cli.display import CountProgress
@@ -27,7 +27,7 @@ def verify(
     Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
     """
     check_range("--threads", threads, 0, MAX_THREADS)
-    url = as_url(folder)
+    url = store_url(folder)
     place = Path() if url is not None else find_data_set(folder, "synpick-warp verify DIR")
     from rich.console import Console
 

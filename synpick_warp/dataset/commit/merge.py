@@ -44,7 +44,7 @@ from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 MAX_EPISODES = 10_000_000
 """Most episodes of a merged data set: its missing ones are listed."""
@@ -76,7 +76,7 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         DatasetError: A part is not a data set, or parts do not match.
         OutputError: A file cannot be written.
     """
-    if (url := next(filter(None, map(as_url, parts)), None)) is not None:
+    if (url := next(filter(None, map(store_url, parts)), None)) is not None:
         raise DatasetError(f"{url} is in an object store, where all of --shard fill one prefix; merge takes folders of this machine")
     manifest = read_manifest(parts[0])
     for part in parts[1:]:

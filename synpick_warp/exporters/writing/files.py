@@ -11,7 +11,7 @@ from pathlib import Path
 
 from synpick_warp.errors import OutputError
 from synpick_warp.system.folders import make_folder
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 PARTIAL = ".partial"
 """Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically.
@@ -64,7 +64,7 @@ def check_output_folder(out: Path) -> None:
 
 def check_local(out: Path, option: str) -> None:
     """Raise OutputError if an option names a place in an object store, into which only a bake writes."""
-    if (url := as_url(out)) is not None:
+    if (url := store_url(out)) is not None:
         raise OutputError(f"{option} is {url}; only bake writes into object stores: name a path on this machine, and copy it there")
 
 

@@ -1,1 +1,1 @@
-"""Object stores: the interface, an implementation for each library (obstore, fsspec), and the choice by URL."""
+"""Object stores by obstore: S3, Google Cloud Storage, Azure; retries, and the choice by URL."""

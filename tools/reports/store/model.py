@@ -23,7 +23,7 @@ import numpy as np
 from synpick_warp.cloud.claims import BEATS, CHECKS, FIRST_WAIT, GROWTH, LEASE, Sizes, default_chunk
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, WHOLE_BYTES
 from synpick_warp.cloud.ledger import BLOCK
-from synpick_warp.system.stores.object_store import PAGE, PART_BYTES
+from synpick_warp.system.stores.store import PAGE, PART_BYTES
 from tools.figures import RESULTS
 
 DAY = 86_400.0

@@ -1,11 +1,11 @@
-"""Object store by obstore, the Python binding of the Rust crate object_store: S3, Google Cloud Storage, Azure, a folder, or memory.
+"""Object store: whole objects by key, listed in order, written always, if absent, or if unchanged (compare-and-swap by ETag, Google's by
+generation). Objects are neither renamed nor appended to. Keys are relative to the data set's prefix, with "/" between their parts.
 
-It has conditional writes: create if absent, and compare-and-swap by ETag (Google: by generation). Folders lack the latter.
+By obstore, the Python binding of the Rust crate object_store.
 """
 
 from __future__ import annotations
 
-import datetime
 import functools
 import importlib
 import os
@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from synpick_warp.errors import StoreError
-from synpick_warp.system.stores.base import BLOCK_BYTES, Stat, TransientError, persist
+from synpick_warp.system.inputs.files import describe_bytes
+from synpick_warp.system.stores.base import Stat, TransientError, persist
 
-TIMEOUT = 60
-"""Timeout of a request [s]."""
+BLOCK_BYTES = 8 << 20
+"""Size of the blocks in which large objects are read [B]."""
 PART_BYTES, PARTS_AT_ONCE = 16 << 20, 4
 """Size of the parts in which larger files are uploaded [B], each a request that counts and costs, and parts of a file at a time."""
 PAGE = 1000
 """Keys of a page of a listing: as many as S3 answers with."""
-_INSTALL = "install it by pip install 'synpick-warp[cloud]'"
+SMALL = 1 << 20
+"""Largest control object, such as a lease or a list of ranges [B]."""
 _SET_CREDENTIALS = "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
 _ADVICE = (
     (
@@ -56,44 +58,32 @@ _PASSING = (
 """Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
 _LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
+_SECRETS = re.compile(r"(?:AWS|AZURE|GOOGLE)_.*(?:KEY|SECRET|TOKEN|SAS|PASSWORD).*")
+"""Variables whose values no message shows."""
+_SHORT = 4
+"""Length of a variable's value from which on it is a secret [characters]."""
+_IN_URL = re.compile(r"(?<=//)[^/\s]*@|\?[^\s)\"]*")
+"""Parts of the URLs in an error's text that may be secrets: user and password, and the query, which may be signed."""
 
 _Result = TypeVar("_Result")
-_memories: dict[str, Any] = {}
-"""Stores in memory by name, shared within the process."""
-_ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-"""Variables of S3 servers other than Amazon's, the first before the next."""
 
 
-class ObjectStore:
-    """`Store` of obstore."""
+class SizeError(StoreError):
+    """An object is larger than any of its kind."""
 
-    def __init__(self, url: str) -> None:
-        """Open the store without a request. Raises StoreError: obstore is not installed or refuses the URL, or there are no credentials."""
-        try:
-            self._obs = importlib.import_module("obstore")
-            self._kinds = importlib.import_module("obstore.store")
-        except ImportError:
-            raise StoreError(f"{url} needs the package obstore; {_INSTALL}") from None
-        self.url, self.conditional = url.rstrip("/"), not url.startswith("file:")
+
+class Store:
+    """Object store below a prefix. Thread-safe. Each method repeats requests that fail for a while, then raises StoreError."""
+
+    def __init__(self, url: str, backend: Any) -> None:
+        """
+        Args:
+            url: Address of the prefix, without a slash at the end.
+            backend: Store of obstore at this prefix.
+        """
+        self.url, self._store = url, backend
+        self._obs = importlib.import_module("obstore")
         self._errors = self._obs.exceptions
-        try:
-            self._store = self._open(self.url)
-        except (self._errors.BaseError, ValueError, OSError) as error:
-            raise StoreError(f"{url} cannot be opened: {_first_line(error)}") from None
-
-    def _open(self, url: str) -> Any:
-        """Construct obstore's store of a URL."""
-        scheme, _, rest = url.partition("://")
-        if scheme == "memory":
-            return _memories.setdefault(rest, self._kinds.MemoryStore())
-        if scheme == "file":
-            return self._kinds.LocalStore(rest, mkdir=True, automatic_cleanup=True)
-        if scheme in ("s3", "s3a"):
-            _check_credentials(url)
-        endpoint = _find_endpoint() if scheme in ("s3", "s3a") else ""
-        client = {"timeout": f"{TIMEOUT}s", "allow_http": endpoint.startswith("http://")}
-        retries = {"max_retries": 3, "retry_timeout": datetime.timedelta(seconds=TIMEOUT)}
-        return self._kinds.from_url(url, client_options=client, retry_config=retries)
 
     def _try(self, request: Callable[[], _Result], what: str) -> _Result:
         """Retry a request while its errors are transient; others become StoreError, but for failed conditions and missing objects."""
@@ -110,22 +100,25 @@ class ObjectStore:
             except (self._errors.BaseError, OSError, NotImplementedError) as error:
                 text = str(error)
                 if any(sign.lower() in text.lower() for sign in _PASSING) and not any(sign in text for sign in _LASTING):
-                    raise TransientError(_first_line(error)) from None
+                    raise TransientError(describe_fault(error)) from None
                 advice = next((said for signs, said in _ADVICE if any(sign in text for sign in signs)), "")
                 if advice:
                     raise StoreError(f"cannot {what}: {advice}") from None
                 if isinstance(error, FileNotFoundError):
-                    raise
-                raise StoreError(f"cannot {what}: {_first_line(error)}") from None
+                    raise FileNotFoundError(describe_fault(error)) from None
+                raise StoreError(f"cannot {what}: {describe_fault(error)}") from None
+            except BaseException as error:
+                raise_panic(error, f"cannot {what}")
+                raise
 
         return persist(attempt, what)
 
     def put(self, key: str, data: bytes) -> None:
-        """See `Store`."""
+        """Write an object atomically: readers see the old or the new one, whole."""
         self._write(key, lambda: self._obs.put(self._store, key, data, use_multipart=False))
 
     def put_file(self, key: str, path: Path) -> None:
-        """See `Store`."""
+        """Upload a file as an object, in several parts if it is large."""
         self._write(key, lambda: self._obs.put(self._store, key, path, chunk_size=PART_BYTES, max_concurrency=PARTS_AT_ONCE))
 
     def _write(self, key: str, request: Callable[[], object]) -> None:
@@ -133,16 +126,34 @@ class ObjectStore:
         try:
             self._try(request, f"write {self.url}/{key}")
         except FileNotFoundError as error:
-            raise StoreError(f"cannot write {self.url}/{key}: {_first_line(error)}") from None
+            raise StoreError(f"cannot write {self.url}/{key}: {error}") from None
 
-    def get(self, key: str) -> bytes:
-        """See `Store`."""
-        return self._try(lambda: bytes(self._obs.get(self._store, key).bytes()), f"read {self.url}/{key}")
+    def get(self, key: str, limit: int) -> bytes:
+        """Read an object of at most `limit` bytes; raises FileNotFoundError, and SizeError if it is larger."""
+        return self._get(key, limit)[0]
 
-    def blocks(self, key: str) -> Iterator[bytes]:
-        """See `Store`."""
+    def _get(self, key: str, limit: int) -> tuple[bytes, Any]:
+        """Content and metadata of an object; as `get`."""
+
+        def read() -> tuple[bytes, Any]:
+            found = self._obs.get(self._store, key)
+            self._check_size(key, found.meta, limit)
+            return bytes(found.bytes()), found.meta
+
+        return self._try(read, f"read {self.url}/{key}")
+
+    def _check_size(self, key: str, meta: Any, limit: int) -> None:
+        """Raise SizeError if an object is larger than `limit` bytes, by its metadata."""
+        if meta["size"] > limit:
+            raise SizeError(f"{self.url}/{key} is larger than {describe_bytes(limit)}, the limit for such files")
+
+    def blocks(self, key: str, limit: int) -> Iterator[bytes]:
+        """Stream an object of at most `limit` bytes in blocks of at most BLOCK_BYTES, one range request each.
+
+        Raises FileNotFoundError, SizeError if it is larger, and StoreError if it is replaced meanwhile."""
         what = f"read {self.url}/{key}"
         meta = self._try(lambda: self._obs.head(self._store, key), what)
+        self._check_size(key, meta, limit)
 
         def read(start: int) -> bytes:
             found = self._obs.get(self._store, key, options={"range": (start, min(start + BLOCK_BYTES, meta["size"]))})
@@ -154,7 +165,7 @@ class ObjectStore:
             yield self._try(lambda first=start: read(first), what)
 
     def stat(self, key: str) -> Stat | None:
-        """See `Store`."""
+        """Look up the metadata of an object; None: there is no such object."""
         try:
             found = self._try(lambda: self._obs.head(self._store, key), f"look up {self.url}/{key}")
         except FileNotFoundError:
@@ -162,12 +173,13 @@ class ObjectStore:
         return Stat(found["size"], found["last_modified"])
 
     def list(self, folder: str, after: str = "") -> Iterator[tuple[str, int]]:
-        """See `Store`."""
+        """List the objects below a folder, sorted by key, page by page: yields key and size [B].
+
+        Args:
+            folder: First parts of their keys, without a slash at the end; empty: all objects.
+            after: Only keys that sort after this one.
+        """
         last = after
-        if self.url.startswith("file:"):  # In the order of the file system, with the files that are being written.
-            found = self._try(lambda: [each for chunk in self._obs.list(self._store, folder or None) for each in chunk], f"list {self.url}")
-            yield from sorted((each["path"], each["size"]) for each in found if each["path"] > after and "#" not in each["path"])
-            return
 
         def read(after: str) -> Any:
             """First page after a key. The stream is made for each attempt: one that has failed says that it is at its end."""
@@ -182,18 +194,19 @@ class ObjectStore:
             last = page[-1]["path"]
 
     def delete(self, key: str) -> None:
-        """See `Store`."""
+        """Delete an object, if it is there."""
         try:
             self._try(lambda: self._obs.delete(self._store, key), f"delete {self.url}/{key}")
         except FileNotFoundError:
             return
 
     def create(self, key: str, data: bytes) -> str | None:
-        """See `Store`."""
+        """Write an object if absent; returns its tag. None: the key is taken, perhaps by an attempt of this call whose answer was lost."""
         return self._put_if(key, data, "create")
 
     def replace(self, key: str, data: bytes, tag: str) -> str | None:
-        """See `Store`."""
+        """Compare-and-swap: write an object if the one that is there has this tag; returns the new tag. None: it has another tag, perhaps
+        that of an attempt of this call whose answer was lost, or was deleted."""
         version, _, e_tag = tag.partition(" ")
         return self._put_if(key, data, {"e_tag": e_tag} | ({"version": version} if version else {}))
 
@@ -208,12 +221,12 @@ class ObjectStore:
             return None
 
     def get_tagged(self, key: str) -> tuple[bytes, str] | None:
-        """See `Store`."""
+        """Read a control object and its tag, which identifies its version; None: there is no such object."""
         try:
-            found = self._try(lambda: self._obs.get(self._store, key), f"read {self.url}/{key}")
-            return self._try(lambda: bytes(found.bytes()), f"read {self.url}/{key}"), _tag(found.meta)
+            data, meta = self._get(key, SMALL)
         except FileNotFoundError:
             return None
+        return data, _tag(meta)
 
 
 @functools.cache
@@ -222,39 +235,22 @@ def _process() -> int:
     return os.getpid()
 
 
-def _find_endpoint() -> str:
-    """Endpoint URL of S3 by the environment variables; empty: Amazon's. Unsets empty variables, which make obstore panic.
-
-    Raises:
-        StoreError: A variable is not an HTTP URL.
-    """
-    found = {name: os.environ[name] for name in _ENDPOINTS if name in os.environ}
-    for name, address in found.items():
-        if not address:
-            del os.environ[name]
-        elif re.match(r"https?://[^/]", address) is None:
-            raise StoreError(f"{name} is {address}; set it to the address of a server, such as http://127.0.0.1:9000, or unset it")
-    return next(filter(None, found.values()), "")
-
-
-def _check_credentials(url: str) -> None:
-    """Check for credentials of S3: raises StoreError if no variable gives them and the machine's metadata service is disabled."""
-    given = (
-        "AWS_ACCESS_KEY_ID",
-        "AWS_WEB_IDENTITY_TOKEN_FILE",
-        "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
-        "AWS_CONTAINER_CREDENTIALS_FULL_URI",
-    )
-    disabled = os.environ.get("AWS_EC2_METADATA_DISABLED", "").lower() == "true"
-    if disabled and not any(os.environ.get(name) for name in given):
-        raise StoreError(f"there are no credentials for {url}; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")
-
-
 def _tag(state: Any) -> str:
     """Tag of an object: its generation, which Google compares, a space, and its ETag, which the others compare."""
     return f"{state['version'] or ''} {state['e_tag']}"
 
 
-def _first_line(error: BaseException) -> str:
-    """First line of an error's text; the others describe the library's internals."""
-    return (str(error).splitlines() or [type(error).__name__])[0][:300]
+def describe_fault(error: BaseException) -> str:
+    """First line of an error's text, as the others describe the library's internals, without secrets: keys, tokens, users, queries of
+    URLs."""
+    text = (str(error).splitlines() or [type(error).__name__])[0]
+    for name, value in os.environ.items():
+        if len(value) >= _SHORT and _SECRETS.fullmatch(name):
+            text = text.replace(value, "…")
+    return _IN_URL.sub("…", text)[:300]
+
+
+def raise_panic(error: BaseException, what: str) -> None:
+    """Raise StoreError if an error is a panic of Rust code, whose class is no Exception and has no module to import it from."""
+    if type(error).__name__ == "PanicException":
+        raise StoreError(f"{what}: obstore failed ({describe_fault(error)}); check the variables of the store's credentials") from None
