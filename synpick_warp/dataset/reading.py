@@ -493,8 +493,7 @@ def open_data_set(folder: Path | str) -> DataSet:
 
     Raises DatasetError if the folder is neither one that a bake wrote, or is still writing, nor another BOP data set.
     """
-    place = parse_place(folder)
-    if isinstance(place, str):
+    if isinstance(place := parse_place(folder), str):
         raise DatasetError(f"{place} is in an object store; open it by synpick_warp.open")
     data_set = DataSet(place)
     data_set.found  # noqa: B018
