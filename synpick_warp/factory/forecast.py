@@ -21,10 +21,12 @@ from synpick_warp.system.progress import Progress
 GB = 10**9
 SAMPLED = 1024
 """Maximum number of episodes whose objects are drawn for the forecast; the others have their mean."""
-VIEW_BYTES = {"bop": (23_000, 0.345), "shards": (23_000, 0.345), "coco": (6_000, 0.2), "yolo": (6_000, 0.2), "lerobot": (500, 0.006)}
-"""Size of a view's files by format: fixed part [B] and part per pixel [B/px]. Baked with real objects and light maps: 0.74 MB a view at
-full HD with all masks, 44 kB at 320x180."""
-TICK_BYTES = {"zarr": 55_000, "usd": 1_500, "picks": 0}
+VIEW_BYTES = {"bop": 739e3, "shards": 739e3, "coco": 480e3, "yolo": 480e3}
+"""Size of a view's files at full HD by format [B]: 57 GB for 77,166 views of real objects, of which colour is 65 %. Formats that are not
+listed are small beside these."""
+FULL_HD, SIZE_EXPONENT = 1920 * 1080, 0.55
+"""Files grow with this power of the pixels [px]: 26 kB were measured at 96x54, 109 kB at 320x180."""
+TICK_BYTES = {"zarr": 50e3}
 """Size of a frame of an episode by format [B], measured with ten objects."""
 SURE = 0.5
 """A bake is refused if even this fraction of its forecast size is not free: sizes of files vary with pictures by less."""
@@ -60,12 +62,12 @@ def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> 
         episodes: Indices.
     """
     frames = round(predict_length(config, catalog, episodes[:: len(episodes) // SAMPLED + 1]) * len(episodes))
-    pixels = [width * height / every for (width, height), every in zip(config.rig.sizes, config.rig.every, strict=True)]
-    shares = [1.0 / every for every in config.rig.every]
-    fixed, each = (sum(VIEW_BYTES.get(name, (0, 0.0))[part] for name in config.bake.formats) for part in (0, 1))
-    size = frames * (fixed * sum(shares) + each * sum(pixels) + sum(TICK_BYTES.get(name, 0) for name in config.bake.formats))
-    seconds = frames * (VIEW_TIME[0] * sum(shares) + VIEW_TIME[1] * sum(pixels))
-    return Forecast(len(episodes), frames, round(frames * sum(shares)), round(size), seconds)
+    # Of each camera: views a frame, and pixels of a view.
+    cameras = [(1.0 / every, width * height) for (width, height), every in zip(config.rig.sizes, config.rig.every, strict=True)]
+    view, tick = (sum(table.get(name, 0.0) for name in config.bake.formats) for table in (VIEW_BYTES, TICK_BYTES))
+    size = frames * (tick + view * sum(share * (pixels / FULL_HD) ** SIZE_EXPONENT for share, pixels in cameras))
+    seconds = frames * sum(share * (VIEW_TIME[0] + VIEW_TIME[1] * pixels) for share, pixels in cameras)
+    return Forecast(len(episodes), frames, round(frames * sum(share for share, _ in cameras)), round(size), seconds)
 
 
 def predict_length(config: Config, catalog: Catalog, episodes: Sequence[int]) -> float:
