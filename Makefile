@@ -47,7 +47,7 @@ checks: $(VENV)/installed-dev
 	$(BIN)/ruff format --quiet --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/basedpyright & types=$$!; \
-	$(BIN)/python -m tools.checks.kernels && $(BIN)/python -m tools.checks.history; others=$$?; wait $$types && exit $$others
+	$(BIN)/python -m tools.checks.kernels; others=$$?; wait $$types && exit $$others
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache .import_linter_cache

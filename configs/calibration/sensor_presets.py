@@ -33,7 +33,7 @@ _FRACTION = Figure(1 / 32, ASSUMED, "five fractional bits, as in librealsense's 
 _SEARCH = Figure(126.0, PUBLISHED, "disparities that are searched, which give the least distance f b / 126 (librealsense, issue 3039)")
 _MIDDLE = "middle of the image"
 _RAGGED = Figure(0.5, ASSUMED, "as of other sensors that match windows (Handa et al., 2014)")
-_FRAMES = "ten frames of YCB-Video (tools.reports.sensor)"
+_FRAMES = "ten frames of YCB-Video (tools/reports/sensor)"
 _ABOVE = Figure(1.0, ASSUMED, "within the range in which noise is below 3 mm")
 
 SENSORS: dict[str, dict[str, Figure]] = {

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import itertools
-import json
-import multiprocessing
 import time
 
 import cv2
@@ -16,12 +12,10 @@ import pytest
 torch = pytest.importorskip("torch", exc_type=ImportError)
 scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 
-from synpick_warp.configs.files.load import load_config, parse_assignment  # noqa: E402
-from synpick_warp.errors import ConfigError, SynpickError  # noqa: E402
+from synpick_warp.errors import ConfigError  # noqa: E402
 from synpick_warp.system.hardware.device import pick_device  # noqa: E402
-from tools.options import Row  # noqa: E402
-from tools.reports.real import OBJECT, ablation, interval, training, worker  # noqa: E402
-from tools.reports.real.__main__ import PRESET, check_ids, make_options, recipe_of, source_of  # noqa: E402
+from tools.reports.real import interval, training  # noqa: E402
+from tools.reports.real.__main__ import check_ids, make_options, recipe_of, source_of  # noqa: E402
 from tools.reports.real.detector import average_precision, boxes_of  # noqa: E402
 from tools.reports.real.networks import NETWORKS, upsample_twofold  # noqa: E402
 from tools.reports.real.training import (  # noqa: E402
@@ -33,7 +27,6 @@ from tools.reports.real.training import (  # noqa: E402
     train,
     warp_views,
 )
-from tools.reports.real.tuning import changed  # noqa: E402
 from tools.reports.real.views import Pool  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
@@ -190,15 +183,6 @@ def test_compiled_and_eager_steps_have_the_same_gradients_when_logits_are_large(
     torch.testing.assert_close(gradients[1], gradients[0], rtol=0.0, atol=0.05 * float(gradients[0].abs().max()))
 
 
-def test_a_trial_changes_what_it_names():
-    assert changed(RECIPE, "base") == RECIPE
-    made = changed(RECIPE, "dice=1,network=residual,width=4")
-    assert made == dataclasses.replace(RECIPE, dice=1.0, network="residual", width=4)
-    for text in ("dice", "dice=x", "dice=-1", "rate=nan", "jpeg=101", "half=2", "batch=0", "network=foo", "views=3", "depth=1"):
-        with pytest.raises(SynpickError):
-            changed(RECIPE, text)
-
-
 def test_a_pool_replaces_views_once_it_is_full():
     pool = Pool(4, 0)
     batches = iter([(torch.full((3, 3, 2, 2), index, dtype=torch.uint8), torch.full((3, 2, 2), index)) for index in range(6)])
@@ -265,89 +249,3 @@ def test_images_and_objects_that_networks_cannot_have_are_named():
 def test_the_command_lines_defaults_are_the_recipes():
     made = recipe_of(make_options().parse_args(["--real", "frames"]))
     assert made == Recipe(views=24_000, passes=4.0, batch=16, width=48, seconds=280.0, capacity=24_000, half=0.7, dice=1.0, crop=0.5)
-
-
-def test_a_worker_starts_anew_after_a_run_that_ends_it(monkeypatch, tmp_path):
-    def serve(connection, shared):
-        for count in itertools.count():
-            (action,), log = connection.recv()
-            log.write_text(f"{shared[0]} {count}")
-            if action != "work":
-                time.sleep(60.0 if action == "hang" else 0.0)
-                raise SystemExit(1)
-            connection.send(True)
-
-    monkeypatch.setattr(worker, "_CONTEXT", multiprocessing.get_context("fork"))
-    monkeypatch.setattr(worker, "_serve", serve)
-    one, log = worker.Worker(["a"]), tmp_path / "log"
-    limits = {"work": 20.0, "fail": 20.0, "hang": 0.5}
-    ended = [(one.run([action], log, limits[action]), one.ready, log.read_text()) for action in ("work", "fail", "work", "hang")]
-    assert ended == [(True, True, "a 0"), (False, False, "a 1"), (True, True, "a 0"), (False, False, "a 1")]
-
-
-@pytest.mark.parametrize("name", ablation.COMPONENTS)
-def test_each_component_changes_the_preset(name):
-    changes = dict(parse_assignment(text) for text in ablation.COMPONENTS[name])
-    assert load_config(PRESET, changes) != load_config(PRESET, {})
-
-
-def test_a_run_that_does_not_fit_is_left_out_and_its_detector_before_it():
-    run, start = ablation.Run("one", 8000, detector=60.0), ablation.SLACK * ablation.START
-    assert run.fit(start + run.limit + 61, ablation.START) == run
-    assert run.fit(start + run.limit + 59, ablation.START) == dataclasses.replace(run, detector=0.0)
-    assert run.fit(start + ablation.SLACK * run.training + 1, ablation.START) is not None
-    assert run.fit(start + run.training, ablation.START) is None
-    assert run.fit(start + ablation.SLACK * run.training + 1, ablation.START, 2.0) is None
-
-
-def results(value):
-    """Results of one seed, as `tools.reports.real` writes them."""
-    rows = [{"name": "obj_id 2: IoU", "value": value, "part": OBJECT}, {"name": "views", "value": 8.0, "part": ""}]
-    entry = dict.fromkeys(("views", "samples", "seconds", "stream_seconds", "limit", *ablation.METRICS), value)
-    return json.dumps({"more": {"seeds": [entry]}, "rows": rows})
-
-
-def test_the_plan_says_what_is_left_out_and_results_are_collected(tmp_path, capsys):
-    jobs = ablation.order(list(ablation.plan(8000, 24_000)))
-    assert len({ablation.stem_of(*job) for job in jobs}) == len(jobs)
-    ablation.print_plan(jobs, 4, 400.0)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == len(jobs)
-    assert lines[-1].endswith("(left out)")
-    for seed, value in enumerate((0.4, 0.6)):
-        (tmp_path / f"{ablation.stem_of(jobs[0][0], seed)}.json").write_text(results(value))
-    made = ablation.collect(tmp_path, jobs)
-    assert [row["value"] for row in made["rows"][:3]] == [0.5, 50.0, 50.0]
-    assert made["rows"][-1] == dataclasses.asdict(Row("obj_id 2: IoU", 0.5, part="24,000 views"))
-    assert made["rows"][0]["name"] == "24,000 views: mIoU"
-    assert made["more"]["seeds"]["24,000 views"]["mean_iou"] == [0.4, 0.6]
-
-
-def test_rows_go_on_after_one_that_fails(monkeypatch, tmp_path, capsys):
-    """Rows that have results or do not fit are left out; each worker is of a GPU."""
-    commands = []
-
-    class Fake:
-        ready = False
-
-        def __init__(self, shared):
-            self.device = shared[shared.index("--device") + 1]
-
-        def run(self, arguments, log, seconds):
-            commands.append((self.device, log.stem))
-            if "fails" not in log.stem:
-                log.with_suffix(".json").write_text(results(0.5))
-            return "fails" not in log.stem
-
-        def stop(self):
-            commands.append((self.device, "stop"))
-
-    monkeypatch.setattr(ablation, "Worker", Fake)
-    names = ("there", "fails", "long", "goes on")
-    jobs = [(ablation.Run(name, 8, seeds=1, rate=1e-3 if name == "long" else 1e3, limit=1e4), 0) for name in names]
-    (tmp_path / "there_0.json").write_text(results(0.5))
-    options = argparse.Namespace(real="R", models="M", lights="L", gpus=1, processes=1, deadline=200.0, out=tmp_path, pass_on=[])
-    assert ablation.Execution(jobs, options).run() == 1
-    assert commands == [("cuda:0", "fails_0"), ("cuda:0", "goes_on_0"), ("cuda:0", "stop")]
-    assert "left out: seed 0 of long" in capsys.readouterr().out
-    assert {row["part"] for row in json.loads((tmp_path / "real_ablation.json").read_text())["rows"]} == {"there", "goes on"}

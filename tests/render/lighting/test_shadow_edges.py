@@ -13,8 +13,8 @@ from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.denoised import scratch_sizes
 from synpick_warp.stages.render.sampling_rates import shadow_size
+from tests.twins.lattice import measure_lattice
 from tests.worlds.toy_scene import FLAT, ToyScene, camera, entry, flat_shaded, lamp, render, sheet, with_render
-from tools.reports.lattice import measure_lattice
 
 FOCAL, DISTANCE = 300.0, 1.5
 WIDTH, HEIGHT = 160, 120

@@ -1,1 +1,0 @@
-"""Report on the depth sensor: simulated depth of annotated scenes beside the measured one."""
