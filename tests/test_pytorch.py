@@ -40,6 +40,11 @@ def torch(monkeypatch):
             del sys.modules[name]
 
 
+def test_fields_are_checked_when_it_is_made(folder):
+    with pytest.raises(DatasetError, match=r"no field depht; did you mean depth\?; fields: rgb, .*pick_weights; layers: .*normals"):
+        Views(folder, fields=("rgb", "depht"))
+
+
 def test_samples_are_views_in_order_with_what_is_visible_enough(folder):
     fields = (name for name in FIELDS if not name.startswith("pick_"))  # This set has no picks.
     views = Views(folder, fields=(*fields, "classes"), min_visibility=0.8)

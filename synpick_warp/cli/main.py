@@ -477,7 +477,8 @@ def _bake(
     if summary.stopped:
         kind = "claimed episodes" if (claim or crew) and not devices else "episodes"
         done = f"{len(summary.episodes)} of {summary.total} {kind} are complete"
-        print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)
+        rest = "completes the data set" if len(summary.episodes) == summary.total else "resumes with the others"
+        print(f"{NAME}: interrupted: {done}; the same command {rest}", file=sys.stderr)
         return EXIT_SIGNAL + summary.stopped
     delivered = sum(1 for row in summary.episodes if row[2].delivers)
     return 0 if delivered == summary.total else EXIT_INCOMPLETE

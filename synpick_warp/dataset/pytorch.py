@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.grasp_maps import candidates, find_pixels, mean_by_candidate
 from synpick_warp.dataset.reading import DataSet, open_data_set
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import DatasetError, suggest
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import Episode
@@ -87,8 +88,11 @@ class Views:
             transform: Called with each sample, which also has its `episode`, `camera` and `frame`; must be picklable for workers.
 
         Raises:
-            DatasetError: There is no such data set, split or camera, or a value is out of range.
+            DatasetError: There is no such data set, split, camera or field, or a value is out of range.
         """
+        if wrong := [name for name in fields if name not in FIELDS and name not in LAYERS]:
+            near = suggest(str(wrong[0]), [*FIELDS, *LAYERS])
+            raise DatasetError(f"there is no field {wrong[0]}{near}; fields: {', '.join(FIELDS)}; layers: {', '.join(LAYERS)}")
         self.source, self.fields, self.min_visibility, self.transform = source, tuple(fields), min_visibility, transform
         whole = self._open()
         data = whole.split(split) if split else whole

@@ -16,7 +16,7 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
-from synpick_warp.errors import ConfigError, DatasetError, format_value
+from synpick_warp.errors import ConfigError, DatasetError, format_value, suggest
 from synpick_warp.views.layer_codec import decode_layer, image_format
 
 if TYPE_CHECKING:
@@ -303,9 +303,15 @@ class View:
 def read_layer(files: SceneFiles, name: str, frame: int) -> np.ndarray:
     """Decode a layer of one image; values, units, shapes and errors as of `View.layer`."""
     if name not in LAYERS:
-        raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
+        raise DatasetError(f"there is no layer {name}{suggest(name, LAYERS)}; layers: {', '.join(LAYERS)}")
     dtype, channels = image_format(name)
-    image = files.typed_image(name, frame, channels, dtype)
+    try:
+        image = files.typed_image(name, frame, channels, dtype)
+    except DatasetError:
+        if files.has(name):
+            raise
+        present = [each for each in LAYERS if files.has(each)]
+        raise DatasetError(f"{files.place} has no layer {name}; it has {', '.join(present) or 'none'}; bake with render.layers") from None
     return decode_layer(name, image if channels is None else image[..., ::-1])
 
 

@@ -220,7 +220,7 @@ def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
     bakes.result = finished(4)
     bakes.result.stopped = 2
     assert main(["bake", "--device=cpu", f"--out={tmp_path}"]) == 130
-    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are complete; the same command resumes with the others\n")
+    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are complete; the same command completes the data set\n")
 
 
 def test_output_folder_that_is_not_empty(tmp_path, bakes):

@@ -114,7 +114,7 @@ def test_layers_are_decoded(data):
         flow = one.layers["flow"][0]
         # A pixel with one unknown component is unknown.
         np.testing.assert_array_equal(view.layer("flow"), np.where(np.isnan(flow).any(axis=-1, keepdims=True), np.nan, flow))
-    with pytest.raises(DatasetError, match="albedo"):
+    with pytest.raises(DatasetError, match=r"has no layer albedo; it has classes, flow; bake with render\.layers"):
         view.layer("albedo")
 
 

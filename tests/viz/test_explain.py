@@ -203,7 +203,7 @@ def test_names_come_from_the_models_or_from_the_object_table(dataset):
 
 
 def test_objects_that_come_twice_get_letters():
-    assert labels(attempt((seen(0, object_id=4), seen(3, object_id=2), seen(5, object_id=4)), {})) == {0: "4a", 5: "4b", 3: "2"}
+    assert labels(attempt((seen(0, object_id=4), seen(3, object_id=2), seen(5, object_id=4)), {})) == {0: "4a", 5: "4f", 3: "2"}
 
 
 FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0.6), seen(2, frozenset({0}), visible_fraction=0.3)
@@ -213,10 +213,20 @@ FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0
     ("objects", "target", "mode", "said"),
     [
         ((FIRST,), 0, "pick", "target: 1 tin: 0 objects above; the only visible object"),
-        ((FIRST, SECOND, THIRD), 1, "pick", "target: 2 box: 0 objects above; visible fraction 0.60, the largest of 2 such"),
+        (
+            (FIRST, SECOND, THIRD),
+            1,
+            "pick",
+            "target: 2 box: 0 objects above; visible area 0.60 of its box's largest face, the largest of 2 such",
+        ),
         ((FIRST, THIRD), 0, "pick", "target: 1 tin: 0 objects above, the fewest of all"),
         ((FIRST, SECOND, THIRD), 2, "target", "target: 3 mug: 1 object above, the most of all"),
-        ((FIRST, SECOND), 0, "target", "target: 1 tin: 0 objects above; visible fraction 0.40, the smallest of 2 such"),
+        (
+            (FIRST, SECOND),
+            0,
+            "target",
+            "target: 1 tin: 0 objects above; visible area 0.40 of its box's largest face, the smallest of 2 such",
+        ),
         ((FIRST, SECOND, THIRD), 0, "pick", "target: 1 tin: 0 objects above; the rule would name 2 box"),
         ((), None, "pick", "target: none, nothing is visible"),
     ],
@@ -287,7 +297,7 @@ def test_a_lift_without_a_seal_says_so():
 
 
 def test_text_fits():
-    text = "target: 5 mustard_bottle: 0 objects above; visible fraction 0.61, the largest of 3 such"
+    text = "target: 5 mustard_bottle: 0 objects above; visible area 0.61 of its box's largest face, the largest of 3 such"
     lines = wrapped(text, 0.5, 200)
     assert " ".join(" ".join(lines).split()) == text
     assert all(cv2.getTextSize(line, FONT, 0.5, 1)[0][0] <= 200 for line in lines)

@@ -150,7 +150,8 @@ def test_labels_that_find_no_room_are_left_out():
 
 
 def test_instances_of_an_object_have_letters():
-    assert short_labels([(5, 9), (2, 4), (0, 9)]) == {5: "9a", 2: "4", 0: "9b"}
+    assert short_labels([(5, 9), (2, 4), (0, 9)]) == {5: "9f", 2: "4", 0: "9a"}
+    assert short_labels([(5, 9), (7, 9)])[5] == "9f", "as before instance 0 was picked"
     assert short_labels([(index, 1) for index in range(28)])[27] == "1ab"
 
 

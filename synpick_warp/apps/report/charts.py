@@ -25,6 +25,8 @@ MAX_LINES = 40
 """Most objects or light maps of a bar chart; the rest are counted together."""
 ROW = 19
 """Height of a line of a bar chart [px]."""
+HEADROOM = 1.1
+"""Length of the axis of objects over time, relative to the largest value: the line does not lie on the frame."""
 MAX_TICKS = 10
 """Most labels of a histogram's axis, beside the first."""
 HEIGHT = 220
@@ -301,6 +303,7 @@ def _timeline(source: Source) -> Chart | None:
         # A bin's mean holds from its begin to the next one's, and the last one's to the end of the longest episode.
         last = [row for row in rows if row["mode"] == mode][-1]
         rows.append({**last, "time": max(last["time"], round(source.durations.get(mode, 0.0), 3))})
+    most = max(row["objects"] for row in rows)
     spec: Spec = {
         "data": {"values": rows},
         "height": HEIGHT,
@@ -308,7 +311,9 @@ def _timeline(source: Source) -> Chart | None:
         "mark": {"type": "line", "interpolate": "step-after", "strokeWidth": 2, "clip": True},
         "encoding": {
             "x": _field("time", "quantitative", "time since the first frame [s]", scale={"domain": [0, max(row["time"] for row in rows)]}),
-            "y": _field("objects", "quantitative", "objects in the scene", scale={"zero": True}),
+            "y": _field(
+                "objects", "quantitative", "objects in the scene", scale={"domain": [0, round(HEADROOM * most, 3) or 1], "nice": False}
+            ),
             "color": _mode_color(rows),
             "opacity": _FADED,
             "tooltip": [

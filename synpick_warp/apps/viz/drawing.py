@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import os
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -88,15 +89,13 @@ def readable_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
 
 
 def short_labels(objects: Iterable[tuple[int, int]]) -> dict[int, str]:
-    """Short label of each (instance id, obj_id): its obj_id, with letters where several instances share it: 9a, 9b, ..., 9z, 9aa."""
-    by_object: dict[int, list[int]] = {}
-    for instance, object_id in objects:
-        by_object.setdefault(object_id, []).append(instance)
-    return {
-        instance: f"{object_id}{_letters(place) if len(group) > 1 else ''}"
-        for object_id, group in by_object.items()
-        for place, instance in enumerate(group)
-    }
+    """Short label of each (instance id, obj_id): its obj_id, with letters where several instances share it: 9a, 9b, ..., 9z, 9aa.
+
+    Letters number instance ids, so that an instance has the same in every picture, whichever others are there.
+    """
+    shown = dict(objects)
+    counts = Counter(shown.values())
+    return {instance: f"{object_id}{_letters(instance) if counts[object_id] > 1 else ''}" for instance, object_id in shown.items()}
 
 
 def _letters(place: int) -> str:

@@ -34,7 +34,7 @@ _DOT = 40.0
 """Area of a tick's disc [px²]."""
 _MAX_DOTS = 200
 """Fewest ticks of a lift whose curve has no dots, which would hide it."""
-_COLUMNS = ((0, "object"), (236, "above"), (296, "share"), (356, "pixels"), (416, "point"))
+_COLUMNS = ((0, "object"), (236, "above"), (296, "area"), (356, "pixels"), (416, "point"))
 """Position [px] and heading of the table's columns."""
 
 

@@ -59,7 +59,7 @@ class Attempt(records.Attempt, dict=True):
         return {one.instance: one for one in self.seen}
 
     def ranked(self) -> list[InstanceObservation]:
-        """Rank by the choice rule: fewest ancestors, then largest visible fraction; in targeted picking the reverse."""
+        """Rank by the choice rule: fewest ancestors, then largest visible area; in targeted picking the reverse."""
         sign = -1 if self.mode == "target" else 1
         return sorted(self.seen, key=lambda one: (sign * len(one.ancestors), -sign * one.visible_fraction, one.instance))
 
@@ -184,7 +184,10 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], target: Target, pic
 
 
 def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], target: Target, pick: Pick) -> str:
-    """Clause on why an object was chosen: number of objects above it, and its visible fraction if several have as many."""
+    """Clause on why an object was chosen: number of objects above it, and its visible area if several have as many.
+
+    The area is relative to the largest face of the bounding box: seen obliquely, an object can show more.
+    """
     targeted = attempt.mode == "target"
     count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"
@@ -200,7 +203,8 @@ def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str],
         return f"{above}; the only visible object"
     if equals == 1:
         return f"{above}, the {'most' if targeted else 'fewest'} of all"
-    return f"{above}; visible fraction {one.visible_fraction:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
+    area = f"visible area {one.visible_fraction:.2f} of its box's largest face"
+    return f"{above}; {area}, the {'smallest' if targeted else 'largest'} of {equals} such"
 
 
 def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> list[str]:

@@ -92,8 +92,9 @@ def _places(box: Box, size: tuple[int, int], area: tuple[int, int]) -> Iterator[
 
 def label_texts(truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
     """Short label of each instance of a view: obj_id, with a letter where several share it."""
-    labels = short_labels((index, record["obj_id"]) for index, (record, _) in enumerate(truth))
-    return [labels[index] for index in range(len(truth))]
+    instances = [record.get("instance_id", index) for index, (record, _) in enumerate(truth)]
+    labels = short_labels(zip(instances, (record["obj_id"] for record, _ in truth), strict=True))
+    return [labels[instance] for instance in instances]
 
 
 def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors: Sequence[tuple[int, int, int]]) -> None:
