@@ -52,7 +52,7 @@ class Labels:
     peak_force: wp.array[float]
     """(trial): largest seal force, including seals that broke [N]."""
     load: wp.array[float]
-    """(trial): largest force of a cup relative to its break force."""
+    """(trial): largest force of a seal relative to its break force."""
     ticks: wp.array[int]
     """(trial): duration up to the outcome [ticks]."""
     held: wp.array[int]
@@ -80,7 +80,7 @@ class Progress:
     peak_force: wp.array[float]
     """(world): largest seal force so far [N]."""
     load: wp.array[float]
-    """(world): largest force of a cup relative to its break force so far."""
+    """(world): largest force of a seal relative to its break force so far."""
     lost: wp.array[int]
     """(world): number of objects that were lost when the trial began."""
     pose: wp.array2d[wp.transform]
@@ -122,16 +122,6 @@ def measure_motion(
             if distance > moved_distance:
                 moved += 1
     return moved, farthest
-
-
-@wp.func
-def largest_load(cup_force: wp.array2d[float], break_force: wp.array2d[float], world: int) -> float:
-    """Largest force of a world's cups relative to their break forces."""
-    load = float(0.0)
-    for cup in range(cup_force.shape[1]):
-        if cup_force[world, cup] > 0.0 and break_force[world, cup] > 0.0:
-            load = wp.max(load, cup_force[world, cup] / break_force[world, cup])
-    return load
 
 
 @wp.kernel
@@ -253,8 +243,7 @@ def place_near_kernel(
 def watch_seals_kernel(
     # State:
     attached: wp.array2d[int],  # (world, instance)
-    cup_force: wp.array2d[float],  # (world, cup) [N]
-    break_force: wp.array2d[float],  # (world, cup) [N]
+    load: wp.array[float],  # (world)
     # Out:
     progress_inout: Progress,
 ):
@@ -265,7 +254,7 @@ def watch_seals_kernel(
     world = wp.tid()
     if progress_inout.trial[world] < 0 or progress_inout.settling[world] != ATTEMPT:
         return
-    progress_inout.load[world] = wp.max(progress_inout.load[world], largest_load(cup_force, break_force, world))
+    progress_inout.load[world] = wp.max(progress_inout.load[world], load[world])
     for instance in range(attached.shape[1]):
         if attached[world, instance] != 0:
             progress_inout.held[world] = progress_inout.held[world] + 1

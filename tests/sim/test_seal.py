@@ -365,3 +365,4 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, too
     np.testing.assert_allclose(worlds.seals.cup_force.numpy()[0], cup_forces, rtol=3e-4, atol=atol)
     assert worlds.seals.attached.numpy()[0].tolist() == kept
     assert worlds.seals.peak_force.numpy()[0] == pytest.approx(peak_force, rel=3e-4, abs=atol)
+    assert worlds.seals.load.numpy()[0] == pytest.approx(max(seal_forces) / break_force, rel=3e-4, abs=atol)

@@ -232,6 +232,7 @@ class Simulation:
         gripper.set_shaft_collision(scene, state, physics)
         gripper.clear_seals(state, self.seals)
         self.seals.peak_force.zero_()
+        self.seals.load.zero_()
         if self.recorder is not None:
             self.recorder.begin_tick()
 

@@ -110,6 +110,8 @@ class SealState:
     """Break force of a cup's seals."""
     peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
     """Largest seal force since the beginning of the tick, including seals that broke."""
+    load: wp.array = device_array("world", dtype=wp.float32)
+    """Largest seal force relative to the seal's break force since the beginning of the tick, likewise."""
 
 
 @dataclass(frozen=True, eq=False)
