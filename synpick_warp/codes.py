@@ -168,6 +168,8 @@ class Measure(enum.IntEnum):
 
     PEAK_FORCE = 0
     """Largest seal force in the tick [N], that of a seal that broke included."""
+    BREAK_FORCE = 1
+    """Least break force of the cups that have something below them, with `suction.vacuum` [N]; 0: none."""
 
 
 class Stream(enum.IntEnum):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.episodes.objects import UNITS
@@ -17,6 +17,18 @@ GRIPPERS = (SUCTION1, SUCTION_ARRAY)
 """Kinds of gripper."""
 EACH = "each"
 COMMON = "common"
+MIN_RAYS = 48
+"""Least rays on a lip with `suction.vacuum`: they and those within are so dense that one meets each hole of a tenth of the cup."""
+FLOW, COMPLIANCE = 40.0, 0.1
+"""Of an ejector [l/min] and of a bellows cup [cup widths], where only `suction.vacuum` is given."""
+_ATMOSPHERE = 101.325
+"""Pressure of air [kPa]."""
+_DENSITY = 1.2
+"""Density of air [kg/m³]."""
+_DISCHARGE = 0.62
+"""Discharge coefficient of a sharp-edged orifice (ISO 5167)."""
+_LITRES_PER_MINUTE = 1e-3 / 60.0
+"""[m³/s]"""
 
 
 @dataclass(frozen=True)
@@ -72,6 +84,32 @@ class Suction:
     """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
 
     rays: int = setting(10, "", "Rays of the seal test, on a circle at the cup's lip (paper).", low=3, high=64)
+    vacuum: float | None = setting(
+        None,
+        "kPa",
+        "Vacuum below a tight cup, such as 60: seals then follow from physics. A seal breaks at the vacuum times the area of the mouth "
+        "that the object covers, less what leaks take. Rays meet the mesh, on the lip and within; it sets radius, rays, surface and break "
+        "forces. Not given: good_force and poor_force, whatever the cup (paper).",
+        above=0.0,
+        high=_ATMOSPHERE,
+    )
+    flow: float | None = setting(
+        None,
+        "l/min",
+        "Suction rate of the ejector with an open cup, 40 unless given. Air that enters through holes, beside the object or below the lip "
+        "lowers the vacuum: linear characteristic, orifice with a discharge coefficient of 0.62. Small ejectors have 10 to 80; Schmalz "
+        "lists 8.3 for airtight parts and cups of up to 60 mm.",
+        low=0.1,
+        high=1e5,
+    )
+    compliance: float | None = setting(
+        None,
+        "",
+        "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: a ball seals if its cap below the lip "
+        "is no higher, so with a radius of 1.3 cups; with 0.05, as of a flat cup, of 2.5.",
+        low=0.0,
+        high=1.0,
+    )
     radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0, high=0.25)
     reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0, high=1.0)
     surface: str = setting(
@@ -98,10 +136,48 @@ class Suction:
         high=1e6,
     )
 
+    @property
+    def rings(self) -> tuple[int, ...]:
+        """Rays of each ring of the seal test, from the lip inwards: the lip alone, or with `vacuum` others as far apart as its rays."""
+        count = round(self.rays / math.tau) if self.vacuum is not None else 0
+        return (self.rays, *(max(1, round(self.rays * (1 - ring / count))) for ring in range(1, count + 1)))
+
+    @property
+    def leak(self) -> float:
+        """Flow of a leak relative to `flow`, at the full vacuum and by its area: C_d sqrt(2 p / ρ) / Q [1/m²]."""
+        assert self.vacuum is not None
+        assert self.flow is not None
+        return _DISCHARGE * math.sqrt(2e3 * self.vacuum / _DENSITY) / (_LITRES_PER_MINUTE * self.flow)
+
+
+def follow_vacuum(gripper: Gripper, suction: Suction, fixed: Collection[str]) -> Suction:
+    """Settings of suction that follow from its vacuum, if that is given: the ring is the cup's lip, a good seal holds the vacuum times the
+    mouth's area, and any other at least what is left beside an open cup. Those in `fixed` stay as they are.
+    """
+    if suction.vacuum is None:
+        return suction
+    radius, plain = gripper.cup_width / 2, Suction()
+    chosen = {"rays": MIN_RAYS, "surface": "mesh", "flow": FLOW, "compliance": COMPLIANCE}
+    found = replace(suction, **{name: value for name, value in chosen.items() if getattr(suction, name) == getattr(plain, name)})
+    force, k = 1e3 * suction.vacuum * math.pi * radius**2, found.leak * math.pi * radius**2
+    forces = {"radius": radius, "good_force": force, "poor_force": force * (2.0 / (k + math.sqrt(k * k + 4.0))) ** 2}
+    changes = {name: getattr(found, name) for name in chosen} | forces
+    return replace(suction, **{name: value for name, value in changes.items() if name not in fixed})
+
+
+def describe_forces(gripper: Gripper, suction: Suction) -> str:
+    """Line about break forces that do not follow from a vacuum."""
+    most = 1e3 * _ATMOSPHERE * math.pi * gripper.cup_width**2 / 4
+    return (
+        f"suction: a seal breaks at {suction.good_force:g} or {suction.poor_force:g} N, as in the paper, whatever cup, holes and gaps "
+        f"(full vacuum below this cup: {most:.3g} N); with suction.vacuum = 60 [kPa] it follows from physics"
+    )
+
 
 def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[tuple[float, float]]) -> Iterator[Conflict]:
     """Yield conflicts of cups, rays and break forces; `mouths` are the sides of the openings of all compartments [m]."""
     max_radius = gripper.cup_width / 2
+    yield from _vacuum(gripper, suction)
     if suction.radius > max_radius:
         yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
     if suction.tolerated_misses >= suction.rays:
@@ -130,3 +206,21 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[
             "gripper.cups",
             f"within {max(limit, 0.0):g} m of the middle: the tool must fit into a compartment, however it is turned",
         )
+
+
+def _vacuum(gripper: Gripper, suction: Suction) -> Iterator[Conflict]:
+    """Yield conflicts of the vacuum with what follows from it, and of settings that only it has."""
+    if suction.vacuum is None:
+        for name in ("flow", "compliance"):
+            if getattr(suction, name) is not None:
+                yield f"suction.{name}", "none without suction.vacuum, such as 60 [kPa]"
+        return
+    if suction.rays < MIN_RAYS:
+        yield "suction.rays", f"at least {MIN_RAYS} with suction.vacuum: fewer miss holes of a tenth of the cup"
+    if suction.surface != "mesh":
+        yield "suction.surface", "mesh with suction.vacuum: collision shapes close holes"
+    follows = follow_vacuum(gripper, suction, ())
+    for name, unit in (("radius", "m"), ("good_force", "N"), ("poor_force", "N")):
+        value = getattr(follows, name)
+        if not math.isclose(getattr(suction, name), value, rel_tol=1e-6):
+            yield f"suction.{name}", f"none with suction.vacuum, or what follows from it and gripper.cup_width, {value:g} [{unit}]"

@@ -10,6 +10,7 @@ from typing import Any
 
 from synpick_warp.configs.cell.bins import BinRow
 from synpick_warp.configs.cell.cameras import Jitter, Pose
+from synpick_warp.configs.cell.gripper import COMPLIANCE, FLOW, Gripper
 from synpick_warp.configs.check import is_table
 from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution
 from synpick_warp.configs.files.load import sections, table_lists
@@ -20,6 +21,8 @@ WIDTH = 120
 """Longest comment line [characters]."""
 FILL, _FEW = 0.1, 4
 """Volume of an episode's objects, as a fraction of the bin's, and their largest number: a few minutes on a CPU."""
+VACUUM = 60.0
+"""Vacuum below a tight cup [kPa]: an ejector's at 4 bar of compressed air or more has 50 to 85."""
 _HEAD = """Cell {name}: cameras, bin, parts and what is randomized. Meaning, unit and allowed values stand above each setting.
 Lines that begin with # and a key, as in #seed = 7, are examples: remove the # to use them.
 
@@ -76,6 +79,9 @@ def cell_toml(cell: NewCell, name: str) -> str:
     lines += _title("Bin")
     lines += _section("bins", {"kind": "own"}, {"shift": (0.02, 0.02), "yaw": 5.0})
     lines += _table("[[bin]]", "bin", shape, shapes)
+    lines += _title("Gripper")
+    lines += _section("gripper", {"cup_width": Gripper().cup_width}, {})
+    lines += _section("suction", {"vacuum": VACUUM, "flow": FLOW, "compliance": COMPLIANCE}, {})
     lines += _title("Parts")
     lines += _section("arrangement", {"volume": volume, "max_objects": _FEW}, {})
     lines += _section("objects", parts, {} if cell.models else {"unit": "mm", "symmetries": "detect"})

@@ -15,7 +15,7 @@ from synpick_warp.configs.calibration.sensor_presets import sensor_settings
 from synpick_warp.configs.calibration.tables import fill_tables
 from synpick_warp.configs.cell.bins import BinRow, check_meshes
 from synpick_warp.configs.cell.cameras import Cameras
-from synpick_warp.configs.cell.gripper import Gripper
+from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
 from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows, settings_of
@@ -31,6 +31,8 @@ CAMERA = "camera"
 _OFFERED = "offered splits"
 """Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
+_PRESET = "in the preset"
+"""Begin of the source of settings of a preset."""
 _OF_SPLITS = ("bake.mode", "bake.episodes")
 """Settings from which splits are resolved."""
 
@@ -84,7 +86,7 @@ def load_config(
             values[SPLITS] = (override_table(values.get(SPLITS, ({}, ""))[0], name, value, source), source)
         else:
             values |= _section_values(section, {name: value}, source)
-    config = _build(values, source if settings else "")
+    config = _follow(_build(values, source if settings else ""), values)
     _check_conflicts(config, values)
     if measure is not None and (found := measure(config.bin, config.gripper)):
         config = dataclasses.replace(config, **found)
@@ -115,8 +117,15 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
         found = _section_values(section, {name: value}, source)
         values |= found
         config = config.with_values({name: pair[0] for name, pair in found.items()})
+    config = _follow(config, values)
     _check_conflicts(config, values)
     return config
+
+
+def _follow(config: Config, values: Values) -> Config:
+    """Configuration whose suction follows from its vacuum, but for what is set beside it, other than in a preset."""
+    fixed = {key.partition(".")[2] for key, (_, source) in values.items() if key.startswith("suction.") and _PRESET not in source}
+    return dataclasses.replace(config, suction=follow_vacuum(config.gripper, config.suction, fixed))
 
 
 def _check_conflicts(config: Config, values: Values) -> None:
@@ -231,7 +240,7 @@ def _preset_values(name: str) -> Values:
     """Values of a preset that is there, read once a process: presets come with the program."""
     document = _parse(_folder() / f"{name}.toml")
     base = document.pop(_BASE, None)
-    return _override(_preset_values(base) if base else {}, document, f"in the preset {name}")
+    return _override(_preset_values(base) if base else {}, document, f"{_PRESET} {name}")
 
 
 def _parse(path: Path) -> dict[str, Any]:

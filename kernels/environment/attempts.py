@@ -96,7 +96,7 @@ def judge_attempts_kernel(
     outcome: wp.array[int],  # (world)
     hits: wp.array[wp.vec2i],  # (world)
     attached_words: wp.array2d[wp.uint32],  # (world, word)
-    peak_force: wp.array[float],  # (world) [N]
+    peak: wp.array[wp.vec2],  # (world) [N]
     catalog_index: wp.array2d[int],  # (world, instance)
     removed: wp.array2d[int],  # (world, instance)
     body_slot: wp.array2d[int],  # (world, instance)
@@ -123,7 +123,7 @@ def judge_attempts_kernel(
     results_inout.outcome[world] = outcome[world]
     results_inout.picked[world] = picked
     results_inout.hits[world] = hits[world]
-    results_inout.peak_force[world] = wp.max(results_inout.peak_force[world], peak_force[world])
+    results_inout.peak_force[world] = wp.max(results_inout.peak_force[world], peak[world][0])
     results_inout.ticks[world] = results_inout.ticks[world] + 1
     results_inout.moved[world] = moved
     results_inout.farthest[world] = farthest

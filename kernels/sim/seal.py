@@ -234,15 +234,13 @@ def apply_seal_forces_kernel(
     attached_inout: wp.array2d[int],  # (world, instance)
     seal_force_inout: wp.array2d[float],  # (world, instance) [N]
     cup_force_inout: wp.array2d[float],  # (world, cup) [N]
-    peak_force_inout: wp.array[float],  # (world) [N]
-    load_inout: wp.array[float],  # (world)
+    peak_inout: wp.array[wp.vec2],  # (world) [N]
     joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
     """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
 
     `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `cup_force` their sum;
-    `peak_force` the maximum over seals and steps since it was cleared, and `load` that of a seal's force relative to its break force.
-    Launched over world.
+    `peak` the maximum over seals and steps since it was cleared, of forces, and of forces relative to the break force. Launched over world.
     """
     world = wp.tid()
     seals = int(0)
@@ -273,8 +271,7 @@ def apply_seal_forces_kernel(
             first_dof = gripper_dof + layout.gripper_dofs + 6 * body_slot[world, instance]
             seal_force_inout[world, instance] = force
             cup_force_inout[world, 0] = cup_force_inout[world, 0] + force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], force)
-            load_inout[world] = wp.max(load_inout[world], force / break_force[world, 0])
+            peak_inout[world] = wp.max(peak_inout[world], wp.vec2(force, force / break_force[world, 0]))
             if force > break_force[world, 0]:
                 attached_inout[world, instance] = 0
                 push_object(wp.vec3(), wp.vec3(), joint_f_inout, first_dof)

@@ -58,10 +58,8 @@ class HeldObject:
 
     cups: int
     """Bits of the cups whose seals did not break."""
-    peak_force: float
-    """Largest tension and shear of a seal, that of one that breaks included [N]."""
-    load: float
-    """Largest tension and shear of a seal relative to its break force."""
+    peak: wp.vec2
+    """Largest tension and shear of a seal, that of one that breaks included [N], and largest relative to its break force."""
     force: wp.vec3
     """On the object, in the world's axes [N]."""
     torque: wp.vec3
@@ -223,8 +221,7 @@ def share_wrench(
             grip_arm = wp.quat_rotate(solved.grip_rotation, cups.place[cup] - middle)
             force = force_of_cup(solved.whole, seals, arm, grip_arm, solved.spin, suction)
             borne = tension_and_shear(force, tcp.axis)
-            result.peak_force = wp.max(result.peak_force, borne)
-            result.load = wp.max(result.load, borne / break_force[world, cup])
+            result.peak = wp.max(result.peak, wp.vec2(borne, borne / break_force[world, cup]))
             cup_force[world, cup] = cup_force[world, cup] + borne
             if borne > break_force[world, cup]:
                 result.cups -= 1 << cup
@@ -253,16 +250,14 @@ def apply_array_forces_kernel(
     break_force_inout: wp.array2d[float],  # (world, cup) [N]
     seal_force_inout: wp.array2d[float],  # (world, instance) [N]
     cup_force_inout: wp.array2d[float],  # (world, cup) [N]
-    peak_force_inout: wp.array[float],  # (world) [N]
-    load_inout: wp.array[float],  # (world)
+    peak_inout: wp.array[wp.vec2],  # (world) [N]
     joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
     """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
 
     `seal_force` receives the largest force of an instance's seals in this step, that of a breaking one included, and 0 without a seal;
-    `cup_force` the sum over a cup's seals; `peak_force` the maximum over seals and steps since it was cleared, and `load` that of a seal's
-    force relative to its break force. Where a seal of a common valve breaks, the others are poor from the next step on. Launched over
-    world.
+    `cup_force` the sum over a cup's seals; `peak` the maximum over seals and steps since it was cleared, of forces, and of forces relative
+    to the break force. Where a seal of a common valve breaks, the others are poor from the next step on. Launched over world.
     """
     world = wp.tid()
     objects = int(0)
@@ -286,9 +281,8 @@ def apply_array_forces_kernel(
             mass, inertia = body_inv_mass[body], body_inv_inertia[body]
             seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction, cups)
             shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, cups, break_force_inout, cup_force_inout, joint_f_inout)
-            seal_force_inout[world, instance] = shared.peak_force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], shared.peak_force)
-            load_inout[world] = wp.max(load_inout[world], shared.load)
+            seal_force_inout[world, instance] = shared.peak[0]
+            peak_inout[world] = wp.max(peak_inout[world], shared.peak)
             broken += held - shared.cups
             attached_inout[world, instance] = shared.cups
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot

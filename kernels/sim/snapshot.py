@@ -129,7 +129,8 @@ def pack_status_kernel(
     outcome: wp.array[int],  # (world)
     target: wp.array[int],  # (world)
     hits: wp.array[wp.vec2i],  # (world)
-    peak_force: wp.array[float],  # (world) [N]
+    peak: wp.array[wp.vec2],  # (world) [N]
+    break_force: wp.array2d[float],  # (world, cup) [N]
     # Out:
     status_out: wp.array2d[int],  # (world, status)
     measure_out: wp.array2d[float],  # (world, measure)
@@ -152,7 +153,13 @@ def pack_status_kernel(
     if attempt[world] >= 0:
         status_out[world, Status.HITS] = hits[world][0]
         status_out[world, Status.SEALED] = hits[world][1]
-    measure_out[world, Measure.PEAK_FORCE] = peak_force[world]
+    measure_out[world, Measure.PEAK_FORCE] = peak[world][0]
+    least = float(0.0)
+    for cup in range(break_force.shape[1]):
+        force = break_force[world, cup]
+        if force > 0.0 and (least == 0.0 or force < least):
+            least = force
+    measure_out[world, Measure.BREAK_FORCE] = least
 
 
 @wp.kernel

@@ -243,18 +243,13 @@ def place_near_kernel(
 def watch_seals_kernel(
     # State:
     attached: wp.array2d[int],  # (world, instance)
-    load: wp.array[float],  # (world)
     # Out:
     progress_inout: Progress,
 ):
-    """Count the steps with an attached object and update the largest load of running attempts; once a step, after the seal forces.
-
-    Launched over world.
-    """
+    """Count the steps with an attached object in running attempts; once a step, after the seal forces. Launched over world."""
     world = wp.tid()
     if progress_inout.trial[world] < 0 or progress_inout.settling[world] != ATTEMPT:
         return
-    progress_inout.load[world] = wp.max(progress_inout.load[world], load[world])
     for instance in range(attached.shape[1]):
         if attached[world, instance] != 0:
             progress_inout.held[world] = progress_inout.held[world] + 1
@@ -316,7 +311,7 @@ def judge_trials_kernel(
     outcome: wp.array[int],  # (world)
     hits: wp.array[wp.vec2i],  # (world)
     attached_words: wp.array2d[wp.uint32],  # (world, word)
-    peak_force: wp.array[float],  # (world) [N]
+    peak: wp.array[wp.vec2],  # (world) [N]
     catalog_index: wp.array2d[int],  # (world, instance)
     removed: wp.array2d[int],  # (world, instance)
     body_slot: wp.array2d[int],  # (world, instance)
@@ -328,8 +323,8 @@ def judge_trials_kernel(
 ):
     """Write labels of trials at the end of a tick: of the attempt at its outcome, and of collateral motion `settle_ticks` later.
 
-    The latter free the world for its next trial, and increment `done`. Before the outcome, duration and peak force are updated. An episode
-    that ends also ends its trial. Launched over world.
+    The latter free the world for its next trial, and increment `done`. Before the outcome, duration, peak force and load are updated. An
+    episode that ends also ends its trial. Launched over world.
     """
     world = wp.tid()
     trial = progress_inout.trial[world]
@@ -338,7 +333,8 @@ def judge_trials_kernel(
     settling = progress_inout.settling[world] - 1
     if progress_inout.settling[world] == ATTEMPT:
         progress_inout.ticks[world] = progress_inout.ticks[world] + 1
-        progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak_force[world])
+        progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak[world][0])
+        progress_inout.load[world] = wp.max(progress_inout.load[world], peak[world][1])
         if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
             return
         picked = int(-1)

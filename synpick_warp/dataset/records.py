@@ -171,6 +171,7 @@ class Attempt(AttemptKey):
     peak_force: Annotated[list[Amount], msgspec.Meta(max_length=100_000)]
     observation: Observation
     sealed: Annotated[list[Index], msgspec.Meta(max_length=MAX_CUPS)] | None = None
+    break_force: Amount | None = None
 
     def __post_init__(self) -> None:
         _check_name("outcome", self.outcome, names(Outcome)[1:])

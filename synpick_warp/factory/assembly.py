@@ -16,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.cell.cameras import COLOR
+from synpick_warp.configs.cell.gripper import describe_forces
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -272,6 +273,8 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
     picks = may_pick(config.bake, config.splits)
     if picks:
         check_reach(config.gripper, config.suction, catalog)
+        if config.bake.models and config.suction.vacuum is None:
+            progress.note(describe_forces(config.gripper, config.suction))
     for line in describe_blocked(picks, config.rig, config.cell.bins, config.gripper, config.pick):
         progress.note(line)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config

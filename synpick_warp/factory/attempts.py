@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,8 @@ class AttemptRecord:
     hits: int
     """Rays that hit an object when suction was switched on."""
     good_seal: bool
-    """True if at most `suction.tolerated_misses` rays of each cup missed, so that seals had the break force of a good seal."""
+    """True if at most `suction.tolerated_misses` rays of each cup missed, so that seals had the break force of a good seal; with
+    `suction.vacuum`, if leaks left at least half of it below each cup."""
     engaged: tuple[int, ...]
     """Engaged instances: those that rays hit."""
     picked: tuple[int, ...]
@@ -99,6 +100,8 @@ class AttemptRecord:
     observation: ObservationRecord
     sealed: tuple[int, ...] | None = None
     """Cups with a good seal; None, and not in the file, for a gripper of one cup."""
+    break_force: float | None = None
+    """Least break force of the cups that had something below them [N]; None, and not in the file, without `suction.vacuum` or hits."""
 
     def line(self, bin: Mapping[str, Any] | None = None) -> str:
         """Serialize the record as one line of JSON with line break; `bin`: record of the episode's bin, if it is not a tote in its place.
@@ -108,7 +111,7 @@ class AttemptRecord:
         """
         record: dict[str, Any] = {}
         for item in fields(self):
-            if item.name != "sealed" or self.sealed is not None:
+            if item.default is MISSING or getattr(self, item.name) is not None:
                 record[item.name] = getattr(self, item.name)
             if item.name == "outcome":
                 record |= {item.name: self.outcome.name.lower(), "sentence": name_bin(self.outcome.sentence, bin)}
@@ -185,7 +188,8 @@ class AttemptLog:
         self.object_ids = np.append(object_ids, -1)
         self.distractors = distractors or {}
         self.resolution = resolution
-        self.rays, self.cups = cups * suction.rays, cups
+        self.rays, self.cups = cups * sum(suction.rings), cups
+        self.is_measured = suction.vacuum is not None
         self._running: dict[int, _Running] = {}
 
     def update(self, report: TickReport) -> dict[int, EpisodeRecord]:
@@ -276,6 +280,7 @@ class AttemptLog:
                 picked=_instances(report.attached[world], running.distractors),
                 peak_force=tuple(running.forces),
                 sealed=sealed if self.cups > 1 else None,
+                break_force=_round(report.measure("break_force")[world]) if hits and self.is_measured else None,
             )
         )
         running.planned = None

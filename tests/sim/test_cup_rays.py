@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.collision.hull_planes import hull_planes
+from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.suction import SuctionHold
 from tests.twins import suction as twin
@@ -33,10 +34,12 @@ PLACE = np.array([0.05, -0.03, 0.1])
 class Cups(KernelWorlds):
     """Worlds whose cups press for long enough, with room for four objects."""
 
-    def __init__(self, device, worlds: int = 1, surface: str = "hull", cups=((0.0, 0.0),), **suction) -> None:
-        super().__init__(
-            device, worlds, 3, 4, compound=np.array([0, 0, 1]), pick={"press_steps": PRESS_STEPS}, move={"tcp_offset": TIP}, cups=cups
-        )
+    def __init__(
+        self, device, worlds: int = 1, surface: str = "hull", cups=((0.0, 0.0),), objects: Catalog = ENTRIES, config=None, **suction
+    ) -> None:
+        given = {"pick": {"press_steps": PRESS_STEPS}, "move": {"tcp_offset": TIP}, "cups": cups}
+        compound = np.array([len(entry.pieces) > 1 for entry in objects.entries], int)
+        super().__init__(device, worlds, len(compound), 4, compound=compound, **given)
         filled(
             self.scene.suction,
             {
@@ -49,9 +52,9 @@ class Cups(KernelWorlds):
                 **suction,
             },
         )
-        meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
-        config = load_config("smoke", {"suction.surface": surface})
-        self.suction = SuctionHold(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
+        meshes, keep = build_meshes([entry.mesh for entry in objects.entries], len(objects), device)
+        config = config or load_config("smoke", {"suction.surface": surface})
+        self.suction = SuctionHold(config.suction, objects, SimpleNamespace(meshes=meshes, keep=keep), device)
         self.begin(Phase.ACT)
         self.set(self.state.catalog_index, -1)
         # Slots in an order of their own.

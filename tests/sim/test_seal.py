@@ -70,14 +70,14 @@ def test_at_rest_the_seal_force_is_the_weight_and_a_good_seal_lifts_everything(t
     # Stretched by no more than the paper's compliance.
     tcp = poses[:, 1, 2] - table.config.gripper.cup_length
     np.testing.assert_allclose(poses[:, 2, 2] + table.size[:, 0, 2] / 2, tcp, atol=5e-3)
-    np.testing.assert_allclose(table.seals.peak_force.numpy(), seal_force.max(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(table.seals.peak.numpy()[:, 0], seal_force.max(axis=0), rtol=1e-5)
 
 
 def test_a_poor_seal_holds_the_marker_and_drops_what_is_heavy(table):
     table.start(under(table), break_force=2.0)
     table.speed[2] = LIFT
     seal_force = table.run(150)[:, :, 0]
-    np.testing.assert_array_equal(table.seals.peak_force.numpy(), seal_force.max(axis=0))
+    np.testing.assert_array_equal(table.seals.peak.numpy()[:, 0], seal_force.max(axis=0))
     attached = table.seals.attached.numpy()[:, 0]
     assert attached[0] == 1
     assert (attached[MASSES > 0.21] == 0).all()
@@ -85,8 +85,8 @@ def test_a_poor_seal_holds_the_marker_and_drops_what_is_heavy(table):
     assert (np.diff(attached) <= 0).all()
     # The force that breaks a seal is recorded, too: in one step of each object that is dropped.
     assert (np.sort(seal_force, axis=0)[-2] <= 2.0).all()
-    assert (table.seals.peak_force.numpy()[attached == 0] > 2.0).all()
-    assert (table.seals.peak_force.numpy()[attached == 1] <= 2.0).all()
+    assert (table.seals.peak.numpy()[:, 0][attached == 0] > 2.0).all()
+    assert (table.seals.peak.numpy()[:, 0][attached == 1] <= 2.0).all()
     # Dropped objects feel no force any more, and fall.
     force = table.physics.control.joint_f.numpy().reshape(len(MASSES), -1)[:, build.GRIPPER_DOFS :]
     assert (force[attached == 0] == 0.0).all()
@@ -273,7 +273,7 @@ def scripted(
     worlds.set(worlds.seals.attached, attached)
     worlds.set(worlds.seals.break_force, break_force)
     worlds.set(worlds.seals.seal_force, 9.0)
-    worlds.set(worlds.seals.peak_force, 1.0)
+    worlds.set(worlds.seals.peak, [1.0, 0.0])
     worlds.set(worlds.physics.control.joint_f, 7.0)
     return worlds
 
@@ -364,5 +364,5 @@ def test_wrenches_are_those_of_the_twin_and_detached_objects_feel_none(seed, too
     np.testing.assert_allclose(worlds.seals.seal_force.numpy()[0], seal_forces, rtol=3e-4, atol=atol)
     np.testing.assert_allclose(worlds.seals.cup_force.numpy()[0], cup_forces, rtol=3e-4, atol=atol)
     assert worlds.seals.attached.numpy()[0].tolist() == kept
-    assert worlds.seals.peak_force.numpy()[0] == pytest.approx(peak_force, rel=3e-4, abs=atol)
-    assert worlds.seals.load.numpy()[0] == pytest.approx(max(seal_forces) / break_force, rel=3e-4, abs=atol)
+    assert worlds.seals.peak.numpy()[0, 0] == pytest.approx(peak_force, rel=3e-4, abs=atol)
+    assert worlds.seals.peak.numpy()[0, 1] == pytest.approx(max(seal_forces) / break_force, rel=3e-4, abs=atol)

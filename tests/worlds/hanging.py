@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-import warp as wp
 
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
+from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
 from tests.twins.raycast import rotation_of
@@ -31,14 +32,21 @@ ROOM = 0.02
 class Hanging:
     """Worlds in which every object is attached by a seal from the start; object `instance` of world `world` has its own mass."""
 
-    def __init__(self, device, masses: Sequence[Sequence[float]], sizes: Sequence[Sequence[Size]], **overrides: object) -> None:
-        """Masses [kg] and sizes [m], by world and instance."""
+    def __init__(
+        self,
+        device,
+        masses: Sequence[Sequence[float]],
+        sizes: Sequence[Sequence[Size]] = (),
+        shapes: Sequence[Any] = (),
+        **overrides: object,
+    ) -> None:
+        """Masses [kg] and sizes [m] of boxes, or other objects of a catalog, by world and instance."""
         self.mass = np.asarray(masses, float)
         self.worlds, self.instances = self.mass.shape
-        self.size = np.asarray(sizes, float).reshape(self.worlds, self.instances, 3)
+        self.size = np.asarray(sizes or np.zeros((*self.mass.shape, 3)), float).reshape(*self.mass.shape, 3)
         room = {"arrangement__max_objects": self.instances, "arrangement__volume": ROOM * self.instances}
         self.config = settings(bake__worlds=self.worlds, **{**COARSE, **room, **overrides})
-        boxes = catalog(*[(tuple(size),) for size in self.size.reshape(-1, 3)]).entries
+        boxes = shapes or catalog(*[(tuple(size),) for size in self.size.reshape(-1, 3)]).entries
         entries = tuple(
             replace(box, mass=mass, inertia=box.inertia * mass / box.mass) for box, mass in zip(boxes, self.mass.reshape(-1), strict=True)
         )
@@ -50,10 +58,9 @@ class Hanging:
         sizes = (self.worlds, self.instances, self.config.move.rounds, built.layout.bodies_per_world, len(built.head.cups))
         extents = world_sizes(*sizes)
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
-        meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-        self.suction = BEHAVIORS[self.config.gripper.kind].hold(
-            self.config.suction, objects, SimpleNamespace(meshes=meshes, keep=()), device
-        )
+        meshes, keep = build_meshes([entry.mesh for entry in entries], len(entries), device)
+        scene = SimpleNamespace(meshes=meshes, keep=keep)
+        self.suction = BEHAVIORS[self.config.gripper.kind].hold(self.config.suction, objects, scene, device)
         order = np.arange(self.mass.size).reshape(self.mass.shape)
         self.state.catalog_index.assign(order)
         self.state.body_slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))
@@ -80,7 +87,7 @@ class Hanging:
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
         self.seals.attached.fill_((1 << self.scene.cups.count) - 1)
         self.seals.break_force.fill_(break_force)
-        self.seals.peak_force.zero_()
+        self.seals.peak.zero_()
         self.setpoint[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
 
     def run(self, steps: int) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import trimesh
+from scipy.spatial.distance import pdist
 
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
@@ -76,6 +77,12 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
     parts = pieces(sizes)
     whole = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
     whole.unmerge_vertices()
+    return replace(solid(whole, parts), obj_id=obj_id, name=f"boxes_{obj_id}")
+
+
+def solid(whole: trimesh.Trimesh, parts: tuple[ConvexPiece, ...] = ()) -> CatalogEntry:
+    """Object 1 of a mesh [m] and its collision shape, by default the hull."""
+    parts = parts or (simplify_hull(whole.vertices, 64),)
     vertices = np.asarray(whole.vertices, np.float32)
     mesh = TriangleMesh(
         vertices, np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32), np.zeros((len(vertices), 2), np.float32)
@@ -83,8 +90,8 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
     properties = mass_properties(parts)
     mass = DENSITY * properties.volume
     return CatalogEntry(
-        obj_id=obj_id,
-        name=f"boxes_{obj_id}",
+        obj_id=1,
+        name="solid",
         mesh=mesh,
         material=Material((0.6, 0.5, 0.4), None, 0.0, 0.5),
         pieces=parts,
@@ -93,7 +100,7 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
         mass=mass,
         center_of_mass=properties.center_of_mass,
         inertia=mass * properties.unit_inertia,
-        diameter=float(np.linalg.norm(vertices[:, None] - vertices[None], axis=2).max()),
+        diameter=float(pdist(np.concatenate([part.vertices for part in parts])).max()),
         symmetries_discrete=(),
         symmetries_continuous=(),
         source=None,

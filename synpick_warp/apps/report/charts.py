@@ -268,7 +268,9 @@ def _forces(source: Source) -> Chart | None:
     if not rows or source.config is None:
         return None
     suction = source.config.suction
-    rules = [_limit(suction.poor_force, "poor seal breaks", "left"), _limit(suction.good_force, "good seal breaks", "right")]
+    rules = [_limit(suction.good_force, "good seal breaks" if suction.vacuum is None else "tight seal breaks", "right")]
+    if suction.vacuum is None:
+        rules.insert(0, _limit(suction.poor_force, "poor seal breaks", "left"))
     bars = _histogram(rows, FORCE_BIN, (_FORCE, "attempts"), "~g", top=-(-suction.good_force // FORCE_BIN) * FORCE_BIN)
     spec = {"height": bars.pop("height"), "layer": [bars, *rules]}
     caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."

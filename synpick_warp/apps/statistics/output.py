@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from synpick_warp.apps.statistics.attempts import NEAR
 from synpick_warp.apps.statistics.compute import OTHER_OBJECTS, Statistics
 from synpick_warp.apps.statistics.tables import PAPER, TIMELINE, make_tables
 from synpick_warp.errors import OutputError, escape
@@ -84,6 +85,10 @@ def print_statistics(console: Console, statistics: Statistics, paper: bool | Non
     for sentence in statistics.missing:
         if shown or sentence != OTHER_OBJECTS:
             console.print(f"missing: {escape(sentence)}", markup=False, soft_wrap=True)
+    load = statistics.total.episodes.largest_load
+    if load is not None and load < NEAR:
+        line = f"no seal was loaded beyond {load} % of its break force: no pick depended on how strong suction is"
+        console.print(line, markup=False, soft_wrap=True)
     if paper is None and statistics.paper and not shown:
         console.print("the objects are not those of the paper; --paper shows its numbers beside these", markup=False, soft_wrap=True)
 

@@ -60,7 +60,7 @@ class Partial:
         known, source = data_set[episode], data_set.folder / f"{episode_entry(episode)}.json"
         row = check_content(known.row, EpisodeFacts, source)
         attempts = [check_content(attempt, AttemptFacts, source) for attempt in known.attempts]
-        self.episodes.add_episode(group_of(data_set, episode, row), row, attempts)
+        self.episodes.add_episode(group_of(data_set, episode, row), row, attempts, data_set.config.suction if attempts else None)
         self.looks.add_episode(row.looks)
         if row.bin is not None:
             self.bins.add_episode(row.bin)

@@ -50,6 +50,8 @@ class AttemptFacts(msgspec.Struct):
     engaged: Annotated[list[Index], Meta(max_length=255)] = []
     peak_force: Annotated[list[Annotated[float, Meta(ge=0.0, le=1e9)]], Meta(max_length=100_000)] = []
     """Largest force on any seal in each tick of the lift [N]."""
+    break_force: Annotated[float, Meta(ge=0.0, le=1e9)] | None = None
+    """Least break force of its seals [N]; None: that of the settings."""
 
 
 class Light(msgspec.Struct, gc=False):

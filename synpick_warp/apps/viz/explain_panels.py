@@ -113,7 +113,7 @@ def load_chart(attempt: Attempt, suction: Suction, tick_time: float, width: int,
     y = axis("y", None, 0.0, peak, tickCount=4)
     times = np.linspace(0.0, span, max(2, len(attempt.peak_force)))[: len(attempt.peak_force)]
     label = {"align": "left", "baseline": "bottom", "x": 8, "dy": -3, "color": _RED, "fontSize": _FONT}
-    rule = limit({"y": {**y, "field": "limit"}, "x": None}, breaks, f"breaks at {breaks:g} N", {"color": _RED, "strokeWidth": 2}, label)
+    rule = limit({"y": {**y, "field": "limit"}, "x": None}, breaks, f"breaks at {breaks:.3g} N", {"color": _RED, "strokeWidth": 2}, label)
     curve = line(2.5, {"value": _BLUE}, dots=_DOT if len(times) < _MAX_DOTS else 0.0)
     x = axis("x", "time since the suction was switched on [s]", -0.01 * span, 1.01 * span, tickCount=8)
     return {

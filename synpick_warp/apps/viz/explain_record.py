@@ -216,8 +216,8 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
     if attempt.hits:
         seal = f"{'good' if attempt.good_seal else 'poor'} seal, breaks"
         if attempt.sealed is not None:
-            seal = f"{len(attempt.sealed)} of {attempt.rays // suction.rays} cups with a good seal, break"
-        lines[0] += f"; {seal} at {break_force(attempt, suction):g} N"
+            seal = f"{len(attempt.sealed)} of {attempt.rays // sum(suction.rings)} cups with a good seal, break"
+        lines[0] += f"; {seal} at {break_force(attempt, suction):.3g} N"
         peak = f"; largest force {max(attempt.peak_force):.1f} N" if attempt.peak_force else ""
         lines.append(f"engaged: {_listed(attempt.engaged, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
@@ -225,7 +225,9 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
 
 
 def break_force(attempt: Attempt, suction: Suction) -> float:
-    """Force at which the strongest seal of the attempt breaks [N]."""
+    """Force at which the strongest seal of the attempt breaks, or with `suction.vacuum` the weakest [N]."""
+    if attempt.break_force is not None:
+        return attempt.break_force
     return suction.good_force if attempt.good_seal or attempt.sealed else suction.poor_force
 
 

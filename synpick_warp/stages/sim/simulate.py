@@ -231,8 +231,7 @@ class Simulation:
         arrange.place_bins(scene, state, physics)
         gripper.set_shaft_collision(scene, state, physics)
         gripper.clear_seals(state, self.seals)
-        self.seals.peak_force.zero_()
-        self.seals.load.zero_()
+        self.seals.peak.zero_()
         if self.recorder is not None:
             self.recorder.begin_tick()
 

@@ -1,9 +1,11 @@
-"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, seal, seal_array and
-seal_contacts.
+"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, vacuum, seal, seal_array
+and seal_contacts.
 """
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import newton
@@ -11,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts
+from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts, vacuum
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
@@ -37,12 +39,30 @@ class SuctionHold:
         """
         self._meshes = render_scene.keep
         self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
+        self.mouth = None if settings.vacuum is None else _mouth_data(settings, device)
+        self.rays = sum(settings.rings)
+        self._scratch: dict[str, wp.array] = {}
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
         sources = (scene, state, attempts, physics.state)
-        launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, seals, self)
+        if self.mouth is None:
+            launch(cup_rays.count_seal_rays_kernel, len(state.phase), *sources, seals, self)
+        else:
+            self._evacuate(*sources, seals=seals)
         launch(cup_rays.engage_seals_kernel, state.catalog_index.shape, *sources, seals)
+
+    def _evacuate(self, *sources: Any, seals: SealState) -> None:
+        """Measure leaks below the cups, and attach what the vacuum that is left holds."""
+        cups, device = seals.break_force.shape, seals.break_force.device
+        rays = (*cups, self.rays)
+        if not self._scratch:
+            shapes = {"depth": (rays, wp.float32), "owner": (rays, wp.int32), "leak": (cups, vacuum.Leak)}
+            self._scratch = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in shapes.items()}
+        scratch = SimpleNamespace(**self._scratch)
+        launch(vacuum.cast_mouth_rays_kernel, rays, *sources, self, scratch)
+        launch(vacuum.measure_leaks_kernel, cups, *sources, self, scratch)
+        launch(vacuum.set_vacuum_kernel, cups[0], *sources, seals, self, scratch)
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Add the seals' wrenches to the joint forces of objects and gripper, and break overloaded seals.
@@ -78,4 +98,24 @@ def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp
         mesh=meshes,
         use_mesh=use_mesh,
         radius=wp.array(np.array(radius), dtype=wp.float32, device=device),
+    )
+
+
+def _mouth_data(settings: Suction, device: wp.Device) -> Any:
+    """Fill `MouthData`: rings of rays as far apart as the rays on the lip; each ray stands for its share of its ring's annulus."""
+    radius, rings = settings.radius, settings.rings
+    rows: list[tuple[float, float, float]] = []
+    for ring, count in enumerate(rings):
+        middle, half = 1.0 - ring / (len(rings) - 1), 0.5 / (len(rings) - 1)
+        area = math.pi * radius**2 * (min(middle + half, 1.0) ** 2 - max(middle - half, 0.0) ** 2) / count
+        angles = (math.tau * index / count for index in range(count))
+        rows += [(middle * radius * math.cos(angle), middle * radius * math.sin(angle), area) for angle in angles]
+    return fill(
+        vacuum.MouthData,
+        settings,
+        ray=wp.array(np.array(rows), dtype=wp.vec3, device=device),
+        lip=settings.rays,
+        compliance=2.0 * radius * (settings.compliance or 0.0),
+        tilt=math.tan(math.radians(settings.swing_limit)),
+        pressure=1e3 * (settings.vacuum or 0.0),
     )

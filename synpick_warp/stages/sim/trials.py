@@ -71,14 +71,14 @@ class TrialLaw(gripper.TwoSpeedLaw):
 
 
 class WatchedHold:
-    """Decorator of a hold that accumulates its forces in the struct `Progress`, in each step."""
+    """Decorator of a hold that counts in the struct `Progress` how long it holds, in each step."""
 
     def __init__(self, hold: Hold, progress: Any) -> None:
         self.hold, self.progress = hold, progress
         self.engage, self.ignore_contacts = hold.engage, hold.ignore_contacts
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
-        """Apply the seal forces, then update steps held and largest load."""
+        """Apply the seal forces, then update steps held."""
         self.hold.apply_forces(scene, state, seals, physics, current)
         launch(kernels.watch_seals_kernel, len(state.phase), seals, progress=self.progress)
 

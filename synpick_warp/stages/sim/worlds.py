@@ -108,10 +108,8 @@ class SealState:
     """Force of tension and shear of each cup, summed over the instances that it holds."""
     break_force: wp.array = device_array("world", "cup", dtype=wp.float32, unit="N")
     """Break force of a cup's seals."""
-    peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
-    """Largest seal force since the beginning of the tick, including seals that broke."""
-    load: wp.array = device_array("world", dtype=wp.float32)
-    """Largest seal force relative to the seal's break force since the beginning of the tick, likewise."""
+    peak: wp.array = device_array("world", dtype=wp.vec2f, unit="N")
+    """Largest seal force since the beginning of the tick, including seals that broke, and largest relative to the seal's break force."""
 
 
 @dataclass(frozen=True, eq=False)

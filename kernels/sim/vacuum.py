@@ -1,0 +1,285 @@
+"""Vacuum of suction cups: rays over a cup's mouth find where air enters, and the flow balance of leak and ejector gives the break force.
+
+Air enters where the mouth is not covered by the object that the cup seals with, and below the lip where the surface falls away faster than
+the lip follows. The ejector's characteristic is linear, p = p₀ (1 - Q / Q₀), and a leak of area A is an orifice, Q = C_d A sqrt(2 p / ρ).
+With s = sqrt(p / p₀) and k = A C_d sqrt(2 p₀ / ρ) / Q₀ that is s² + k s = 1. A cup holds p times the covered area of its mouth.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.bitsets import pack_word
+from synpick_warp.kernels.rng import TAU
+from synpick_warp.kernels.sim.cup_rays import CUP, SurfaceData, cast_ray, suction_begins, tcp_pose
+from synpick_warp.kernels.structs import CupData, LayoutData, PickData, SuctionData
+
+wp.set_module_options({"enable_backward": False})
+
+BACK = wp.constant(0.01)
+"""Rays start this far above the lip [m]: a mesh can stand out of the collision shape on which the cup rests."""
+GOOD = wp.constant(0.5)
+"""A seal is good if at least this fraction of the vacuum is left, as a vacuum switch confirms a part."""
+
+
+@wp.struct
+class MouthData:
+    """Rays over the mouth of a cup, its lip and its ejector; see `configs.cell.gripper.Suction`."""
+
+    ray: wp.array[wp.vec3]
+    """(ray): place x, y in the TCP frame [m] and share of the mouth's area [m²]; those on the lip first, by angle."""
+    lip: int
+    """Rays on the lip."""
+    radius: float
+    """Radius of the lip [m]."""
+    compliance: float
+    """Height that the lip follows [m]."""
+    tilt: float
+    """Largest slope of a surface on which the lip lies flat, since the cup tilts."""
+    pressure: float
+    """Vacuum of a tight cup, p₀ [Pa]."""
+    leak: float
+    """k of a leak, by its area [1/m²]."""
+
+
+@wp.struct
+class Leak:
+    """Where air enters below a cup."""
+
+    instance: int
+    """Instance that the cup seals with; -1: none."""
+    hits: int
+    """Rays that hit it."""
+    covered: float
+    """Area of the mouth that it covers [m²]."""
+    open: float
+    """Area through which air enters [m²]."""
+
+
+@wp.func
+def surface_below(
+    start: wp.vec3,
+    direction: wp.vec3,
+    layout: LayoutData,
+    suction: SuctionData,
+    surface: SurfaceData,
+    world: int,
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+):
+    """Distance to the first surface along a ray [m] and its instance, -1 without one.
+
+    A ray passes through the whole of each object: it ends at the bottom of a pocket, however deep, but not in a hole.
+    """
+    nearest = float(0.0)
+    hit = int(-1)
+    for instance in range(layout.instances):
+        index = catalog_index[world, instance]
+        if index >= 0:
+            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+            radius = surface.radius[index]
+            length = BACK + suction.reach + 2.0 * radius
+            if wp.length(wp.transform_get_translation(pose) - start) <= radius + length:
+                distance = cast_ray(start, direction, length, pose, index, surface)
+                if distance >= 0.0 and (hit < 0 or distance < nearest):
+                    nearest = distance
+                    hit = instance
+    return nearest, hit
+
+
+@wp.kernel
+def cast_mouth_rays_kernel(
+    # Scene:
+    layout: LayoutData,
+    pick: PickData,
+    suction: SuctionData,
+    cups: CupData,
+    surface: SurfaceData,
+    mouth: MouthData,
+    # State:
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    # Out:
+    depth_out: wp.array3d[float],  # (world, cup, ray) [m]
+    owner_out: wp.array3d[int],  # (world, cup, ray)
+):
+    """Write what lies below each ray of a cup's mouth where suction is switched on: instance, -1 for none, and its depth below the lip.
+
+    Launched over world, cup, ray.
+    """
+    world, cup, ray = wp.tid()
+    if not suction_begins(phase[world], task[world], steps[world], pick):
+        return
+    tcp_in_world = tcp_pose(body_q[world * layout.bodies + CUP], cups.place[cup])
+    place = mouth.ray[ray]
+    start = wp.transform_point(tcp_in_world, wp.vec3(place[0], place[1], BACK))
+    direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
+    distance, hit = surface_below(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
+    depth_out[world, cup, ray] = distance - BACK
+    owner_out[world, cup, ray] = hit
+
+
+@wp.func
+def count_owner(instance: int, world: int, cup: int, reach: float, depth: wp.array3d[float], owner: wp.array3d[int]) -> int:
+    """Number of a cup's rays that hit an instance within reach."""
+    count = int(0)
+    for ray in range(owner.shape[2]):
+        if owner[world, cup, ray] == instance and depth[world, cup, ray] <= reach:
+            count += 1
+    return count
+
+
+@wp.func
+def lip_slope(
+    instance: int, world: int, cup: int, reach: float, mouth: MouthData, depth: wp.array3d[float], owner: wp.array3d[int]
+) -> wp.vec2:
+    """Slope of the plane through the surface below the lip (least squares), to which the cup tilts; 0 where the lip stands out."""
+    slope = wp.vec2(0.0, 0.0)
+    for ray in range(mouth.lip):
+        if owner[world, cup, ray] != instance or depth[world, cup, ray] > reach:
+            return wp.vec2(0.0, 0.0)
+        slope += depth[world, cup, ray] * wp.vec2(mouth.ray[ray][0], mouth.ray[ray][1])
+    slope *= 2.0 / (float(mouth.lip) * mouth.radius * mouth.radius)
+    return slope * wp.min(1.0, mouth.tilt / wp.max(wp.length(slope), 1.0e-9))
+
+
+@wp.func
+def drop_below(ray: int, world: int, cup: int, slope: wp.vec2, mouth: MouthData, depth: wp.array3d[float]) -> float:
+    """Depth of the surface below the plane of the tilted lip at a ray [m]."""
+    place = mouth.ray[ray]
+    return depth[world, cup, ray] - slope[0] * place[0] - slope[1] * place[1]
+
+
+@wp.func
+def gap_below_lip(
+    ray: int,
+    instance: int,
+    world: int,
+    cup: int,
+    top: float,
+    slope: wp.vec2,
+    mouth: MouthData,
+    reach: float,
+    depth: wp.array3d[float],  # (world, cup, ray) [m]
+    owner: wp.array3d[int],  # (world, cup, ray)
+) -> float:
+    """Height of the gap between lip and surface at a ray of the lip [m].
+
+    The lip rests on the highest point below the mouth. It follows the surface down to its compliance c, and along its length with a slope
+    of at most c / r, that of a cylinder on which it just seals: the lowest position with both bounds that is nowhere below the surface.
+    """
+    lowest = float(mouth.compliance)
+    for other in range(mouth.lip):
+        if owner[world, cup, other] == instance and depth[world, cup, other] <= reach:
+            apart = wp.abs(ray - other)
+            way = mouth.compliance * TAU * float(wp.min(apart, mouth.lip - apart)) / float(mouth.lip)
+            lowest = wp.min(lowest, drop_below(other, world, cup, slope, mouth, depth) - top + way)
+    return drop_below(ray, world, cup, slope, mouth, depth) - top - lowest
+
+
+@wp.kernel
+def measure_leaks_kernel(
+    # Scene:
+    pick: PickData,
+    suction: SuctionData,
+    mouth: MouthData,
+    # State:
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    # In:
+    depth: wp.array3d[float],  # (world, cup, ray) [m]
+    owner: wp.array3d[int],  # (world, cup, ray)
+    # Out:
+    leak_out: wp.array2d[Leak],  # (world, cup)
+):
+    """Measure where air enters below each cup where suction is switched on.
+
+    A cup seals with the instance that most of its rays hit, the first of several: between two objects, or beside one, air enters. Launched
+    over world, cup.
+    """
+    world, cup = wp.tid()
+    if not suction_begins(phase[world], task[world], steps[world], pick):
+        return
+    leak = Leak()
+    leak.instance = -1
+    for ray in range(owner.shape[2]):
+        instance = owner[world, cup, ray]
+        if instance >= 0 and (ray == 0 or owner[world, cup, ray - 1] != instance):
+            count = count_owner(instance, world, cup, suction.reach, depth, owner)
+            if count > leak.hits or (count == leak.hits and instance < leak.instance):
+                leak.instance = instance
+                leak.hits = count
+    slope = lip_slope(leak.instance, world, cup, suction.reach, mouth, depth, owner)
+    top = float(suction.reach)
+    for ray in range(owner.shape[2]):
+        covered = leak.instance >= 0 and owner[world, cup, ray] == leak.instance
+        if covered and (ray >= mouth.lip or depth[world, cup, ray] <= suction.reach):
+            leak.covered += mouth.ray[ray][2]
+            top = wp.min(top, drop_below(ray, world, cup, slope, mouth, depth))
+        else:
+            leak.open += mouth.ray[ray][2]
+    arc = TAU * mouth.radius / float(mouth.lip)
+    for ray in range(mouth.lip):
+        if leak.instance >= 0 and owner[world, cup, ray] == leak.instance and depth[world, cup, ray] <= suction.reach:
+            leak.open += arc * gap_below_lip(ray, leak.instance, world, cup, top, slope, mouth, suction.reach, depth, owner)
+    leak_out[world, cup] = leak
+
+
+@wp.func
+def vacuum_left(open: float, mouth: MouthData) -> float:
+    """Vacuum relative to that of a tight cup, s², with a leak of an area [m²]: s² + k s = 1."""
+    k = mouth.leak * open
+    s = 2.0 / (k + wp.sqrt(k * k + 4.0))
+    return s * s
+
+
+@wp.kernel
+def set_vacuum_kernel(
+    # Scene:
+    layout: LayoutData,
+    pick: PickData,
+    cups: CupData,
+    mouth: MouthData,
+    # State:
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    # In:
+    leak: wp.array2d[Leak],  # (world, cup)
+    # Out:
+    hits_out: wp.array[wp.vec2i],  # (world)
+    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
+    attached_inout: wp.array2d[int],  # (world, instance)
+    break_force_out: wp.array2d[float],  # (world, cup) [N]
+):
+    """Attach objects and set break forces where suction is switched on; outputs as of `count_seal_rays_kernel`.
+
+    A cup that has nothing below it has the break force 0. With a common valve the leaks of all cups add up. Launched over world.
+    """
+    world = wp.tid()
+    if not suction_begins(phase[world], task[world], steps[world], pick):
+        return
+    for instance in range(layout.instances):
+        attached_inout[world, instance] = 0
+    total = float(0.0)
+    for cup in range(cups.count):
+        total += leak[world, cup].open
+    hits = int(0)
+    sealed = int(0)
+    for cup in range(cups.count):
+        below = leak[world, cup]
+        left = vacuum_left(wp.where(cups.common_valve != 0, total, below.open), mouth)
+        break_force_out[world, cup] = mouth.pressure * left * below.covered
+        if below.instance >= 0:
+            hits += below.hits
+            attached_inout[world, below.instance] = attached_inout[world, below.instance] | (1 << cup)
+            if left >= GOOD:
+                sealed = sealed | (1 << cup)
+    hits_out[world] = wp.vec2i(hits, sealed)
+    for word in range(engaged_words_out.shape[1]):
+        engaged_words_out[world, word] = pack_word(attached_inout, catalog_index, world, word)
