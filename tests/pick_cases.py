@@ -1,4 +1,6 @@
-"""Rows of picks for tests/test_cases.py: tables that replace a data set's own are refused in one line, by every command that reads them."""
+"""Rows of picks for tests/test_cases.py: tables that replace a data set's own are refused in one line, by every command that reads them;
+parts that suction does not hold are not held in a new cell.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +8,10 @@ import shutil
 from functools import partial
 from pathlib import Path
 
+from synpick_warp.configs.cell.gripper import describe_forces
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.exporters.picks import pick_files
-from tests.builders import mistake
+from tests.builders import mistake, run
 from tests.worlds.box_sets import write_pick_set
 
 
@@ -21,6 +25,17 @@ def _is_refused(column: str, value: str, path: Path, out: Path) -> None:
     assert [path.name for path in out.iterdir()] == ["set"]
 
 
+def _has_physics(parts: Path, out: Path) -> None:
+    """Break forces follow from the vacuum, as `tests/sim/test_vacuum.py` measures on these parts; a bake without one tells its forces."""
+    assert run("new-cell", out / "cell", "--part", parts, "--unit", "mm").code == 0
+    cell = load_config(str(out / "cell/cell.toml"), {"gripper.cup_width": 0.022})
+    found = cell.suction.vacuum, cell.suction.surface, cell.suction.radius, round(cell.suction.good_force, 1)
+    assert found == (60.0, "mesh", 0.011, 22.8)
+    line = describe_forces(cell.gripper, load_config("smoke").suction)
+    assert line.startswith("suction: a seal breaks at 40 or 2 N, as in the paper, whatever cup")
+    assert "(full vacuum below this cup: 38.5 N)" in line
+
+
 ROWS = {
     f"picks/{name}.parquet": partial(_is_refused, *said)
     for name, said in {
@@ -29,4 +44,4 @@ ROWS = {
         "trials_point_floatnan": ("point", "[nan, nan, nan]"),
         "trials_state_-1": ("state", "-1"),
     }.items()
-}
+} | {"parts/suction_default_porous": _has_physics}

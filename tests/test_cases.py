@@ -28,7 +28,6 @@ PENDING = {
     "calibrations/ros_rational_cols5.yaml",
     "cells/decomposition_limit.toml",
     "parts/bin_wire",
-    "parts/suction_default_porous",
     "settings/posegl.toml",
 }
 
