@@ -27,7 +27,7 @@ from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, 
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.green_contexts import SmPartition, count_reserved
-from synpick_warp.system.inputs.urls import as_url
+from synpick_warp.system.inputs.urls import store_url
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 _SMALL = 1e-3
@@ -72,7 +72,7 @@ def print_forecast(config: Config, out: Path | None, episodes: Sequence[int]) ->
         fitted = fit_to_device(without_pictures(config), device, len(episodes), writers)
         terms = plan_memory(fitted, device, writers)
         forecast = forecast_settings(fitted, episodes, progress)
-        here = out is None or as_url(out) is None
+        here = out is None or store_url(out) is None
         folder = next((path for path in (Path(out or ".").absolute(), *Path(out or ".").absolute().parents) if path.is_dir()), Path("/"))
         if here:
             check_disk(forecast, folder, progress)
