@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
@@ -23,7 +24,7 @@ def run(capsys, *arguments: object) -> tuple[int, list[str], str]:
 def test_a_correct_set(good, capsys):
     code, lines, _ = run(capsys, good)
     assert code == 0
-    assert lines == ["6 scenes, 4 models, 12 views, 12 of them rendered again: 0 errors, 0 warnings"]
+    assert lines == ["3 scenes, 2 models, 6 views, 6 of them rendered again: 0 errors, 0 warnings"]
 
 
 def test_a_violation_is_one_line_with_its_cure(copy, capsys):
@@ -32,7 +33,17 @@ def test_a_violation_is_one_line_with_its_cure(copy, capsys):
     assert code == 1
     text = "image 1, instance 0: visib_fract is 0.5, but the counts give 1"
     assert lines[0].startswith(f"error {SCENE}/scene_gt_info.json: visible-fraction: {text}. To mend it: compute it")
-    assert lines[-1].endswith("12 views, 0 of them rendered again: 2 errors, 0 warnings") or lines[-1].endswith("1 errors, 0 warnings")
+    assert lines[-1].endswith("6 views, 0 of them rendered again: 2 errors, 0 warnings") or lines[-1].endswith("1 errors, 0 warnings")
+
+
+def test_nothing_is_rendered_without_models(copy, capsys):
+    """And what to add fits what is missing."""
+    for name in ("models", "models_eval"):
+        shutil.rmtree(copy / name)
+    _, lines, _ = run(capsys, copy)
+    assert "3 scenes, 0 models, 6 views, none of them rendered again, without models: " in lines[-1]
+    (said,) = [line for line in lines if line.startswith("warning models: set-files")]
+    assert said.endswith("poses are not checked against pixels. To mend it: add what is missing: tools read it without asking.")
 
 
 def test_warnings_alone_are_no_failure(copy, capsys):
@@ -82,8 +93,8 @@ def test_rules_are_listed(capsys):
 
 
 def test_a_sample_of_views_is_rendered(good, capsys):
-    assert "12 views, 5 of them" in run(capsys, good, "--sample", 5)[1][-1]
-    assert "12 views, 12 of them" in run(capsys, good, "--poses")[1][-1]
+    assert "6 views, 5 of them" in run(capsys, good, "--sample", 5)[1][-1]
+    assert "6 views, 6 of them" in run(capsys, good, "--poses")[1][-1]
     assert "0 views, 0 of them" in run(capsys, good, "--fast")[1][-1]
 
 

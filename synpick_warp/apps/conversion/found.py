@@ -105,7 +105,7 @@ class FoundSceneFiles(StoredSceneFiles):
 
 
 class _Context(ExportContext):
-    """Context of the exporters: names from models, or else numbers; models are copied."""
+    """Context of the exporters: objects of models and ground truth, by the models' names or else by numbers; models are copied."""
 
     def __init__(self, data: DataSet, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
         super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
@@ -118,8 +118,8 @@ class _Context(ExportContext):
 
     @cached_property
     def _names(self) -> dict[int, str]:
-        found = {int(index) for view in self._data.views() for index in view.object_ids}
         folder = self._data.folder
+        found = {int(index) for view in self._data.views() for index in view.object_ids} | set(_found(self._data).layout.model_files)
         named = object_names(folder, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 

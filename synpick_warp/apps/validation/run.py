@@ -48,7 +48,10 @@ class Options:
 
 @dataclass
 class Summary:
-    """Totals of a validation: numbers of what was checked and of violations, and the measured deviations."""
+    """Totals of a validation: numbers of what was checked and of violations, and the measured deviations.
+
+    A view that the data set has twice, in a scene folder and in a shard, counts once; so does an object with several models.
+    """
 
     scenes: int = 0
     views: int = 0
@@ -80,18 +83,24 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     layout = Layout(folder)
     lists = TargetLists(layout)
     scenes = _list_scenes(layout)
-    summary.scenes = len(scenes)
-    total = sum(len(images) for _, images in scenes)
+    counted = {_key(ref): ref for ref, _ in reversed(scenes)}
+    summary.scenes = len(counted)
+    total = sum(len(images) for ref, images in scenes if counted[_key(ref)] == ref)
     for violation in _check_folders(layout, lists):
         yield _finish(violation, layout, summary)
-    models = list(_plan_models(layout, summary))
+    models = list(_plan_models(layout))
+    summary.models = len({task.obj_id for task in models if task.obj_id is not None})
     cameras, picks = _read_plan(layout)
     tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(cameras, scenes)]
     tasks += map(CheckPicks, committed_episodes(layout.root)) if picks else ()
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
-    for checked in map_ordered(WorkerProgram(partial(State, layout.root, options.tolerance), "process that validates"), tasks, processes):
-        summary.views += checked.views
-        summary.rendered += checked.rendered
+    program = WorkerProgram(partial(State, layout.root, options.tolerance), "process that validates")
+    rendered: set[tuple[tuple[str, int, str], int]] = set()
+    for task, checked in zip(tasks, map_ordered(program, tasks, processes), strict=True):
+        if isinstance(task, CheckScene):
+            summary.views += checked.views * (counted[key := _key(task.ref)] == task.ref)
+            rendered |= {(key, image) for image in checked.rendered}
+            summary.rendered = len(rendered)
         for rule, obj_id, value in checked.deviations:
             summary.deviations.setdefault((rule, obj_id), array("d")).append(value)
         report("views" if options.images else "scenes", summary.views, total)
@@ -132,12 +141,16 @@ def _list_scenes(layout: Layout) -> list[tuple[SceneRef, np.ndarray]]:
     return found
 
 
-def _plan_models(layout: Layout, summary: Summary) -> Iterator[Task]:
-    """Yield a task for each models folder, and one for each of its models; counts these."""
+def _key(ref: SceneRef) -> tuple[str, int, str]:
+    """Split, index and sensor of a scene, which it shares with its shards."""
+    return ref.split.removesuffix("_web"), ref.scene, ref.sensor
+
+
+def _plan_models(layout: Layout) -> Iterator[CheckModel]:
+    """Yield a task for each models folder, and one for each of its models."""
     for name, listing in layout.models.items():
         yield CheckModel(name, None)
         for obj_id in ModelsFolder(listing).files:
-            summary.models += 1
             yield CheckModel(name, obj_id)
 
 

@@ -23,8 +23,8 @@ class Checked(NamedTuple):
     violations: list[Violation]
     views: int = 0
     """Views whose images were checked."""
-    rendered: int = 0
-    """Views that were rendered again."""
+    rendered: Sequence[int] = ()
+    """Images that were rendered again."""
     deviations: Sequence[tuple[str, int, float]] = ()
     """(rule, obj_id, value) of each deviation; empty without a tolerance."""
 
@@ -110,14 +110,14 @@ class CheckScene:
         if not self.images:
             return Checked(violations, deviations=deviations)
         images = scene.images[self.first : self.last]
-        rendered = 0
+        rendered: list[int] = []
         for image in images:
             view = ViewSubject(scene, image)
             violations += apply_rules(view, state.tolerance, deviations)
-            if image in self.poses and view.truths:
+            if image in self.poses and any(state.renderer.has(truth.obj_id) for truth in view.truths):
                 from synpick_warp.apps.validation.diagnosis import DiagnosedView
 
-                rendered += 1
+                rendered.append(image)
                 violations += apply_rules(DiagnosedView(view, state.renderer, state.tolerance), state.tolerance, deviations)
         return Checked(violations, len(images), rendered, deviations)
 

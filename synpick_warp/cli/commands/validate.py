@@ -148,6 +148,7 @@ def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bo
     for item in found:
         name, numbers = item.obj_id or "all", f"{item.median:8.2f} {item.percentile_95:8.2f} {item.largest:8.2f}"
         print(f"{item.rule:<17} {name:>6} {item.instances:>9} {numbers} {item.unit}")
-    checked = f"{summary.scenes:,} scenes, {summary.models:,} models, {summary.views:,} views, {summary.rendered:,} of them rendered again"
+    rendered = f"{summary.rendered:,} of them rendered again" if summary.models else "none of them rendered again, without models"
+    checked = f"{summary.scenes:,} scenes, {summary.models:,} models, {summary.views:,} views, {rendered}"
     print(f"{checked}: {summary.errors:,} errors, {summary.warnings:,} warnings")
     sys.stdout.flush()

@@ -99,6 +99,8 @@ def test_readers_find_images_to_train_and_to_validate(tmp_path, folders, keys):
     out = export(YoloExporter, tmp_path / "set", dataclasses.replace(config(), splits=splits), (0,))
     data = yaml.safe_load((out / "yolo" / "data.yaml").read_text())
     assert [data.get(key) for key in ("train", "val", "test")] == [key and f"images/{key}" for key in keys]
+    note = {"train_pbr": "train", "test_pbr": "test", "mine": "all", "val_pbr": None}[keys[1]]
+    assert (f"# No split for validation: these are the {note} images." in (out / "yolo" / "data.yaml").read_text()) == (note is not None)
     assert all((out / "yolo" / "images" / folder).is_dir() for folder in folders)
     assert FORMAT_TABLE["yolo"].part.file(0) == "yolo/000000.txt"
 

@@ -71,7 +71,7 @@ def check_camera_file(tree: TreeSubject) -> Findings:
             yield name, str(error)
 
 
-@rule(TreeSubject, "set-files", "add the file: tools read it without asking (test_targets_bop19.json may be [])", level=Level.WARNING)
+@rule(TreeSubject, "set-files", "add what is missing: tools read it without asking", level=Level.WARNING)
 def check_set_files(tree: TreeSubject) -> Findings:
     """The data set has camera.json, models, models_eval with a models_info.json of its own, and test_targets_bop19.json."""
     layout = tree.layout
@@ -88,7 +88,7 @@ def check_set_files(tree: TreeSubject) -> Findings:
         if f"obj_{obj_id:06d}.ply" not in layout.models["models_eval"].files:
             yield layout.models["models_eval"].name(f"obj_{obj_id:06d}.ply"), f"missing; {layout.model_files[obj_id][0]} has this object"
     if layout.splits and "test_targets_bop19.json" not in layout.listing.files:
-        yield "test_targets_bop19.json", "missing; the toolkit's calc_gt_masks.py and calc_gt_coco.py open it"
+        yield "test_targets_bop19.json", "missing; the toolkit's calc_gt_masks.py and calc_gt_coco.py open it, and take [] for no targets"
 
 
 @rule(TreeSubject, "bake-finished", "the command that started the bake resumes it", level=Level.WARNING)

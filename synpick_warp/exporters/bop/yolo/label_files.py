@@ -48,7 +48,15 @@ def write_data_file(out: Path, names: Mapping[int, str], splits: Sequence[str]) 
     any_split = next(iter(kinds.values()))
     train = kinds.get("train", any_split)
     val = kinds.get("val", kinds.get("test", train))
-    lines = [f"train: {train}", f"val: {val}", *([f"test: {kinds['test']}"] if "test" in kinds else []), f"nc: {len(names)}", "names:"]
+    used = next((kind for kind in ("train", "test") if val == kinds.get(kind)), "all")
+    note = "" if "val" in kinds else f"  # No split for validation: these are the {used} images."
+    lines = [
+        f"train: {train}",
+        f"val: {val}{note}",
+        *([f"test: {kinds['test']}"] if "test" in kinds else []),
+        f"nc: {len(names)}",
+        "names:",
+    ]
     lines += [f"  {index}: {json.dumps(names[obj_id], ensure_ascii=False)}" for index, obj_id in enumerate(sorted(names))]
     (out / DATA).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
