@@ -10,20 +10,22 @@ import numpy as np
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.episodes.objects import AUTO_UNIT, HOUSEHOLD, UNITS
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, HULL, MASS_RANGE, MESH, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
-from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh_file, signed_volume
+from synpick_warp.scenes.assets.meshes import MeshOptions, connected_parts, merge_positions, read_mesh_file, solid_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
+from synpick_warp.scenes.collision.depth import is_concave
 from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.solids import solids
+from synpick_warp.scenes.symmetries.likeness import look_alike, shape_profile
 from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
@@ -33,8 +35,11 @@ _MIN_DIAMETER = 2e-3
 # Maximum distance of a vertex from the origin, in diameters: with more, the origin lies far outside the body, and the bounding sphere
 # about the origin (which spaces the drop) would be mostly empty.
 _MAX_ORIGIN_DISTANCE = 1.5
-# Allowed masses [kg]: others have no useful inverse in 32-bit floats.
-_MASS_RANGE = (1e-7, 1e4)
+# Pieces that make up at most this part of a mesh's surface, and shorten it to this part of its length if they are left out, are told.
+_SPECK, _LENGTHENED = 0.01, 0.95
+# Part of its hull's volume above which a mesh has bodies that overlap; the rest is rounding.
+_OVERFULL = 1.001
+_MAX_LISTED = 8
 READ_LIMITS = Limits(600.0, 2**33)
 """Limits of a mesh file with its textures: 10 min and 8 GiB; the largest files that are read take a minute and 3 GiB."""
 _UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres, unless objects.unit says otherwise"
@@ -69,12 +74,12 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         _report_undrawable(entries, config.arrangement.volume, report)
     if not config.randomize.most_distractors:
         return Catalog(tuple(entries))
-    others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, tuple(entry.name for entry in entries))
+    others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, entries)
     return Catalog(tuple(entries), tuple(replace(entry, obj_id=FIRST_DISTRACTOR - index) for index, entry in enumerate(others)))
 
 
 def _load_entries(
-    folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[str] = ()
+    folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[CatalogEntry] = ()
 ) -> list[CatalogEntry]:
     """Load the objects of `_read_objects`, ordered by obj_id."""
     objects = rules.objects
@@ -84,15 +89,18 @@ def _load_entries(
     names, meshes = [raw.name for raw in raws], [raw.mesh for raw in raws]
     seconds = objects.decomposition_time
     shapes = collision_shapes(names, meshes, recipes, cache_dir or default_cache_dir(), report, seconds)
-    entries = []
+    entries, masses = [], []
     for raw, shape in zip(raws, shapes, strict=True):
         if isinstance(shape, CatalogError):
             faults.add(shape)
         else:
-            entries.append(_entry(raw, shape, _checked_mass(raw, objects.density)))
+            masses.append((raw, _checked_mass(raw, objects, shape)))
+            entries.append(_entry(raw, shape, masses[-1][1]))
     if not entries:
         raise faults.summary()
     faults.tell()
+    if line := describe_masses([raw for raw, _ in masses], objects, [mass for _, mass in masses], guesses=True):
+        report(line)
     return sorted(entries, key=lambda entry: entry.obj_id)
 
 
@@ -108,12 +116,22 @@ def read_objects(
 
 
 def _read_objects(
-    folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults, catalog: Sequence[str] = ()
+    folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults, catalog: Sequence[CatalogEntry] = ()
 ) -> list[RawObject]:
-    """The objects of a folder; empty: the embedded objects that have no name of `catalog`."""
-    if folder:
-        return _read_folder(Path(folder).expanduser(), rules, report, faults)
-    return _embedded_objects(rules, faults, catalog)
+    """The objects of a folder but for those that look like one of `catalog`; empty: the embedded ones, beside a `catalog` solids."""
+    if not folder:
+        return _embedded_objects(rules, faults, bool(catalog))
+    raws = _read_folder(Path(folder).expanduser(), rules, report, faults)
+    labelled = [(entry.name, shape_profile(entry.mesh.vertices, entry.mesh.faces)) for entry in catalog]
+    for raw in [*raws] if labelled else ():
+        profile = shape_profile(raw.mesh.vertices, raw.mesh.faces)
+        twin = next((name for name, known in labelled if name == raw.name or look_alike(profile, known)), None)
+        if twin is not None:
+            faults.add(CatalogError(f"the distractor {raw.name}: it looks like {twin}, whose instances are labelled"))
+            raws.remove(raw)
+    if not raws:
+        raise faults.summary()
+    return raws
 
 
 class _SizeError(CatalogError):
@@ -202,15 +220,13 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
     return raws
 
 
-def _embedded_objects(rules: _Rules, faults: _Faults, catalog: Sequence[str]) -> list[RawObject]:
-    """Embedded objects that fit into the bins; beside a `catalog` household objects without a name of it, or else geometric solids.
+def _embedded_objects(rules: _Rules, faults: _Faults, distractors: bool) -> list[RawObject]:
+    """Embedded objects that fit into the bins; as distractors geometric solids, with procedural surfaces textured.
 
-    With procedural surfaces these are the solids, textured: household objects look like those of real data sets.
+    Household objects would look like labelled ones, which are of the same kinds.
     """
     raws = []
-    textured = bool(catalog) and rules.surfaces > 0
-    made = [] if textured else procedural_objects((HOUSEHOLD,) if catalog else rules.objects.embedded)
-    for raw in [raw for raw in made if raw.name not in catalog] or solids(textured):
+    for raw in solids(rules.surfaces > 0) if distractors else procedural_objects(rules.objects.embedded):
         try:
             _check_size(raw, raw.name, rules.bins)
         except CatalogError as error:
@@ -241,6 +257,7 @@ def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawOb
     rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
     row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
     raw = _raw(model, mesh, hull, found.material, row, objects)
+    lines += _describe_specks(mesh, hull.diameter, str(model.path))
     _check_size(raw, str(model.path if model.is_bop else raw.name), rules.bins)
     info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path))
     lines += said
@@ -248,7 +265,7 @@ def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawOb
     # A copy of the file could not name its texture as it does, and would have another unit than BOP's.
     if model.is_bop and unit == "mm" and not scope.moved:
         raw = replace(raw, source=model.path)
-    _checked_mass(raw, objects.density)
+    _checked_mass(raw, objects)
     return raw, [*scope.moved[:1], *lines]
 
 
@@ -284,6 +301,7 @@ def _check_info(info: ModelInfo, mesh: TriangleMesh, hull: HullSize, model: Mode
 def _raw(model: ModelFile, mesh: TriangleMesh, hull: HullSize, given: FileMaterial, row: ObjectRow | None, objects: Objects) -> RawObject:
     """Combine mesh file and row. Material properties of the file have priority over the row, the row over the section objects."""
     defaults = row or objects
+    concave = row.concave if row else None
     material = Material(
         given.color,
         given.texture,
@@ -297,7 +315,7 @@ def _raw(model: ModelFile, mesh: TriangleMesh, hull: HullSize, given: FileMateri
         hull=hull,
         material=material,
         mass=row.mass if row else None,
-        concave=row.concave if row else None,
+        concave=is_concave(mesh.vertices, mesh.faces, hull.volume, objects.concave_ratio) if concave is None else concave,
         symmetries_discrete=(),
         symmetries_continuous=(),
         source=None,
@@ -362,13 +380,63 @@ def _by(sides: list[float]) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _checked_mass(raw: RawObject, density: float) -> float:
-    """Mass [kg]: the object's own, or density times hull volume."""
+def _describe_specks(mesh: TriangleMesh, diameter: float, origin: str) -> list[str]:
+    """Line on loose pieces of a mesh, a hundredth of its surface in all, that lie so far off that they lengthen it."""
+    positions, faces = merge_positions(mesh.vertices, mesh.faces)
+    part = connected_parts(faces)[faces[:, 0]]
+    corners = positions[faces]
+    area = np.bincount(part, np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1))
+    order = np.argsort(area, kind="stable")
+    loose = np.zeros(len(area), bool)
+    loose[order[np.cumsum(area[order]) <= _SPECK * area.sum()]] = True
+    size = hull_size(corners[~loose[part]].reshape(-1, 3)).diameter if loose.any() else diameter
+    if size >= _LENGTHENED * diameter:
+        return []
+    said = f"{origin}: loose pieces, {int(loose[part].sum())} of its {len(faces)} triangles, lengthen it"
+    return [f"{said} from {1e3 * size:.4g} to {1e3 * diameter:.4g} mm; delete them from the file unless they belong to it"]
+
+
+def describe_masses(raws: Sequence[RawObject], objects: Objects, masses: Sequence[float] = (), *, guesses: bool = False) -> str:
+    """Line on the masses [kg] of objects that have them by their density; empty: there are none.
+
+    Args:
+        raws: Objects.
+        objects: Settings.
+        masses: Their masses, if their collision shapes are known.
+        guesses: Those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the density.
+    """
+    known = objects.mass_volume == MESH and objects.density != Objects.density
+    pairs = zip(raws, masses or [_checked_mass(raw, objects) for raw in raws], strict=True)
+    told = {raw.name: mass for raw, mass in pairs if raw.mass is None and not (known and bool(_solid(raw)) == guesses)}
+    if not told:
+        return ""
+    names = [*list(told)[:_MAX_LISTED], *([f"{len(told) - _MAX_LISTED} more"] if len(told) > _MAX_LISTED else [])]
+    low, high = (f"{pick(told.values()):.3g}" for pick in (min, max))
+    what = "convex hulls" if objects.mass_volume == HULL else "collision shapes, where meshes are open" if guesses and known else "meshes"
+    line = f"mass of {', '.join(names)}: {low if low == high else f'{low} to {high}'} kg, {objects.density:g} kg/m³ of their {what}"
+    advice = (
+        "close the meshes, or set mass in [[object_rows]]" if known else "set objects.density to the material's, or mass in [[object_rows]]"
+    )
+    return f"{line}, is a guess; {advice}" if guesses or not known else line
+
+
+def _solid(raw: RawObject) -> float:
+    """Volume that the object's mesh encloses [m³]; 0: it is open, or bodies in it overlap."""
+    volume = solid_volume(raw.mesh.vertices, raw.mesh.faces) or 0.0
+    return volume if volume <= _OVERFULL * raw.hull.volume else 0.0
+
+
+def _checked_mass(raw: RawObject, objects: Objects, pieces: Sequence[ConvexPiece] = ()) -> float:
+    """Mass [kg]: the object's own, or density times the volume that `objects.mass_volume` names; before there are pieces, that of the hull
+    stands for theirs."""
     origin = raw.source or raw.name
-    mass = density * raw.hull.volume if raw.mass is None else raw.mass
-    if not _MASS_RANGE[0] <= mass <= _MASS_RANGE[1]:
+    mass = raw.mass
+    if mass is None:
+        solid = _solid(raw) if objects.mass_volume == MESH else raw.hull.volume
+        mass = objects.density * (solid or (mass_properties(pieces).volume if pieces else raw.hull.volume))
+    if not MASS_RANGE[0] <= mass <= MASS_RANGE[1]:
         source = "by objects.density" if raw.mass is None else "in its row of the object table"
-        raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {_MASS_RANGE[0]:g} to {_MASS_RANGE[1]:g} kg")
+        raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {MASS_RANGE[0]:g} to {MASS_RANGE[1]:g} kg")
     return mass
 
 
@@ -381,11 +449,8 @@ def _report_undrawable(entries: list[CatalogEntry], budget: float, report: Calla
 
 
 def shape_recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
-    """Parameters of an object's collision shape: concave if stated, or by the ratio of the volumes of mesh and convex hull."""
-    concave = raw.concave
-    if concave is None:
-        concave = signed_volume(raw.mesh.vertices, raw.mesh.faces) < objects.concave_ratio * raw.hull.volume
-    return ShapeRecipe(concave, objects.hull_vertices, objects.piece_vertices, objects.pieces, objects.concavity)
+    """Parameters of an object's collision shape."""
+    return ShapeRecipe(raw.concave, objects.hull_vertices, objects.piece_vertices, objects.pieces, objects.concavity)
 
 
 def _entry(raw: RawObject, pieces: tuple[ConvexPiece, ...], mass: float) -> CatalogEntry:

@@ -64,8 +64,8 @@ class RawObject:
     material: Material
     mass: float | None
     """[kg]; None: by objects.density."""
-    concave: bool | None
-    """Use a convex decomposition instead of the hull as collision shape; None: by objects.concave_ratio."""
+    concave: bool
+    """Use a convex decomposition instead of the hull as collision shape."""
     symmetries_discrete: tuple[tuple[float, ...], ...]
     """Rigid transforms under which the object looks the same: row-major 4 x 4 matrices as in BOP, but in metres."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]

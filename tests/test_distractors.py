@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -223,13 +222,36 @@ def make_folder(folder: Path, *sides: float) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("own", "surfaces", "embedded"), [(True, 0, procedural_objects), (False, 0, solids), (True, 1, functools.partial(solids, True))]
+    ("own", "surfaces"),
+    [(True, 0), (False, 0), (True, 1)],
 )
-def test_embedded_objects_are_distractors_of_other_models_and_solids_of_their_own(tmp_path, own, surfaces, embedded):
+def test_distractors_of_no_folder_are_solids(tmp_path, own, surfaces):
+    """Household objects look like those of labelled classes, such as the banana of the YCB models."""
     models = str(make_folder(tmp_path / "own", 0.05)) if own else ""
     loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2, "randomize.surfaces": surfaces}))
-    assert {body.name for body in loaded.entries}.isdisjoint(body.name for body in loaded.distractors)
-    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(len(embedded()))]
+    assert [body.name for body in loaded.distractors] == [raw.name for raw in solids(surfaces > 0)]
+    assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(len(loaded.distractors))]
+
+
+def test_distractors_that_look_like_a_labelled_object_are_left_out(tmp_path):
+    """By shape whatever their names, sizes and poses, or by name; a carton of other proportions is none of them."""
+    labelled = {
+        raw.name: trimesh.Trimesh(raw.mesh.vertices, raw.mesh.faces) for raw in procedural_objects() if raw.name in ("banana", "drill")
+    }
+    turn = trimesh.transformations.rotation_matrix(1.0, (1.0, 2.0, 3.0))
+    others = {"fruit": labelled["banana"].copy().apply_scale(0.7).apply_transform(turn), "tool": labelled["drill"].subdivide()}
+    others |= {"drill": trimesh.creation.box((0.1, 0.1, 0.1)), "carton": trimesh.creation.box((0.06, 0.1, 0.02))}
+    for folder, meshes in (("labelled", labelled), ("others", others)):
+        (tmp_path / folder).mkdir()
+        for name, mesh in meshes.items():
+            mesh.export(tmp_path / folder / f"{name}.stl")
+    given = {"randomize.distractors": 1, "bake.models": str(tmp_path / "labelled"), "randomize.distractor_models": str(tmp_path / "others")}
+    lines: list[str] = []
+    loaded = load_catalog(load_config("smoke", given | {"objects.concave_ratio": 0.0}), tmp_path / "cache", lines.append)
+    assert [body.name for body in loaded.distractors] == ["carton"]
+    said = [line.removeprefix("left out: the distractor ") for line in lines if "labelled" in line and "left out" in line]
+    pairs = [("drill", "drill"), ("fruit", "banana"), ("tool", "drill")]
+    assert said == [f"{name}: it looks like {twin}, whose instances are labelled" for name, twin in pairs]
 
 
 @pytest.mark.parametrize(("textured", "largest"), [(False, 0.2), (True, 0.32)])

@@ -16,6 +16,28 @@ UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
 HOUSEHOLD, INDUSTRIAL = "household", "industrial"
 EMBEDDED = (HOUSEHOLD, INDUSTRIAL)
 """Sets of embedded objects."""
+HULL, MESH = "hull", "mesh"
+"""Volumes that a density is multiplied by."""
+MASS_RANGE = (1e-7, 1e4)
+"""Allowed masses [kg]: others have no useful inverse in 32-bit floats."""
+MATERIALS = {
+    "abs": 1050.0,
+    "aluminium": 2700.0,
+    "brass": 8500.0,
+    "cast-iron": 7200.0,
+    "copper": 8960.0,
+    "glass": 2500.0,
+    "nylon": 1140.0,
+    "petg": 1270.0,
+    "pla": 1240.0,
+    "pom": 1410.0,
+    "pp": 905.0,
+    "stainless-steel": 7900.0,
+    "steel": 7850.0,
+    "titanium": 4500.0,
+    "zinc": 7140.0,
+}
+"""Typical densities of solid materials, as data sheets give them [kg/m³]."""
 DECLARED, DETECT = "declared", "detect"
 SYMMETRIES = (DECLARED, DETECT)
 """Sources of an object's symmetries."""
@@ -120,12 +142,27 @@ class Objects:
         300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
     )
     concave_ratio: float = setting(
-        0.6, "", "Objects without a row in the object table are decomposed if mesh volume / hull volume is below this.", low=0.0, high=1.0
+        0.6,
+        "",
+        "Objects whose row does not say whether they are concave are decomposed if 1 - depth is below this. Depth is that of the convex "
+        "hull above the surface, at most, in halves of the hull's thickness: 0 of a hollow ball, 0.8 of a tube, above 1 of a bowl, of a "
+        "bracket, and of a plate with holes as wide as it is thick.",
+        low=0.0,
+        high=1.0,
     )
     strict: bool = setting(
         False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
     )
-    density: float = setting(400.0, "kg/m³", "Density over the volume of the convex hull, for objects without a mass.", above=0.0, high=1e5)
+    density: float = setting(
+        400.0, "kg/m³", "Density of objects without a mass; where it is not set, their mass is a guess, which is told.", above=0.0, high=1e5
+    )
+    mass_volume: str = setting(
+        HULL,
+        "",
+        "Volume that the density is multiplied by: hull, that of the convex hull, or mesh, that of the mesh where it is watertight, and of "
+        "the collision shape elsewhere. Where density is set and this is not: mesh.",
+        choices=(HULL, MESH),
+    )
     metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
     crease_angle: float = setting(
@@ -175,8 +212,10 @@ class ObjectRow:
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
     )
     diameter: float = setting(0.0, "m", "Diameter of the model, which must agree for the row to be used; 0: any.", low=0.0)
-    mass: float = setting(0.1, "kg", "Mass.", above=0.0)
-    concave: bool = setting(False, "", "Use a convex decomposition as collision shape instead of the convex hull.")
+    mass: float | None = setting(None, "kg", "Mass; not given: by objects.density.", above=0.0)
+    concave: bool | None = setting(
+        None, "", "Use a convex decomposition as collision shape instead of the convex hull; not given: by objects.concave_ratio."
+    )
     metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
     roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
     symmetries_discrete: tuple[tuple[float, ...], ...] = setting(

@@ -220,7 +220,7 @@ class Randomize:
     distractor_models: str = setting(
         "",
         "",
-        "Folder of distractors, as bake.models; empty: the embedded objects that the catalog lacks, or, if it has all or with surfaces, "
+        "Folder of distractors, as bake.models, without those that have a name or the shape of a labelled object, in any size; empty: "
         "geometric solids.",
         path=True,
     )

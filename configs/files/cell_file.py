@@ -12,6 +12,7 @@ from synpick_warp.configs.cell.bins import BinRow
 from synpick_warp.configs.cell.cameras import Jitter, Pose
 from synpick_warp.configs.cell.gripper import COMPLIANCE, FLOW, Gripper
 from synpick_warp.configs.check import is_table
+from synpick_warp.configs.episodes.objects import MESH
 from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution
 from synpick_warp.configs.files.load import sections, table_lists
 from synpick_warp.configs.files.table_lists import given_values, settings_of
@@ -52,6 +53,12 @@ class NewCell:
     """Folder of the parts; empty: the embedded objects."""
     unit: str = ""
     """Unit of their files."""
+    density: float | None = None
+    """Density of their material [kg/m³]; None: not known."""
+    mass: float | None = None
+    """Mass of each [kg]; None: by the density."""
+    weighed: Sequence[tuple[int, str]] = ()
+    """obj_id and name of each part that has the mass."""
     center: bool = False
     """Whether parts are moved to their middle."""
     volume: float = 0.0
@@ -67,6 +74,8 @@ def cell_toml(cell: NewCell, name: str) -> str:
     volume = float(f"{max(FILL * inside, cell.volume):.2g}")
     parts = {"unit": cell.unit, "center": cell.center, "symmetries": "detect"} if cell.models else {}
     mass = {"id": 1, "name": "NAME", "diameter": 0.0, "mass": 0.1, "metallic": 0.6, "roughness": 0.3}
+    if cell.density is not None:
+        parts |= {"density": cell.density, "mass_volume": MESH}
     lines = [*(f"# {line}".rstrip() for line in _HEAD.format(name=name, file=shlex.quote(f"{name}/cell.toml")).splitlines()), ""]
     lines += ['# Preset below these settings: "smoke" is small and fast, to try a cell; "synpick" is for training.', 'preset = "smoke"', ""]
     models = {"models": cell.models} if cell.models else {}
@@ -84,8 +93,12 @@ def cell_toml(cell: NewCell, name: str) -> str:
     lines += _section("suction", {"vacuum": VACUUM, "flow": FLOW, "compliance": COMPLIANCE}, {})
     lines += _title("Parts")
     lines += _section("arrangement", {"volume": volume, "max_objects": _FEW}, {})
-    lines += _section("objects", parts, {} if cell.models else {"unit": "mm", "symmetries": "detect"})
-    lines += _table("#[[object_rows]]", "object_rows", {}, mass)
+    examples = {"density": 7850.0} if cell.models and cell.density is None else {"unit": "mm", "symmetries": "detect"}
+    lines += _section("objects", parts, {} if cell.density is not None else examples)
+    for index, (obj_id, name) in enumerate(cell.weighed):
+        row = {"id": obj_id, "name": name, "diameter": 0.0, "mass": cell.mass}
+        lines += _table("[[object_rows]]", "object_rows", row, {}, first=index == 0)
+    lines += [] if cell.weighed else _table("#[[object_rows]]", "object_rows", {}, mass)
     lines += _title("Domain randomization, drawn for each episode: a value or a distribution")
     lines += _section("randomize", {}, _RANDOMIZED)
     lines += _section("effects", {}, {"exposure_jitter": 0.3, "shot_noise": (0.0, 0.01), "blur": (0.0, 0.8)})

@@ -17,6 +17,7 @@ from synpick_warp.configs.cell.bins import BinRow, check_meshes
 from synpick_warp.configs.cell.cameras import Cameras
 from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
 from synpick_warp.configs.check import check_value
+from synpick_warp.configs.episodes.objects import MESH
 from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
 from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows, settings_of
 from synpick_warp.configs.rules.consistency import find_conflicts
@@ -338,6 +339,9 @@ def _build(values: Values, override: str) -> Config:
         values = values | {"bake.episodes": (total, source)}
     elif "bake.episodes" not in values and (worlds := values.get("bake.worlds", (0, "")))[0]:
         values = values | {"bake.episodes": worlds}
+    if "objects.density" in values:
+        # A known density is that of the material; the default is a guess over the convex hull.
+        values = {"objects.mass_volume": (MESH, values["objects.density"][1])} | values
     parts: dict[str, Any] = {
         section: kind(**{name: values[f"{section}.{name}"][0] for name in settings_of(kind) if f"{section}.{name}" in values})
         for section, kind in sections().items()

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import (
@@ -151,6 +153,26 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     corners = vertices[faces].astype(np.float64)
     corners -= corners.mean(axis=(0, 1))
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
+
+
+def solid_volume(vertices: np.ndarray, faces: np.ndarray) -> float | None:
+    """Volume of the solid that a mesh encloses; None: the mesh is open."""
+    positions, faces = merge_positions(vertices, faces)
+    return signed_volume(positions, faces) if len(faces) and is_watertight(faces) else None
+
+
+def is_watertight(faces: np.ndarray) -> bool:
+    """Whether a mesh is closed: triangles run along each edge equally often in either direction."""
+    start, end = faces.reshape(-1), faces[:, (1, 2, 0)].reshape(-1)
+    edges, index = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
+    return not np.bincount(index.reshape(-1), weights=np.where(start < end, 1, -1), minlength=len(edges)).any()
+
+
+def connected_parts(faces: np.ndarray) -> np.ndarray:
+    """Connected component of each vertex (V) int, up to the last one that a triangle has."""
+    count = int(faces.max()) + 1
+    links = coo_array((np.ones(2 * len(faces)), (faces[:, :2].reshape(-1), faces[:, 1:].reshape(-1))), shape=(count, count))
+    return connected_components(links, directed=False)[1]
 
 
 def merge_positions(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

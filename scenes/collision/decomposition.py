@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
+from synpick_warp.scenes.assets.meshes import connected_parts, is_watertight, merge_positions, signed_volume
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
@@ -114,13 +112,7 @@ def _without_needles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarra
 
 def _needs_repair(vertices: np.ndarray, faces: np.ndarray) -> bool:
     """Whether the mesh is open (not watertight), or much of it lies inside the body: CoACD would cut along inner walls for minutes."""
-    start, end = faces.reshape(-1), faces[:, (1, 2, 0)].reshape(-1)
-    edges, index = np.unique(np.sort(np.stack([start, end], axis=1), axis=1), axis=0, return_inverse=True)
-    if np.bincount(index, weights=np.where(start < end, 1, -1), minlength=len(edges)).any():
-        return True
-    links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices)))
-    _, part = connected_components(links, directed=False)
-    return _buried_fraction(vertices, faces, part) > _MAX_BURIED
+    return not is_watertight(faces) or _buried_fraction(vertices, faces, connected_parts(faces)) > _MAX_BURIED
 
 
 def _buried_fraction(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> float:

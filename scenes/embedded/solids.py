@@ -13,6 +13,8 @@ from synpick_warp.scenes.types import Material, RawObject
 
 SIDES = 32
 """Points per ring of a round solid."""
+DENSITY = 400.0
+"""[kg/m³], between foam and wood."""
 SCALES = ((1.0, 1.0, 1.0), (1.6, 1.6, 1.8), (1.2, 2.0, 2.2), (2.2, 1.4, 1.0))
 """Factors on x, y and z of textured solids: tins, cartons, books and bottles of a household."""
 REPEAT = 0.3
@@ -54,7 +56,8 @@ def solids(textured: bool = False) -> list[RawObject]:
     for obj_id, (name, patch, color) in enumerate(rows, start=1):
         mesh = make_mesh(patch, centered=True)
         material = Material(color, None, 0.0, 0.5)
-        made.append(RawObject(obj_id, name, mesh, hull_size(mesh.vertices), material, None, False, (), (), None))
+        hull = hull_size(mesh.vertices)
+        made.append(RawObject(obj_id, name, mesh, hull, material, DENSITY * hull.volume, False, (), (), None))
     return _dress(made) if textured else made
 
 
@@ -66,12 +69,18 @@ def _dress(plain: list[RawObject]) -> list[RawObject]:
             mesh = replace(raw.mesh, vertices=raw.mesh.vertices * np.array(scale, np.float32))
             mesh = project_from_box(replace(mesh, normals=_normalize(mesh.normals / np.array(scale, np.float32))))
             mesh = replace(mesh, uv=(mesh.uv / REPEAT + 0.5).astype(np.float32))
-            index = len(made)
+            index, hull = len(made), hull_size(mesh.vertices)
             (texture,) = surface_textures(1, index)
             material = Material((1.0, 1.0, 1.0), texture, 0.0, 0.5)
             made.append(
                 replace(
-                    raw, obj_id=index + 1, name=f"textured_{raw.name}_{index}", mesh=mesh, hull=hull_size(mesh.vertices), material=material
+                    raw,
+                    obj_id=index + 1,
+                    name=f"textured_{raw.name}_{index}",
+                    mesh=mesh,
+                    hull=hull,
+                    material=material,
+                    mass=DENSITY * hull.volume,
                 )
             )
     return made

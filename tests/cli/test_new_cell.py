@@ -15,11 +15,13 @@ import trimesh
 from synpick_warp.apps.viz.cell.frusta import project
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.cell.rig import intrinsics
+from synpick_warp.configs.episodes.objects import MATERIALS
 from synpick_warp.configs.files.cell_file import WIDTH
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.cameras import describe_blocked, make_cameras
+from synpick_warp.scenes.catalog import load_catalog
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import OBJ, exported, put
@@ -159,7 +161,7 @@ def test_four_coefficients_may_be_of_a_fisheye(tmp_path, drawn):
     assert load_config(tmp_path / "cell" / "cell.toml").camera[0].model == "fisheye"
 
 
-@pytest.mark.parametrize(("offset", "center"), [(0.0, False), (500.0, True)])
+@pytest.mark.parametrize(("offset", "center"), [(0.0, False), (8.0, False), (10.0, True), (500.0, True)])
 def test_parts_are_copied_with_their_unit(tmp_path, drawn, offset, center):
     mesh = trimesh.creation.box((80.0, 40.0, 12.0))
     mesh.apply_translation((offset, 0.0, 0.0))
@@ -172,6 +174,26 @@ def test_parts_are_copied_with_their_unit(tmp_path, drawn, offset, center):
     assert drawn == ["cell/cell.toml", "bracket"]
     (tmp_path / "cell").rename(tmp_path / "moved")
     assert load_config(tmp_path / "moved" / "cell.toml").bake.models == str(tmp_path / "moved" / "parts")
+
+
+@pytest.mark.parametrize(
+    ("options", "mass", "said"),
+    [
+        (["--density", "steel"], 7850 * 38.4e-6, "mass of block: 0.301 kg, 7850 kg/m³ of their meshes\n"),
+        (["--density", "700"], 700 * 38.4e-6, "mass of block: 0.0269 kg, 700 kg/m³ of their meshes\n"),
+        (["--mass", "0.25"], 0.25, ""),
+        ([], 400 * 38.4e-6, "mass of block: 0.0154 kg, 400 kg/m³ of their convex hulls, is a guess; set objects.density"),
+    ],
+)
+def test_parts_have_the_mass_or_the_density_that_is_given(tmp_path, drawn, options, mass, said):
+    part = put(tmp_path / "in" / "block.stl", exported(trimesh.creation.box((80.0, 40.0, 12.0)), "stl"))
+    ran = run("new-cell", tmp_path / "cell", "--part", part, "--unit", "mm", "--bin", "0.3x0.2x0.1", *options)
+    assert said in ran.out + ran.err
+    assert ("mass of block" in ran.out + ran.err) == bool(said)
+    lines: list[str] = []
+    (entry,) = load_catalog(load_settings(tmp_path / "cell" / "cell.toml"), tmp_path / "cache", lines.append).entries
+    assert entry.mass == pytest.approx(mass)
+    assert any("is a guess" in line for line in lines) == (not options)
 
 
 def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):
@@ -257,6 +279,15 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["c", "--part", "nut.stl"], "nut: too large for the bin"),
         (["c", "--part", "nut.stl", "--unit", "inch"], '--unit is "inch"; allowed: m, cm, mm, in'),
         (["c", "--unit", "mm"], "--unit is given without --part"),
+        (["c", "--mass", "0.1"], "--mass is given without --part"),
+        (["c", "--part", "nut.stl", "--mass", "0"], "--mass is 0; allowed: 1e-07 to 10000 kg"),
+        (["c", "--part", "nut.stl", "--mass", "1", "--density", "abs"], "--mass is given beside --density; allowed: one of both"),
+        (["c", "--part", "nut.stl", "--density", "stel"], '--density is "stel"; allowed: 10 to 100000 kg/m³, or abs, '),
+        (
+            ["c", "--part", "nut.stl", "--density", "7.85"],
+            f'--density is "7.85"; allowed: 10 to 100000 kg/m³, or {", ".join(MATERIALS)}; did you mean 7850?',
+        ),
+        (["c", "--part", "nut.stl", "--density", "nan"], '--density is "nan"; allowed: '),
         (["c", "--part", "nut.stl", "--part", "in/nut.stl", "--unit", "mm"], '--part names "nut" 2 times'),
         (["c", "--part", "nut.stl", "--part", "in", "--unit", "mm"], "--part names a folder beside other parts"),
         (["c", "--part", "flat.stl", "--unit", "mm"], "flat: all vertices lie in one plane"),

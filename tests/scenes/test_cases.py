@@ -13,6 +13,7 @@ from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import CatalogEntry
+from tests.worlds.model_files import heard
 
 CASES = Path(__file__).parents[1] / "cases"
 GREY = (0.7, 0.7, 0.7)
@@ -91,7 +92,7 @@ MESHES = (
 @pytest.mark.parametrize("case", MESHES, ids=lambda case: case.name)
 def test_meshes(tmp_path, case):
     lines: list[str] = []
-    catalog = load_catalog(Config(bake=Bake(models=str(case.folder)), objects=Objects(center=case.center)), tmp_path, lines.append)
+    catalog = load_catalog(Config(bake=Bake(models=str(case.folder)), objects=Objects(center=case.center)), tmp_path, heard(lines))
     (entry,) = catalog.entries
     assert entry.material.color == pytest.approx(case.color or (1.0, 1.0, 1.0), abs=0.003)
     assert (entry.material.texture is None) == (case.color is not None)

@@ -22,7 +22,7 @@ from synpick_warp.scenes.collision import hulls
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
-from tests.worlds.model_files import REAL_HULLS, exported, glb, put
+from tests.worlds.model_files import REAL_HULLS, exported, glb, heard, put
 
 REAL_CONCAVE = {13, 14, 15}
 
@@ -118,7 +118,7 @@ def test_other_meshes_beside_bop_models_are_reported_as_ignored(tmp_path):
     write_box(tmp_path / "obj_000001.ply")
     write_box(tmp_path / "spare.obj")
     lines: list[str] = []
-    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", lines.append)) == 1
+    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", heard(lines))) == 1
     assert any("1 meshes" in line and "ignored" in line for line in lines)
 
 
@@ -207,7 +207,7 @@ def test_units_and_centring_are_told(tmp_path, name, unit, center, size, said):
     box.apply_translation(np.array(size) / 2)
     put(file, exported(box, file.suffix[1:]))
     lines: list[str] = []
-    (entry,) = load_catalog(config_for(tmp_path, unit=unit, center=center), tmp_path / "cache", lines.append).entries
+    (entry,) = load_catalog(config_for(tmp_path, unit=unit, center=center), tmp_path / "cache", heard(lines)).entries
     scale = {"auto": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit]
     assert np.ptp(entry.mesh.vertices, axis=0) == pytest.approx(scale * np.array(size), rel=1e-5)
     assert np.allclose(entry.mesh.vertices.max(axis=0), np.array(size) * scale * (0.5 if center else 1.0))
@@ -234,7 +234,7 @@ def test_an_implausible_unit_is_told_with_a_likely_one(tmp_path, unit, side, adv
     # One that fits does not hide it.
     put(tmp_path / "d.stl", exported(trimesh.creation.box(np.full(3, 0.05 / {"auto": 1, "m": 1, "mm": 1e-3}[unit])), "stl"))
     lines: list[str] = []
-    load_catalog(config_for(tmp_path, unit=unit), tmp_path / "cache", lines.append)
+    load_catalog(config_for(tmp_path, unit=unit), tmp_path / "cache", heard(lines))
     assert lines[-1] == f"models folder {tmp_path}: {advice}"
 
 
@@ -293,11 +293,11 @@ def test_objects_larger_than_the_volume_budget_are_reported(tmp_path):
     write_box(tmp_path / "large.ply", (0.2, 0.2, 0.2))
     write_box(tmp_path / "small.ply")
     lines: list[str] = []
-    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", lines.append)) == 2
+    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", heard(lines))) == 2
     assert lines == ["never drawn, since larger than arrangement.volume, 0.007 m³: large (0.008 m³)"]
     roomy = replace(config_for(tmp_path), arrangement=Arrangement(volume=0.0081))
     lines.clear()
-    load_catalog(roomy, tmp_path / "cache", lines.append)
+    load_catalog(roomy, tmp_path / "cache", heard(lines))
     assert not lines
 
 
@@ -376,7 +376,7 @@ def test_the_real_objects(real_models, tmp_path):
     rows = tuple(replace(row, concave=False) for row in config.object_rows)
     config = replace(config, bake=replace(config.bake, models=str(real_models)), object_rows=rows)
     lines: list[str] = []
-    entries = load_catalog(config, tmp_path / "cache", lines.append).entries
+    entries = load_catalog(config, tmp_path / "cache", heard(lines)).entries
     assert not lines
     assert [entry.obj_id for entry in entries] == list(range(1, 22))
     for entry, row in zip(entries, rows, strict=True):

@@ -18,7 +18,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog
 from tests.scenes.test_fuzz_assets import OBJ, picture
-from tests.worlds.model_files import exported, put
+from tests.worlds.model_files import exported, heard, put
 
 CASES = Path(__file__).resolve().parents[1] / "cases"
 SMALL = OBJ.replace("v 1 ", "v 0.1 ").replace("v 0 1 ", "v 0 0.1 ").replace("v 0 0 1\n", "v 0 0 0.1\n", 1)
@@ -27,7 +27,7 @@ SMALL = OBJ.replace("v 1 ", "v 0.1 ").replace("v 0 1 ", "v 0 0.1 ").replace("v 0
 
 def load(folder: Path, cache: Path, **objects) -> tuple[Catalog, list[str]]:
     lines: list[str] = []
-    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache / "cache", lines.append), lines
+    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache / "cache", heard(lines)), lines
 
 
 def write(folder: Path, **files: str | bytes) -> Path:

@@ -13,14 +13,14 @@ from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
 from synpick_warp.scenes.catalog import load_catalog
-from tests.worlds.model_files import exported, put, step_cylinder
+from tests.worlds.model_files import exported, heard, put, step_cylinder
 
 SHOWN = "not readable as STEP (OpenCASCADE refuses it)"
 
 
 def load(folder: Path, cache: Path, **objects):
     lines: list[str] = []
-    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache, lines.append).entries, lines
+    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache, heard(lines)).entries, lines
 
 
 @pytest.mark.parametrize(

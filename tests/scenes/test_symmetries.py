@@ -23,7 +23,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
 from synpick_warp.scenes.symmetries.surface import Surface
-from tests.worlds.model_files import exported, put
+from tests.worlds.model_files import exported, heard, put
 
 MAKE = trimesh.creation
 
@@ -159,7 +159,7 @@ def load(tmp_path: Path, mesh: trimesh.Trimesh, name: str = "part.stl", row: Obj
     put(tmp_path / "parts" / name, exported(mesh, name.rpartition(".")[2]))
     lines: list[str] = []
     config = Config(bake=Bake(models=str(tmp_path / "parts")), objects=Objects(**objects), object_rows=(row,) if row else ())
-    catalog = load_catalog(config, tmp_path / "cache", lines.append)
+    catalog = load_catalog(config, tmp_path / "cache", heard(lines))
     return catalog, lines
 
 

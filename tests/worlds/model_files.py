@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,11 @@ def step_cylinder(radius: float, height: float, unit: str = ".MILLI.") -> str:
     head = "FILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\nFILE_SCHEMA(('AUTOMOTIVE_DESIGN'));"
     data = "\n".join(f"#{index}={row};" for index, row in enumerate(rows, 1))
     return f"ISO-10303-21;\nHEADER;\n{head}\nENDSEC;\nDATA;\n{data}\nENDSEC;\nEND-ISO-10303-21;\n"
+
+
+def heard(lines: list[str]) -> Callable[[str], None]:
+    """Collect lines of progress, but for those on masses that are guessed, which most models here have."""
+    return lambda line: None if " is a guess; " in line else lines.append(line)
 
 
 def put(path: Path, content: str | bytes) -> Path:

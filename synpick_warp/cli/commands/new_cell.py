@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 from cyclopts import Parameter
 
 from synpick_warp.cli.commands.pictures import draw_cell
@@ -23,7 +24,7 @@ from synpick_warp.configs.cell.bins import AXES, BinRow
 from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import lens_map
-from synpick_warp.configs.episodes.objects import AUTO_UNIT, UNITS
+from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT, MASS_RANGE, MATERIALS, UNITS
 from synpick_warp.configs.files.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
 from synpick_warp.configs.rules.camera_rules import NAME, RESERVED
 from synpick_warp.configs.schema import Config
@@ -46,6 +47,10 @@ _OTHER_FILES = {".obj": rb"^\s*mtllib\s", ".gltf": rb'"uri"\s*:\s*"(?!data:)', "
 """What shows that a mesh file names others."""
 _PERCEPTION, _LEAST = 640, 16
 """Width of the image of perception [px], that of the preset smoke, whose other settings are in its pixels; and its least height."""
+_DENSITIES = (10.0, 1e5)
+"""Allowed densities [kg/m³]: foams have 10 at least; smaller numbers are in g/cm³."""
+_OFF_CENTRE = 0.1
+"""Distance of a bounding box's centre from the origin, by the box's diagonal, of which validate warns."""
 _LONGEST = 28
 """Longest name of a camera, without a number behind it."""
 
@@ -61,6 +66,14 @@ BinUnitOption = Annotated[
     str | None, Parameter(help=f"Unit of the bin's mesh file, whatever that of the parts: {', '.join(UNITS)} (default: m; bin.unit).")
 ]
 BinUpOption = Annotated[str | None, Parameter(help=f"Axis of the bin's mesh file that points up: {', '.join(AXES)} (default: z; bin.up).")]
+DensityOption = Annotated[
+    str | None,
+    Parameter(
+        help="Density of the parts' material [kg/m³], times the volume of their meshes: a number, or "
+        f"{', '.join(MATERIALS)} (default: their mass is guessed; objects.density)."
+    ),
+]
+MassOption = Annotated[float | None, Parameter(help="Mass of each part [kg], in place of --density (object_rows.mass).")]
 
 
 def new_cell(
@@ -87,6 +100,8 @@ def new_cell(
         ),
     ] = None,
     unit: Annotated[str | None, Parameter(help=f"Unit of the parts' files: {', '.join(UNITS)} (default: m; objects.unit).")] = None,
+    density: DensityOption = None,
+    mass: MassOption = None,
     resolution: Annotated[str | None, Parameter(help="Image size of cameras whose calibration does not say it, as WIDTHxHEIGHT.")] = None,
     lens: Annotated[
         str | None, Parameter(help=f"Distortion model of calibrations that do not name it: {' or '.join(MODELS)} (camera.model).")
@@ -100,7 +115,8 @@ def new_cell(
     """
     place = Path(os.path.realpath(folder))
     _check_folder(folder, place)
-    _check_parts(parts := part or [], unit)
+    _check_parts(parts := part or [], {"--unit": unit, "--density": density, "--mass": mass})
+    weights = _parse_density(density), _check_mass(mass, density)
     shape = _read_bin(bin_, bin_unit, bin_up)
     from synpick_warp.apps.viz.cell.poses import pose_for
     from synpick_warp.cli.display import make_console, make_progress
@@ -115,7 +131,7 @@ def new_cell(
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
-        cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, perception=perception)
+        cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, *weights, perception=perception)
         _fill(cell, folder, stage, progress, calibration or [], f"{place.name}/{CELL}")
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
     print(f"bake it: synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA")
@@ -148,18 +164,45 @@ def _check_folder(folder: Path, place: Path) -> None:
         raise OutputError(f"{folder} is not empty; new-cell takes a new or an empty folder")
 
 
-def _check_parts(parts: Sequence[Path], unit: str | None) -> None:
-    """Check the files of parts by their names, and that they are whole.
+def _parse_density(text: str | None) -> float | None:
+    """Density [kg/m³] of a material, or of a number; raises ConfigError."""
+    if text is None or text.lower() in MATERIALS:
+        return None if text is None else MATERIALS[text.lower()]
+    try:
+        density = float(text)
+    except ValueError:
+        density = 0.0
+    if not _DENSITIES[0] <= density <= _DENSITIES[1]:
+        hint = f"; did you mean {1e3 * density:g}?" if 0.1 < density < _DENSITIES[0] else suggest(text.lower(), list(MATERIALS))
+        raise ConfigError(
+            f"--density is {format_value(text)}; allowed: {_DENSITIES[0]:g} to {_DENSITIES[1]:g} kg/m³, or {', '.join(MATERIALS)}{hint}"
+        )
+    return density
+
+
+def _check_mass(mass: float | None, density: str | None) -> float | None:
+    """Mass of each part [kg]; raises ConfigError if there is a density as well, or no body weighs so much."""
+    if mass is not None and density is not None:
+        raise ConfigError("--mass is given beside --density; allowed: one of both")
+    if mass is not None and not MASS_RANGE[0] <= mass <= MASS_RANGE[1]:
+        raise ConfigError(f"--mass is {mass:g}; allowed: {MASS_RANGE[0]:g} to {MASS_RANGE[1]:g} kg")
+    return mass
+
+
+def _check_parts(parts: Sequence[Path], options: dict[str, Any]) -> None:
+    """Check the files of parts by their names, and that they are whole; `options` need parts.
 
     Raises:
         ConfigError: One is missing or refers to other files, two have one name, a folder stands beside others, or the unit is unknown.
     """
     from synpick_warp.scenes.assets.meshes import SUFFIXES
 
+    unit = options["--unit"]
     if unit is not None and unit not in UNITS:
         raise ConfigError(f"--unit is {format_value(unit)}; allowed: {', '.join(UNITS)}{suggest(unit, list(UNITS))}")
-    if unit is not None and not parts:
-        raise ConfigError("--unit is given without --part; the embedded objects have no unit")
+    for name, value in options.items():
+        if value is not None and not parts:
+            raise ConfigError(f"{name} is given without --part; the embedded objects have sizes and masses of their own")
     if len(parts) > 1 and any(file.is_dir() for file in parts):
         raise ConfigError("--part names a folder beside other parts; allowed: one folder, or files")
     stems = [file.stem for file in parts]
@@ -331,38 +374,48 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
 
 
 def _write_cell(cell: NewCell, name: str, stage: Path, say: Callable[[str], None]) -> list[RawObject] | None:
-    """Write the settings, with a volume budget for the parts, and moved to their middle if they are too far from their origin; returns the
-    parts, None: the embedded objects. `say` is called with each line on them.
+    """Write the settings, with a volume budget and masses for the parts, which are moved to their middle if that is far from their origin;
+    returns the parts, None: the embedded objects. `say` is called with each line on them.
 
     Raises:
         SynpickError: A setting, or a part, cannot be used.
     """
-    from synpick_warp.scenes.catalog import read_objects
+    from synpick_warp.scenes.catalog import describe_masses, read_objects
+
+    lines: list[str] = []
 
     def write(cell: NewCell) -> Config:
         (stage / CELL).write_text(cell_toml(cell, name), encoding="utf-8")
         return load_settings(stage / CELL)
 
-    def read(cell: NewCell) -> list[RawObject]:
-        config, lines = write(cell), []
-        objects = replace(config.objects, strict=cell.models == PARTS)
-        found = read_objects(config.bake.models, objects, config.object_rows, config.cell.bins, lines.append)
-        for line in lines:
-            say(line)
-        return found
+    def read(cell: NewCell, symmetries: str) -> list[RawObject]:
+        config = write(cell)
+        lines.clear()
+        objects = replace(config.objects, strict=cell.models == PARTS, symmetries=symmetries)
+        return read_objects(config.bake.models, objects, config.object_rows, config.cell.bins, lines.append)
 
     if not cell.models:
         write(cell)
         return None
     try:
         try:
-            found = read(cell)
+            off = any(_is_off_centre(raw) for raw in read(cell, DECLARED))
         except CatalogError as error:
             if "objects.center" not in str(error):
                 raise
-            cell = replace(cell, center=True)
-            found = read(cell)
+            off = True
+        cell = replace(cell, center=off)
+        found = read(cell, DETECT)
     except CatalogError as error:
         raise CatalogError(str(error).replace('objects.unit = "', '--unit "')) from None
-    write(replace(cell, volume=2.0 * max(raw.hull.volume for raw in found)))
+    named = [(raw.obj_id, raw.name) for raw in found] if cell.mass else []
+    config = write(replace(cell, volume=2.0 * max(raw.hull.volume for raw in found), weighed=named))
+    for line in filter(None, (*lines, "" if cell.mass else describe_masses(found, config.objects))):
+        say(line)
     return found
+
+
+def _is_off_centre(raw: RawObject) -> bool:
+    """Whether the bounding box of an object lies so far off its origin that validate warns; not of BOP models, which stay as they are."""
+    low, high = raw.mesh.vertices.min(axis=0), raw.mesh.vertices.max(axis=0)
+    return raw.source is None and float(np.linalg.norm(low + high)) > 2.0 * _OFF_CENTRE * float(np.linalg.norm(high - low))

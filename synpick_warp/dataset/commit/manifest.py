@@ -115,6 +115,7 @@ YOUNGER_SETTINGS: dict[str, Any] = {
     "gripper.mesh_unit": "m",
     "gripper.mesh_checksum": "",
     "objects.unit": AUTO_UNIT,
+    "objects.mass_volume": Objects().mass_volume,
     "objects.symmetries": Objects().symmetries,
     "objects.symmetry_tolerance": Objects().symmetry_tolerance,
 }

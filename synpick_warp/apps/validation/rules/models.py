@@ -119,7 +119,7 @@ def check_box(model: ModelSubject) -> Findings:
 @rule(
     ModelSubject,
     "model-origin",
-    "move the mesh, and all poses with it; tools that crop by the origin and the diameter expect it",
+    "bake with objects.center = true, or move the mesh, and all poses with it; tools that crop by the origin and the diameter expect it",
     level=Level.WARNING,
 )
 def check_origin(model: ModelSubject) -> Findings:
