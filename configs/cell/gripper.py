@@ -137,10 +137,9 @@ class Suction:
     )
 
     @property
-    def rings(self) -> tuple[int, ...]:
-        """Rays of each ring of the seal test, from the lip inwards: the lip alone, or with `vacuum` others as far apart as its rays."""
-        count = round(self.rays / math.tau) if self.vacuum is not None else 0
-        return (self.rays, *(max(1, round(self.rays * (1 - ring / count))) for ring in range(1, count + 1)))
+    def mouth_rays(self) -> int:
+        """Rays of the seal test within the lip, nearly as far apart as those on it: none without `vacuum`."""
+        return self.rays**2 // 9 if self.vacuum is not None else 0
 
     @property
     def leak(self) -> float:

@@ -25,7 +25,7 @@ class MouthData:
     """Rays over the mouth of a cup, its lip and its ejector; see `configs.cell.gripper.Suction`."""
 
     ray: wp.array[wp.vec3]
-    """(ray): place x, y in the TCP frame [m] and share of the mouth's area [m²]; those on the lip first, by angle."""
+    """(ray): place x, y in the TCP frame [m] and share of the mouth's area [m²]; those on the lip, which have none, first, by angle."""
     lip: int
     """Rays on the lip."""
     radius: float

@@ -188,7 +188,7 @@ class AttemptLog:
         self.object_ids = np.append(object_ids, -1)
         self.distractors = distractors or {}
         self.resolution = resolution
-        self.rays, self.cups = cups * sum(suction.rings), cups
+        self.rays, self.cups = cups * (suction.rays + suction.mouth_rays), cups
         self.is_measured = suction.vacuum is not None
         self._running: dict[int, _Running] = {}
 

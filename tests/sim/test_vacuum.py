@@ -80,7 +80,7 @@ def test_a_tight_cup_holds_vacuum_times_area_and_the_settings_say_so(device):
 @pytest.mark.parametrize("cup", CUPS)
 def test_a_hole_leaks_by_its_area_and_one_of_a_tenth_of_the_cup_is_always_seen(device, cup):
     plate = annulus(cup / 10, 3 * cup, 0.004, sections=96)
-    assert forces(device, [plate], cup)[0] == pytest.approx(held(cup, math.pi * cup**2 / 100), rel=0.35)
+    assert forces(device, [plate], cup)[0] == pytest.approx(held(cup, math.pi * cup**2 / 100), rel=0.25)
     tenth, numbers = annulus(cup / 20, 3 * cup, 0.004, sections=96), np.random.default_rng(5)
     way, angle = 0.44 * cup * np.sqrt(numbers.uniform(size=60)), numbers.uniform(0, math.tau, 60)
     places = np.column_stack([way * np.cos(angle), way * np.sin(angle)])
@@ -131,7 +131,7 @@ def test_beside_an_edge_and_across_two_boxes_air_enters(device):
 @pytest.mark.parametrize(("valve", "good"), [(0, 0b01), (1, 0)])
 def test_an_open_cup_takes_the_vacuum_of_a_common_valve(device, valve, good):
     pressed = press(device, [box((0.05, 0.05, 0.01))], 0.022, cups=((0.0, 0.0), (0.06, 0.0)), valve=valve)
-    assert pressed.attempts.hits.numpy().tolist() == [[217, good]]
+    assert pressed.attempts.hits.numpy().tolist() == [[304, good]]
     assert pressed.attached() == [[1, 0, 0, 0]]
     config = load_config("smoke", {"suction.vacuum": PRESSURE / 1e3, "gripper.cup_width": 0.022})
     assert pressed.seals.break_force.numpy()[0].tolist() == pytest.approx(

@@ -216,7 +216,7 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
     if attempt.hits:
         seal = f"{'good' if attempt.good_seal else 'poor'} seal, breaks"
         if attempt.sealed is not None:
-            seal = f"{len(attempt.sealed)} of {attempt.rays // sum(suction.rings)} cups with a good seal, break"
+            seal = f"{len(attempt.sealed)} of {attempt.rays // (suction.rays + suction.mouth_rays)} cups with a good seal, break"
         lines[0] += f"; {seal} at {break_force(attempt, suction):.3g} N"
         peak = f"; largest force {max(attempt.peak_force):.1f} N" if attempt.peak_force else ""
         lines.append(f"engaged: {_listed(attempt.engaged, full)}{peak}")

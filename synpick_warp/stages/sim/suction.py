@@ -40,7 +40,7 @@ class SuctionHold:
         self._meshes = render_scene.keep
         self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
         self.mouth = None if settings.vacuum is None else _mouth_data(settings, device)
-        self.rays = sum(settings.rings)
+        self.rays = settings.rays + settings.mouth_rays
         self._scratch: dict[str, wp.array] = {}
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
@@ -102,18 +102,17 @@ def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp
 
 
 def _mouth_data(settings: Suction, device: wp.Device) -> Any:
-    """Fill `MouthData`: rings of rays as far apart as the rays on the lip; each ray stands for its share of its ring's annulus."""
-    radius, rings = settings.radius, settings.rings
-    rows: list[tuple[float, float, float]] = []
-    for ring, count in enumerate(rings):
-        middle, half = 1.0 - ring / (len(rings) - 1), 0.5 / (len(rings) - 1)
-        area = math.pi * radius**2 * (min(middle + half, 1.0) ** 2 - max(middle - half, 0.0) ** 2) / count
-        angles = (math.tau * index / count for index in range(count))
-        rows += [(middle * radius * math.cos(angle), middle * radius * math.sin(angle), area) for angle in angles]
+    """Fill `MouthData`: rays on the lip, and within it on a spiral on which each stands for the same area (Vogel, 1979)."""
+    radius, count = settings.radius, settings.mouth_rays
+    lip, within = math.tau * np.arange(settings.rays) / settings.rays, np.arange(count)
+    angle = np.concatenate([lip, math.pi * (3.0 - math.sqrt(5.0)) * within])
+    way = np.concatenate([np.ones_like(lip), np.sqrt((within + 0.5) / count)])
+    area = np.concatenate([np.zeros_like(lip), np.full(count, math.pi * radius**2 / count)])
+    rays = np.column_stack([radius * way * np.cos(angle), radius * way * np.sin(angle), area])
     return fill(
         vacuum.MouthData,
         settings,
-        ray=wp.array(np.array(rows), dtype=wp.vec3, device=device),
+        ray=wp.array(rays, dtype=wp.vec3, device=device),
         lip=settings.rays,
         compliance=2.0 * radius * (settings.compliance or 0.0),
         tilt=math.tan(math.radians(settings.swing_limit)),
