@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Mode, Outcome, Task
+from synpick_warp.codes import Ending, Measure, Mode, Outcome, Task
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, ROOM, Ticks, World, bits, new_world, play, report, run
@@ -125,6 +125,15 @@ def test_caught_and_picked_are_the_attempts_own(mixed):
     assert [one.hits for one in attempts] == [RAYS, RAYS - 2, 1, 0, 0]
     assert [one.good_seal for one in attempts] == [True, False, False, False, False]
     assert [(one.target, one.object_id) for one in attempts] == [(1, 3), (0, 21), (0, 21), (3, 8), (None, None)]
+
+
+def test_with_a_vacuum_an_attempt_has_the_break_force_of_what_it_engaged(device, mixed):
+    world, suction = new_world(device), settings(suction__vacuum=60.0).suction
+    world.measures[0, Measure.BREAK_FORCE] = 12.5
+    attempts = by_number(play({world: every_outcome(world)}, AttemptLog(suction, CONFIG.perception.resolution, OBJECT_IDS)))[5].attempts
+    assert [json.loads(one.line()).get("break_force") for one in attempts] == [12.5] * 3 + [None] * 2
+    assert {one.rays for one in attempts} == {48 + 256}
+    assert "break_force" not in by_number(mixed)[5].attempts[0].line()
 
 
 def test_an_attempt_keeps_what_its_own_look_saw(mixed):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import itertools
 import json
 import math
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -14,12 +16,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 import synpick_warp
 from synpick_warp.apps.statistics import collect as collecting
 from synpick_warp.apps.statistics import partial as partials
 from synpick_warp.apps.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
-from synpick_warp.apps.statistics.attempts import FORCE_BIN
+from synpick_warp.apps.statistics.attempts import FORCE_BIN, EpisodeCounts
 from synpick_warp.apps.statistics.bins import BinCounts, BinUse
 from synpick_warp.apps.statistics.collect import SceneTask, collect
 from synpick_warp.apps.statistics.compute import assemble, compute_statistics
@@ -27,11 +30,13 @@ from synpick_warp.apps.statistics.counting import Group
 from synpick_warp.apps.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, SECTORS, CoverageCounts, direction_bins
 from synpick_warp.apps.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
 from synpick_warp.apps.statistics.lights import LightCounts
+from synpick_warp.apps.statistics.output import print_statistics
 from synpick_warp.apps.statistics.partial import Partial
-from synpick_warp.apps.statistics.records import BinFacts, Light
+from synpick_warp.apps.statistics.records import AttemptFacts, BinFacts, EpisodeFacts, Light
 from synpick_warp.apps.statistics.scenes import SceneTruth
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.apps.statistics.timeline import TIME_BIN, TimelineCounts
+from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, PERIOD, PRISM, VISIBILITY, write_evaluation_set
@@ -111,6 +116,22 @@ def test_attempts_and_seal_forces_have_the_known_answers(statistics):
     assert (pick.seals, pick.good_seals, pick.force) == (2, 1, pytest.approx((5.5 + 500.0) / 2))
     assert {index: count for index, count in enumerate(pick.force_histogram) if count} == {int(5.5 / FORCE_BIN): 1, 29: 1}
     assert statistics.total.episodes.attempts == 3
+
+
+@pytest.mark.parametrize(("forces", "load"), [(((5.5, True, None), (0.3, False, None)), 15), (((8.0, False, 40.0), (2.1, True, 5.0)), 42)])
+@pytest.mark.parametrize("broken", [0, 1])
+def test_a_line_tells_that_no_seal_came_near_its_break_force(statistics, forces, load, broken):
+    """Of the settings, 40 and 2 N, or of the attempt; one that broke is near it."""
+    rows = [
+        AttemptFacts("target_picked", good, [1], [0.0, force], limit) for force, good, limit in (*forces, *[(2.5, False, None)] * broken)
+    ]
+    counts = EpisodeCounts()
+    counts.add_episode(Group("a", "pick"), EpisodeFacts("pick", 9, "finished"), rows, Suction())
+    episodes = counts.result(counts.groups())
+    assert episodes.largest_load == (100 if broken else load)
+    console = Console(file=io.StringIO(), width=200)
+    print_statistics(console, replace(statistics, total=replace(statistics.total, episodes=episodes)))
+    assert (f"no seal was loaded beyond {load} % of its break force" in console.file.getvalue()) == (not broken)
 
 
 def test_bins_have_the_known_answers_and_merge(statistics):

@@ -276,6 +276,8 @@ def test_what_the_seal_bore():
     assert seal_words(poor, NAMES, Config().suction) == said
     four = attempt((FIRST,), {}, 0, rays=40, hits=37, good_seal=False, sealed=[0, 1, 3], engaged=(7,))
     assert seal_words(four, NAMES, Config().suction)[0] == "rays: 37 of 40 hit; 3 of 4 cups with a good seal, break at 40 N"
+    weak = attempt((FIRST,), {}, 0, rays=304, hits=290, good_seal=False, break_force=3.456)
+    assert seal_words(weak, NAMES, Config().suction)[0] == "rays: 290 of 304 hit; poor seal, breaks at 3.46 N"
     assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config().suction) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config().suction) == []
 
