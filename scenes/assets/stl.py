@@ -29,7 +29,7 @@ def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
     count = int.from_bytes(data[80:_HEADER], "little")
     # Binary files may begin with "solid" as well, and text with any word: the announced size decides first.
     exact = len(data) >= _HEADER and len(data) == _HEADER + count * _TRIANGLE.itemsize
-    if exact or (len(data) >= _HEADER and b"\0" in data[:_HEADER] and "vertex" not in decode_text(data[:_SAMPLE]).lower()):
+    if exact or (len(data) >= _HEADER and b"\0" in data[:_SAMPLE] and not _VERTEX.search(decode_text(data[:_SAMPLE]))):
         corners = _binary(data, count, path, notes)
     else:
         corners = _text(data, path)

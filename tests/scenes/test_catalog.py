@@ -122,28 +122,6 @@ def test_other_meshes_beside_bop_models_are_reported_as_ignored(tmp_path):
     assert any("1 meshes" in line and "ignored" in line for line in lines)
 
 
-def test_concave_by_volume_ratio_or_by_row(tmp_path, monkeypatch):
-    asked = {}
-
-    def remember(names, meshes, recipes, cache_dir, report, seconds):
-        asked.update({name: recipe.concave for name, recipe in zip(names, recipes, strict=True)})
-        raise CatalogError("enough")
-
-    monkeypatch.setattr(catalog, "collision_shapes", remember)
-    tube = trimesh.creation.annulus(0.04, 0.05, 0.1)
-    for name in ("hollow", "ruled"):
-        put(tmp_path / f"{name}.ply", exported(tube))
-    write_box(tmp_path / "solid.ply")
-    write_box(tmp_path / "wanted.ply")
-    rows = (ObjectRow(name="ruled", concave=False), ObjectRow(name="wanted", concave=True))
-    with pytest.raises(CatalogError, match="enough"):
-        load_catalog(config_for(tmp_path, rows), tmp_path / "cache")
-    assert asked == {"hollow": True, "ruled": False, "solid": False, "wanted": True}
-    with pytest.raises(CatalogError, match="enough"):
-        load_catalog(config_for(tmp_path, rows, concave_ratio=0.1), tmp_path / "cache")
-    assert asked["hollow"] is False
-
-
 def fails(config: Config, cache: Path, *words: str) -> None:
     """Objects that cannot be used are errors; without `strict` they are left out (`test_folder_cases.py`)."""
     with pytest.raises(CatalogError) as caught:

@@ -184,13 +184,15 @@ def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
     assert finish.color == (0.7, 0.7, 0.7)
 
 
+@pytest.mark.parametrize("header", [bytes(80), b"solid vertex".ljust(80, b"\0"), b" " * 80])
 @pytest.mark.parametrize(
-    ("announced", "more", "count"), [(12, 0, 12), (0, 0, 12), (0, 3, 12), (5, 0, 12), (12, 3, 12), (11, 60, 11), (13, 0, 0), (2**24, 0, 0)]
+    ("announced", "more", "count"),
+    [(12, 0, 12), (0, 0, 12), (0, 3, 12), (5, 0, 12), (12, 3, 12), (11, 60, 11), (13, 0, 0), (2**32 - 1, 0, 0)],
 )
-def test_a_binary_stl_has_as_many_triangles_as_its_body(tmp_path, announced, more, count):
+def test_a_binary_stl_has_as_many_triangles_as_its_body(tmp_path, header, announced, more, count):
     """Unless bytes that are no triangles follow those announced."""
     data, said = exported(trimesh.creation.box((1, 1, 1)), "stl"), []
-    path = put(tmp_path / "a.stl", data[:80] + struct.pack("<I", announced) + data[84:] + bytes(more))
+    path = put(tmp_path / "a.stl", header + struct.pack("<I", announced) + data[84:] + bytes(more))
     if not count:
         with pytest.raises(CatalogError, match=f"announces {announced} triangles"):
             read_mesh(path, 1.0)

@@ -88,13 +88,14 @@ def test_a_density_that_is_set_is_over_meshes_unless_hulls_are_asked_for():
     ] == ["hull", "mesh", "hull"]
 
 
-def test_a_row_leaves_what_it_does_not_name_to_the_rules(tmp_path):
+@pytest.mark.parametrize("concave", [None, False])
+def test_a_row_leaves_what_it_does_not_name_to_the_rules(tmp_path, concave):
     """It gave 0.1 kg, and the hull of a bracket."""
-    row = ObjectRow(name="part", symmetries_discrete=((0.0, 1.0, 0.0, 2.0),))
+    row = ObjectRow(name="part", concave=concave)
     config = Config(objects=Objects(density=STEEL, mass_volume="mesh"), object_rows=(row,))
     entry, lines = load(tmp_path, bracket(60.0).apply_scale(1e-3), config)
     assert entry.mass == pytest.approx(STEEL * 23.49e-6)
-    assert len(entry.pieces) > 1, lines
+    assert (len(entry.pieces) > 1) == (concave is None), lines
 
 
 # ---- concavity ----
