@@ -1,4 +1,5 @@
-"""Bake on a Ray cluster (`bake --engine ray`): the driver places claiming workers, replaces dead ones, and shows what they report."""
+"""Bake on a Ray cluster (`bake --engine ray`): a task a GPU or core runs a claiming worker; Ray places and restarts them, claims in the
+store deal the episodes out."""
 
 from __future__ import annotations
 
@@ -13,39 +14,40 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 from synpick_warp import __version__
-from synpick_warp.cloud.claims import open_claims, plan_chunks
-from synpick_warp.cloud.crew import RAY, Crew, CrewProgress
+from synpick_warp.cloud.claims import Chunks, open_claims, plan_chunks
+from synpick_warp.cloud.crew import RAY, Crew
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.ray_worker import Board, Report, Worker
-from synpick_warp.cloud.run import Job
+from synpick_warp.cloud.run import Job, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.errors import DeviceError
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DeviceError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.pipeline import with_measures
+from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.interrupt import StopRequest
-from synpick_warp.system.progress import Progress
+from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.system.stores.opening import open_store, probe
 
 VERSIONS = ((2, 52), (3,))
 """Versions of Ray, from the first one, which has token authentication, to before the second one."""
-_POLL = 1.0
-"""Interval of reports [s]."""
+RETRIES = 20
+"""Deaths of a worker after which the bake ends with an error."""
+_POLL = 5.0
+"""Interval at which the done chunks are counted [s]."""
 _ANSWER = 5.0
 """Connection timeout [s]."""
 _ENDING, _STOPPING = 30.0, 120.0
 """Longest wait for workers: once one has found that all is done, and once they are asked to stop, and upload what is finished [s]."""
-MAX_DEATHS = 5
-"""Deaths of a worker and its successors without an episode between them, after which the bake ends with an error."""
 _SAID = 300
 """Maximum length of an error message of Ray that is shown; longer ones are cut [characters]."""
 STORE_BYTES = 100 << 20
-"""Size of a local cluster's object store [B]: workers send counts."""
+"""Size of a local cluster's object store [B]: workers return counts."""
 _PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 """Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
@@ -63,27 +65,85 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         progress: Observer.
 
     Returns:
-        Summary of the chunks that ended in this run.
+        Summary of the workers that ended.
 
     Raises:
         SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
     """
     job = replace(job, config=with_measures(job.config, ()))
-    config, url, ranges = job.config, job.url, DataLayout.of(job.config).plan(job.splits)
-    planned = sum(map(len, ranges))
     address = find_address(crew.engine)
     ray = import_ray(address)
-    store = open_store(url)
-    ledger = Ledger(store, config, probe(store))
+    store = open_store(job.url)
+    ledger = Ledger(store, job.config, probe(store))
     claims = open_claims(ledger, job.lease)
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
     with _cluster(ray, address, crew.workers):
-        device, each = _resources(ray, config.bake.device, crew.workers)
-        before = plan_chunks(ledger, claims, ranges).count_over()
-        return _Driver(ray, crew, progress, pickle.dumps(job), device, each, (before, planned)).run()
+        device, each, count = _resources(ray, job.config.bake.device, crew.workers)
+        start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
+        calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
+        return _await(ray, calls, crew, progress, plan_chunks(ledger, claims, DataLayout.of(job.config).plan(job.splits)))
+
+
+def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummary | str:
+    """Ray task: claim and bake chunks until all episodes of a job are done; returns the summary, or an error that the user can correct.
+
+    Args:
+        version: Version of the driver's synpick_warp.
+        data: Pickled `Job`.
+        device: Device of the bakes.
+        cores: CPU cores of this worker.
+    """
+    if version != __version__:
+        return f"a Ray worker has synpick-warp {__version__}, and this command {version}; install one version everywhere"
+    job: Job = pickle.loads(data)
+    limit_threads(cores)
+    real, own = job.bake or keeping_baker(), {"bake.device": device, "bake.writers": job.config.bake.writers or cores}
+
+    def bake(config: Config, *given: Any) -> BakeSummary:
+        return real(config.with_values(own), *given)
+
+    try:
+        return bake_into_store(job.config, job.url, SilentProgress(), splits=job.splits, bake=bake, claim=True, lease=job.lease)
+    except SynpickError as error:
+        return str(error) or type(error).__name__
+
+
+def _await(ray: Any, calls: list[Any], crew: Crew, progress: Progress, chunks: Chunks) -> BakeSummary:
+    """Show how many episodes are done until the calls of `run_worker` have ended; a signal stops them. Returns the sum of their summaries.
+
+    Raises:
+        DeviceError: A worker reports an error that the user can correct, or has died too often.
+    """
+    summary, deadline, last = BakeSummary(), float("inf"), time.monotonic()
+    started, before, planned = last, chunks.count_over(), chunks.sizes.episodes
+    with StopRequest() as stop:
+        while calls and time.monotonic() < deadline:
+            ended, calls = ray.wait(calls, timeout=_POLL)
+            for call in ended:
+                try:
+                    found = ray.get(call)
+                except (ray.exceptions.TaskCancelledError, KeyboardInterrupt):
+                    continue
+                except ray.exceptions.RayError as error:
+                    raise DeviceError(f"a worker died {RETRIES + 1} times ({_describe(error)}); the same command resumes") from error
+                if isinstance(found, str):
+                    raise DeviceError(found)
+                summary.total += found.total
+                summary.take_summary(found)
+                deadline = min(deadline, time.monotonic() + _ENDING)
+            if stop.number and not summary.stopped:
+                summary.stopped, deadline = stop.number, time.monotonic() + _STOPPING
+                for call in calls:
+                    ray.cancel(call)  # An interrupt, which `StopRequest` of the running bake takes.
+            now, done = time.monotonic(), chunks.count_over()
+            crew.alive, crew.seconds, last = len(calls), crew.seconds + len(calls) * (now - last), now
+            left = (now - started) * (planned - done) / (done - before) if done > before else None
+            progress.update(episodes_done=done, episodes=planned, worlds_active=0, views=0, views_per_s=0.0, seconds_left=left)
+    summary.wall_seconds = time.monotonic() - started
+    return summary
 
 
 def import_ray(address: str | None) -> Any:
@@ -139,8 +199,6 @@ def _cluster(ray: Any, address: str | None, workers: int) -> Iterator[None]:
             given |= {"_temp_dir": folder, "num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
         try:
             ray.init(**given)
-            # Otherwise logs of dead nodes go through the display, whatever `log_to_driver` is.
-            ray._private.worker.print_to_stdstream = lambda *_, **__: None
         except Exception as error:  # ConnectionError, RuntimeError, ValueError and classes of Ray's, each for several reasons.
             raise DeviceError(f"Ray cannot be used at {address or 'this machine'}: {_describe(error)}") from error
         try:
@@ -160,8 +218,8 @@ def _describe(error: Exception) -> str:
     return text if len(text) <= _SAID else f"{text[:_SAID]}…"
 
 
-def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, float]]:
-    """Device of a worker, and the resources that it asks for: a GPU with its part of its node's cores, or a core.
+def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, int], int]:
+    """Device of a worker, the resources that it asks for, a GPU with its part of its node's cores, or a core, and the number of workers.
 
     Raises:
         DeviceError: The cluster has no GPU, and no worker is asked for that could wait for one.
@@ -169,134 +227,8 @@ def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, floa
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     shares = [int(node.get("CPU", 0) // node["GPU"]) for node in nodes if node.get("GPU", 0) >= 1]
     if device == "cpu" or (device == "auto" and not shares and not workers):
-        return "cpu", {"num_cpus": 1}
+        return "cpu", {"num_cpus": 1}, workers or sum(int(node.get("CPU", 0)) for node in nodes)
     if not shares and not workers:
         raise DeviceError(f"bake.device is {device}, and the Ray cluster has no GPU; use --device cpu, or --workers that wait for one")
-    return "cuda:0", {"num_gpus": 1, "num_cpus": max(1, min(shares, default=1))}
-
-
-@dataclass(eq=False)
-class _Place:
-    """Place of a worker in the crew: the actor that has it at present, with a number that no other has."""
-
-    number: int = 0
-    actor: Any = None
-    """Handle, without which Ray ends the actor."""
-    deaths: int = 0
-    """Deaths since an episode was reported from here."""
-
-
-class _Driver:
-    """Main loop: places workers as resources come, replaces dead ones, adds up reports, until one worker finds that all is done."""
-
-    def __init__(
-        self, ray: Any, crew: Crew, progress: Progress, job: bytes, device: str, each: dict[str, float], counts: tuple[int, int]
-    ) -> None:
-        """
-        Args:
-            ray: The package.
-            crew: Options and costs.
-            progress: Observer.
-            job: Pickled `Job`.
-            device, each: Device and resources of a worker.
-            counts: Episodes that are done, and all.
-        """
-        self._ray, self._crew, self._progress = ray, crew, CrewProgress(progress, crew, *counts)
-        self._resource = "GPU" if "num_gpus" in each else "CPU"
-        self._board = ray.remote(Board).options(num_cpus=0, max_restarts=-1).remote()
-        self._make = partial(ray.remote(Worker).options(**each).remote, self._board, __version__, job, device, int(each["num_cpus"]))
-        self._places: list[_Place] = []
-        self._flight: dict[Any, _Place] = {}
-        """Calls that run, by their references."""
-        self._reports: dict[int, Report] = {}
-        """Last report of each actor, also of those that have ended."""
-        self._summary, self._noted, self._stop = BakeSummary(), set[str](), StopRequest()
-
-    def run(self) -> BakeSummary:
-        """Bake; returns the summary. At the end it waits for workers that run, after a request to stop for those that bake.
-
-        Raises:
-            SynpickError: An error that the user can correct.
-        """
-        started, deadline, last = time.monotonic(), None, set[int]()
-        with self._stop:
-            while deadline is None or (last & {place.number for place in self._flight.values()} and time.monotonic() < deadline):
-                if deadline is None:
-                    wanted = self._crew.workers or int(self._ray.cluster_resources().get(self._resource, 0))
-                    while len(self._places) < wanted:
-                        self._places.append(_Place())
-                        self._start(self._places[-1])
-                is_over = self._take_ended()
-                if deadline is None and (is_over or self._stop.number):
-                    deadline = time.monotonic() + (_STOPPING if self._stop.number else _ENDING)
-                    last = {number for number, report in self._alive.items() if report.busy or not self._stop.number}
-                self._collect()
-                self._show()
-        self._summary.stopped, self._summary.wall_seconds = self._stop.number, time.monotonic() - started
-        return self._summary
-
-    @property
-    def _alive(self) -> dict[int, Report]:
-        """Last reports of the workers that run, by number."""
-        return {place.number: self._reports[place.number] for place in self._flight.values() if place.number in self._reports}
-
-    def _start(self, place: _Place) -> None:
-        """Have a new actor take a place; it waits for its resources by itself."""
-        place.number = 1 + max(each.number for each in self._places)
-        place.actor = self._make(place.number)
-        self._flight[place.actor.work.remote()] = place
-
-    def _take_ended(self) -> bool:
-        """Wait for a call to end, for _POLL at most, and replace workers that have died.
-
-        Returns:
-            Whether one ended since all is done, or since it was to stop.
-
-        Raises:
-            DeviceError: A worker reports an error that the user can correct, or too many have died in one place.
-        """
-        if not self._flight:
-            time.sleep(_POLL)
-        for call in self._ray.wait(list(self._flight), timeout=_POLL)[0] if self._flight else ():
-            place = self._flight.pop(call)
-            try:
-                said = self._ray.get(call)
-            except self._ray.exceptions.RayActorError as error:
-                said = 0, _describe(error)
-            if isinstance(said, str) and said:
-                raise DeviceError(said)
-            if not said or self._stop.number:
-                return True
-            self._collect()
-            place.deaths += 1
-            if place.deaths >= MAX_DEATHS:
-                raise DeviceError(f"{MAX_DEATHS} workers died one after the other without an episode ({said}); the same command resumes")
-            self._progress.note(f"worker {place.number} died, another one takes its place")
-            self._start(place)  # The claim of the dead one runs out, and some worker takes its chunk.
-        return False
-
-    def _collect(self) -> None:
-        """Take the reports from the board; none come while it moves to another node."""
-        reports: dict[int, Report] = {}
-        with contextlib.suppress(self._ray.exceptions.RayActorError, self._ray.exceptions.GetTimeoutError):
-            reports = self._ray.get(self._board.collect.remote(self._stop.number), timeout=_ENDING)
-        for number, report in reports.items():
-            for note in report.notes:
-                if note not in self._noted:
-                    self._noted.add(note)
-                    self._progress.note(note)
-            for chunk in report.chunks:
-                self._summary.total += chunk.total
-                self._summary.take_summary(chunk)
-            if report.episodes > self._reports.get(number, Report()).episodes:
-                for place in self._places:
-                    place.deaths = 0 if place.number == number else place.deaths
-            self._reports[number] = report
-
-    def _show(self) -> None:
-        """Update the display: totals over all workers."""
-        alive = self._alive
-        self._crew.alive = len(alive)
-        done, views = (sum(getattr(report, name) for report in self._reports.values()) for name in ("episodes", "views"))
-        worlds = sum(report.worlds for report in alive.values())
-        self._progress.update(episodes_done=done, episodes=0, worlds_active=worlds, views=views, views_per_s=0.0, seconds_left=None)
+    gpus = sum(int(node.get("GPU", 0)) for node in nodes)
+    return "cuda:0", {"num_gpus": 1, "num_cpus": max(1, min(shares, default=1))}, workers or gpus

@@ -18,7 +18,7 @@ from tests.harness import scripted_bake
 
 
 def bake_or_die(marker: str, config, out, progress, *given):
-    """Kill this process, and so the actor, in the first chunk of all."""
+    """Kill this process, and so the worker, in the first chunk of all."""
     if not Path(marker).exists():
         Path(marker).touch()
         os.kill(os.getpid(), signal.SIGKILL)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -16,8 +15,6 @@ from rich.console import Console
 
 from synpick_warp.cli.display import make_progress
 from synpick_warp.cloud.ray_engine import Crew
-from synpick_warp.cloud.ray_worker import Board, Report, Reporter
-from synpick_warp.factory.episodes import BakeSummary
 from tests.builders import mistake
 from tests.cloud.conftest import files, tiny
 from tests.cloud.mortal import stored
@@ -28,7 +25,7 @@ S3 = ("bake", "--config", "smoke", "--device", "cpu", "--out", "s3://bucket/set"
 
 @pytest.mark.slow(minutes=1)
 def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, tmp_path):
-    """Two workers; the first that claims a chunk is killed in it, another actor takes its place, and its chunk is dealt again."""
+    """Two workers; the first that claims a chunk is killed in it, Ray starts it again, and its chunk is dealt again."""
     pytest.importorskip("ray")
     (tmp_path / "home").mkdir()
     with tempfile.TemporaryDirectory(dir="/tmp") as short:  # Paths of sockets have 107 characters.
@@ -38,9 +35,9 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
         assert ran.returncode == 0, ran.stdout + ran.stderr
         assert list(Path(short).iterdir()) == []
     assert list((tmp_path / "home").iterdir()) == []
-    assert "died, another one takes its place" in ran.stdout
-    assert "workers · cost" in ran.stdout
-    assert "(raylet)" not in ran.stdout + ran.stderr
+    assert (tmp_path / "died").exists()
+    assert "worker · cost" in ran.stdout or "workers · cost" in ran.stdout
+    assert "A worker died" in ran.stdout  # Ray's own notice.
     scripted_bake.bake(tmp_path / "local", tiny(12).with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
 
@@ -71,31 +68,6 @@ def test_ray_is_missing_or_of_another_version(ray, said, monkeypatch):
     assert said in mistake(*S3, "--engine", "ray")
 
 
-def test_a_worker_reports_sums_over_chunks_and_stops_on_request():
-    """What the board has not handed over adds up; a request to stop comes with the answer to a report, and is a signal."""
-    board, got = Board(), []
-    reporter = Reporter(lambda report: board.post(7, report), lambda answer: answer)
-    counts = {"episodes": 9, "worlds_active": 2, "views_per_s": 4.0, "seconds_left": None}
-    before = signal.signal(signal.SIGTERM, lambda *_: got.append("stopped"))
-    try:
-        for number in range(2):
-            ended: list[BakeSummary] = []
-            with reporter.chunk(ended):
-                reporter.note(f"chunk {number}")
-                reporter.update(episodes_done=1, views=3, **counts)
-                ended.append(BakeSummary(1, episodes=[None], views=3))
-        report = board.collect(0)[7]
-        assert (report.busy, report.episodes, report.views, report.worlds, len(report.chunks)) == (False, 2, 6, 0, 2)
-        assert report.notes == ["chunk 0", "chunk 1"]
-        assert board.collect(15) == {}
-        reporter.note("next")
-        assert got == []
-        reporter.update(episodes_done=1, views=3, **counts)
-        assert got == ["stopped"]
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def test_the_display_shows_workers_and_what_they_have_cost():
     crew, out = Crew(price=2.5, alive=3), io.StringIO()
     crew.seconds = 3600.0
@@ -103,4 +75,3 @@ def test_the_display_shows_workers_and_what_they_have_cost():
         progress.update(episodes_done=1, episodes=2, worlds_active=4, views=5, views_per_s=6.0, seconds_left=7.0)
     assert "worlds 4 · views 5 · 6.0 views/s · 0:07 left · 3 workers · cost 2.50" in out.getvalue()
     assert str(Crew(alive=1)) == "1 worker"
-    assert Report().busy is False
