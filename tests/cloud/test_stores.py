@@ -211,6 +211,8 @@ def test_a_place_is_a_folder_or_a_prefix(place, found):
     ("place", "said"),
     [
         *((f"{scheme}://a/b", "allowed: s3://") for scheme in ("memory", "hdfs", "hf", "sftp", "local", "http", "data", "s3a", "abfs")),
+        (Path("memory://"), "allowed: s3://"),
+        (Path("simplecache::s3://b/x"), "allowed: s3://"),
         ("hf://datasets/a", "bake into a folder for other services"),
         ("s3a://b/x", "did you mean s3?"),
         *((f"{scheme}:bucket", "has not two slashes") for scheme in ("s3", "gs", "az")),

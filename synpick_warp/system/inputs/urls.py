@@ -12,7 +12,7 @@ SCHEMES = ("s3", "gs", "az")
 """Schemes of object stores."""
 FILE = "file"
 _ALLOWED = "allowed: s3://bucket/prefix, gs://bucket/prefix, az://container/prefix, or a folder, also as file:///folder"
-_URL = re.compile(r"([a-z][a-z0-9+.-]+):(/{,2})(.*)", re.DOTALL | re.IGNORECASE)
+_URL = re.compile(r"([a-z][a-z0-9+.-]+(?:::[a-z0-9+.-]+)*):(/{,2})(.*)", re.DOTALL | re.IGNORECASE)
 _WORD = re.compile(rf"(--[a-z][a-z-]*=)?((?:{'|'.join((*SCHEMES, FILE))}):.*)", re.DOTALL | re.IGNORECASE)
 _BUCKET = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{,218}[A-Za-z0-9])?")
 _SECRET = re.compile(r"[@?#]|%(?:40|3f|23)", re.IGNORECASE)
@@ -29,7 +29,7 @@ def parse_place(place: Path | str) -> Path | str:
     """
     match = _URL.fullmatch(str(place))
     scheme = match[1].lower() if match else ""
-    if match is None or (not match[2] and scheme not in (*SCHEMES, FILE)):
+    if match is None or (match[3] and not match[2] and scheme not in (*SCHEMES, FILE)):
         return Path(place)
     rest = match[3].rstrip("/")
     shown = f"{scheme}://…" if _SECRET.search(rest) else shorten(f"{scheme}:{match[2]}{rest}")
