@@ -15,6 +15,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.dataset.bop.measured import measure_info
+from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from tests.builders import run
 from tests.validation.conftest import good  # noqa: F401
@@ -247,6 +248,42 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
     assert run("validate", out)[0] == 0
 
 
+def test_each_sensor_becomes_a_scene(folders, tmp_path):
+    assert run("convert", folders["multisensor"], "--to", "shards,coco,yolo", "--out", tmp_path / "out", "--threads", 1)[0] == 0
+    source, made = synpick_warp.open(folders["multisensor"]), synpick_warp.open(tmp_path / "out")
+    assert list(made) == [0, 1, 2]
+    for theirs in source.views():
+        ours = made[theirs.camera].view(theirs.frame)
+        for key, values in rows(theirs).items():
+            np.testing.assert_array_equal(values, rows(ours)[key], err_msg=key)
+    assert "those of scene s and its sensors " in (tmp_path / "out/dataset_info.md").read_text()
+    assert run("validate", tmp_path / "out")[0] == 0
+
+
+def test_masks_are_rendered_where_a_set_has_none(plain, tmp_path):
+    """Those of the bake, but for pixels on edges; the classes are those of the models, and what was made is noted."""
+    expected = [(view.episode, view.image_id, mask) for view in synpick_warp.open(plain).views() for mask in view.masks if mask.any()]
+    for path in [*plain.glob("test/*/mask*"), *plain.glob("test/*/scene_gt_info.json")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for folder in ("models", "models_eval"):
+        shutil.copyfile(plain / folder / "obj_000003.ply", plain / folder / "obj_000009.ply")
+    code, said, _ = run("convert", plain, "--to", "coco,yolo", "--out", tmp_path / "out", "--threads", 2)
+    assert code == 0
+    assert "Masks are rendered from models and poses" in said
+    content = json.loads((tmp_path / "out/coco/annotations/instances_test.json").read_text())
+    assert len(content["annotations"]) == len(expected)
+    for one, (_, _, mask) in zip(content["annotations"], expected, strict=True):
+        made = decode_run_lengths(one["segmentation"]["counts"], mask.shape)
+        assert np.count_nonzero(made != mask) <= 0.01 * mask.sum()
+    assert "Masks are rendered from models and poses" in (tmp_path / "out/dataset_info.md").read_text()
+    assert "nc: 3\n" in (tmp_path / "out/yolo/data.yaml").read_text(), "9 is in no image"
+    shutil.rmtree(plain / "models")
+    shutil.rmtree(plain / "models_eval")
+    code, _, said = run("convert", plain, "--to", "yolo", "--out", tmp_path / "none", "--threads", 1)
+    assert code == 2
+    assert "has no masks of visible parts (mask_visib), nor models and cameras to render them, which it needs" in said
+
+
 def test_a_split_is_converted(folders, tmp_path):
     words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--threads", 1)
     assert run(*words)[0] == 0
@@ -276,7 +313,6 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path)
         ("tless", "bop", "--to names bop, which .* has already"),
         ("tless", "nothing", "--to names nothing; allowed: bop, shards, coco, yolo"),
         ("ycbv", "coco", "has the splits test, train_pbr; choose one by --split"),
-        ("multisensor", "coco", "has 3 sensors; convert takes"),
     ],
 )
 def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, name, to, said):

@@ -7,18 +7,24 @@ The result has no settings and no manifest either. It is written to a temporary 
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from itertools import repeat
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from synpick_warp.apps.conversion.rendered import REMARK, render_masks
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.layout import TARGETS
+from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.dataset.bop.models import models_folder
 from synpick_warp.dataset.bop.scenes import FoundScenes
 from synpick_warp.dataset.object_names import object_names
@@ -47,11 +53,13 @@ from synpick_warp.views.frames import EpisodeEnd
 _IMAGES = {"views", "masks"}
 """Kinds of `formats.Content` that these data sets have."""
 _NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
-_NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib)"}
+_NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib), nor models and cameras to render them"}
 _NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
 """What formats need of a scene, by the names of `SceneFiles.has`."""
 _BAKED = (CAMERA_FILE, "README.md")
 """Files of exporters that describe a bake, its camera or its licence."""
+_CAMERA = re.compile(r"camera(_\w+)?\.json")
+"""Cameras of a split or a sensor."""
 _JPEG_QUALITY = 95
 """JPEG quality of colour images that are encoded again: they are neither PNG nor JPEG, or differ in type from the first one."""
 
@@ -59,8 +67,20 @@ _JPEG_QUALITY = 95
 class FoundViewFiles(StoredViewFiles):
     """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, amodal masks may be missing."""
 
-    suffix, size = "", (0, 0)
-    """Of all colour images; width and height [px]."""
+    suffix, size, root = "", (0, 0), Path()
+    """Of all colour images; width and height [px]; folder of the data set."""
+
+    @property
+    def gt_info(self) -> list[dict[str, Any]]:
+        """See `EncodedView`; measured where masks are rendered."""
+        if self.files.has("mask_visib") or self.files.has("gt_info"):
+            return super().gt_info
+        return measure_info([visible for _, visible in self._rendered], [amodal for amodal, _ in self._rendered])
+
+    @cached_property
+    def _rendered(self) -> list[tuple[np.ndarray, ...]]:
+        """Amodal and visible masks of a view without any."""
+        return render_masks(self.root, self.files, self.frame, self.camera, self.gt)
 
     @property
     def color(self) -> tuple[str, Buffer]:
@@ -81,7 +101,9 @@ class FoundViewFiles(StoredViewFiles):
         return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`; where there are no amodal masks, COCO's formats need none."""
+        """See `EncodedView`; where there are no amodal masks, COCO's formats need none; without masks, they are rendered."""
+        if not self.files.has("mask_visib"):
+            return [Masks(find_runs(amodal), find_runs(visible)) for amodal, visible in self._rendered]
         visible = self._runs("mask_visib")
         return [Masks(*pair) for pair in zip(self._runs("mask") if self.files.has("mask") else visible, visible, strict=True)]
 
@@ -95,12 +117,13 @@ class FoundSceneFiles(StoredSceneFiles):
 
     suffix: str
     size: tuple[int, int]
+    root: Path
 
     def views(self, frames: range) -> Iterator[StoredViewFiles]:
         """See `StoredScene`."""
         for frame in frames:
             view = FoundViewFiles(self.files, self.scene, self.images[frame])
-            view.suffix, view.size = self.suffix, self.size
+            view.suffix, view.size, view.root = self.suffix, self.size, self.root
             yield view
 
 
@@ -141,8 +164,8 @@ def _found(data: DataSet) -> FoundScenes:
     return data.found
 
 
-def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> int:
-    """Convert all scenes of a data set from another source; returns their number.
+def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
+    """Convert all scenes of a data set from another source; returns their number, and what was made that the source does not have.
 
     Args:
         data: The data set.
@@ -156,33 +179,35 @@ def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: i
         DatasetError: A file is missing or damaged.
         OutputError: `out` cannot be used, or a file not be written.
     """
-    first = next((data.scene_files(index, 0) for index, episode in data.items() if len(episode)), None)
-    if first is None:
+    index = next((index for index, episode in data.items() if len(episode)), None)
+    if index is None:
         raise DatasetError(f"{data.folder} has no images")
-    _check_formats(data, first, formats)
+    firsts = [data.scene_files(index, camera) for camera in range(data.camera_count)]
+    for first in firsts:
+        _check_formats(data, first, formats)
     check_output_folder(out)
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"--out is {out}, which is not empty; name a new folder: data sets from other sources are converted as a whole")
-    settings = ExportSettings.of(_make_config(data, first, formats))
+    settings = _make_settings(data, firsts, formats)
     with output_errors(out):
         make_folder(out.parent)
         work = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:
-        count = _write(data, work, settings, processes, report)
+        contents = {content for name in formats for content in contents_of(name, settings.bop)}
+        remark = REMARK if "masks" in contents and not all(first.has("mask_visib") for first in firsts) else ""
+        count = _write(data, work, settings, processes, report, remark)
         work.chmod(0o755)
         work.rename(out)
     except OSError as error:
         raise output_error(out, error) from error
     finally:
         shutil.rmtree(work, ignore_errors=True)
-    return count
+    return count, remark
 
 
 def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
     """Check that the formats can be made of what the first scene has."""
     found = _found(data)
-    if data.camera_count > 1:
-        raise ConfigError(f"{data.folder} has {data.camera_count} sensors; convert takes data sets of one camera a scene")
     if len(found.splits) > 1:
         raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
     bop = dataclasses.replace(load_config().bop, coco=False)
@@ -195,7 +220,8 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         if (name == "bop" and isinstance(first, SceneFolder)) or (name == "shards" and first.place.suffix == ".tar"):
             raise ConfigError(f"--to names {name}, which {data.folder} has already; copy the folder")
         (kind,) = load_exporter_classes([name])
-        needs = _NEEDS | (_NEEDS_OF_MASKS if "masks" in contents[name] else {}) | (_NEEDS_OF_DEPTH if kind.writes_depth else {})
+        masks = _NEEDS_OF_MASKS if found.layout.model_files == {} or not first.has("camera") else {}
+        needs = _NEEDS | (masks if "masks" in contents[name] else {}) | (_NEEDS_OF_DEPTH if kind.writes_depth else {})
         for part, what in needs.items():
             if not first.has(part):
                 raise ConfigError(f"--to names {name}, but {first.place} has no {what}, which it needs")
@@ -207,33 +233,38 @@ def _has_masks(scene: SceneFiles) -> bool:
     return scene.has("mask") and scene.has("mask_visib")
 
 
-def _make_config(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> Config:
-    """Settings by which exporters name and lay out files; they are written nowhere."""
-    base, frame = load_config(), first.frames()[0]
-    suffix, _ = first.image_file("rgb", frame)
-    return dataclasses.replace(
+def _make_settings(data: DataSet, firsts: Sequence[SceneFiles], formats: Sequence[str]) -> ExportSettings:
+    """Settings by which exporters name and lay out files, with a camera for each sensor (`firsts`: their first scenes); they are written
+    nowhere."""
+    base, masks = load_config(), all(map(_has_masks, firsts))
+    suffixes = {first.image_file("rgb", first.frames()[0])[0] for first in firsts}
+    config = dataclasses.replace(
         base,
         bake=dataclasses.replace(base.bake, formats=tuple(formats), mode="move"),
         bop=dataclasses.replace(
             base.bop,
             split=_found(data).splits[0].removesuffix("_web"),
-            masks=_has_masks(first),
-            coco="bop" in formats and _has_masks(first),
+            masks=masks,
+            coco="bop" in formats and masks,
             keypoints=0,
-            color_format="jpg" if suffix in (".jpg", ".jpeg") else "png",
+            color_format="jpg" if suffixes <= {".jpg", ".jpeg"} else "png",
         ),
         cameras=dataclasses.replace(
-            base.cameras, positions=base.cameras.positions[:1], ups=base.cameras.ups[:1], resolution=first.image_size(frame)
+            base.cameras, positions=len(firsts) * base.cameras.positions[:1], ups=len(firsts) * base.cameras.ups[:1]
         ),
         splits=(),
         render=dataclasses.replace(base.render, layers=()),
     )
+    settings = ExportSettings.of(config)
+    sizes = (first.image_size(first.frames()[0]) for first in firsts)
+    rows = tuple(dataclasses.replace(row, resolution=size) for row, size in zip(settings.rig.rows, sizes, strict=True))
+    return dataclasses.replace(settings, rig=dataclasses.replace(settings.rig, rows=rows))
 
 
-def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, report: Report) -> int:
-    """Write a data set into a new folder; returns the number of scenes."""
+def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, report: Report, remark: str) -> int:
+    """Write a data set into a new folder, with a remark in its notes; returns the number of scenes."""
     classes = load_exporter_classes(settings.bake.formats)
-    scenes = [data.scene_id(index, 0) for index in data]
+    scenes = [_found(data).scene(index) for index in data]
     done: list[int] = []
 
     def commit(scene: int) -> None:
@@ -247,9 +278,11 @@ def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, 
         exporters.write_constants()
         for episode, scene in zip(data.values(), scenes, strict=True):
             images = tuple(episode.image_ids)
-            files = data.scene_files(episode.index, 0)
-            suffix = f".{settings.bop.color_format}"
-            exporters.write_stored(scene, [FoundSceneFiles(files, scene, images, suffix, settings.rig.sizes[0])])
+            suffix, folder = f".{settings.bop.color_format}", data.folder
+            ids = [data.scene_id(episode.index, camera) for camera in range(data.camera_count)]
+            files = [data.scene_files(episode.index, camera) for camera in range(data.camera_count)]
+            stored = [FoundSceneFiles(*each, suffix, size, folder) for *each, size in zip(files, ids, repeat(images), settings.rig.sizes)]
+            exporters.write_stored(scene, stored)
             end = EpisodeEnd(scene, 0, len(images), int(Ending.FINISHED), image_ids=images)
             exporters.end_episode(end, lambda scene=scene: commit(scene))
         pool.wait()
@@ -260,9 +293,16 @@ def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, 
         (work / name).unlink(missing_ok=True)
     listing = _found(data).layout.listing
     for name in sorted(
-        name for name in listing.files if name == CAMERA_FILE or ("bop" in settings.bake.formats and TARGETS.fullmatch(name))
+        name for name in listing.files if _CAMERA.fullmatch(name) or ("bop" in settings.bake.formats and TARGETS.fullmatch(name))
     ):
         (work / name).write_bytes(listing.read(name, MAX_IMAGE_FILE))
-    text = f"Converted by synpick-warp from the BOP data set {data.folder.resolve().name}: {len(scenes):,} scenes with their own ids.\n"
+    sensors = _found(data).sensors
+    ids = (
+        f"; those of scene s and its sensors {', '.join(sensors)} are {len(sensors)} s and following"
+        if len(sensors) > 1
+        else " with their own ids"
+    )
+    text = f"Converted by synpick-warp from the BOP data set {data.folder.resolve().name}: {len(scenes):,} scenes{ids}.\n"
+    text += f"{remark}\n" if remark else ""
     write_atomically(work / NOTES_FILE, text.encode())
     return len(scenes)

@@ -28,12 +28,14 @@ AHEAD = 2
 
 
 class Converted(NamedTuple):
-    """Result of a conversion: number of all episodes of the converted data set, and how many of them earlier runs had converted."""
+    """Result of a conversion: numbers of episodes of the converted data set and of those that earlier runs had converted, and a remark."""
 
     episodes: int
     """Episodes of the converted data set."""
     resumed: int
     """Those of earlier runs."""
+    remark: str = ""
+    """What was made that the source does not have."""
 
 
 def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report, split: str | None = None) -> Converted:
@@ -55,7 +57,8 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     data = open_data_set(folder)
     if data.found is not None:
         _check_apart(folder, out)
-        return Converted(convert_found(data if split is None else data.split(split), out, formats, processes, report), 0)
+        count, remark = convert_found(data if split is None else data.split(split), out, formats, processes, report)
+        return Converted(count, 0, remark)
     if split is not None:
         raise ConfigError("--split is for data sets from other sources; those of synpick-warp bake are converted as a whole")
     source = Source(folder)

@@ -49,5 +49,7 @@ def convert(
     unit = "episodes" if (folder / MANIFEST_FILE).exists() else "scenes"
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
     print(f"{converted.episodes:,} {unit} converted to {', '.join(names)}{before}")
+    if converted.remark:
+        print(converted.remark)
     print(f"data set: {out}")
     return 0
