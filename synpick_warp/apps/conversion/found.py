@@ -12,7 +12,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -276,12 +275,13 @@ def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, 
         context = _Context(data, work, settings, pool)
         exporters = Exporters(classes, context)
         exporters.write_constants()
-        for episode, scene in zip(data.values(), scenes, strict=True):
+        for (index, episode), scene in zip(data.items(), scenes, strict=True):
             images = tuple(episode.image_ids)
-            suffix, folder = f".{settings.bop.color_format}", data.folder
-            ids = [data.scene_id(episode.index, camera) for camera in range(data.camera_count)]
-            files = [data.scene_files(episode.index, camera) for camera in range(data.camera_count)]
-            stored = [FoundSceneFiles(*each, suffix, size, folder) for *each, size in zip(files, ids, repeat(images), settings.rig.sizes)]
+            suffix, sizes = f".{settings.bop.color_format}", settings.rig.sizes
+            stored = [
+                FoundSceneFiles(data.scene_files(index, camera), data.scene_id(index, camera), images, suffix, size, data.folder)
+                for camera, size in enumerate(sizes)
+            ]
             exporters.write_stored(scene, stored)
             end = EpisodeEnd(scene, 0, len(images), int(Ending.FINISHED), image_ids=images)
             exporters.end_episode(end, lambda scene=scene: commit(scene))

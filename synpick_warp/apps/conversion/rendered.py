@@ -52,8 +52,8 @@ def render_masks(
         measured = files.typed_image("depth", frame, None, "uint16") * np.float32(camera["depth_scale"])
     found = []
     for truth in gt:
-        pose = (np.reshape(np.asarray(truth[name], np.float64), shape) for name, shape in (("cam_R_m2c", (3, 3)), ("cam_t_m2c", 3)))
-        patch = _renderer(root).render(int(truth["obj_id"]), *pose, matrix, size, lens)
+        rotation, translation = (np.asarray(truth[name], np.float64) for name in ("cam_R_m2c", "cam_t_m2c"))
+        patch = _renderer(root).render(int(truth["obj_id"]), rotation.reshape(3, 3), translation.reshape(3), matrix, size, lens)
         window = np.s_[patch.top : patch.top + patch.depth.shape[0], patch.left : patch.left + patch.depth.shape[1]]
         nearest[window] = np.minimum(nearest[window], patch.depth)
         found.append((patch.depth, window))
