@@ -6,6 +6,8 @@ world, so that one launch copies from or to all arrays.
 
 import warp as wp
 
+from synpick_warp.codes import Phase
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -57,6 +59,27 @@ def load_rows_kernel(
         return
     live = word_of(table, world, word)
     live[0] = record[row[world], word]
+
+
+@wp.kernel
+def reset_rows_kernel(
+    # Scene:
+    table: WordTable,
+    fresh: wp.array[wp.uint32],  # (word)
+    # State:
+    phase: wp.array[int],  # (world)
+    # In:
+    resets: wp.array[int],  # (reset word)
+):
+    """Write the words `resets` of worlds that start an episode or have none (phase START or IDLE) as before the first tick.
+
+    Launched over world, reset word.
+    """
+    world, place = wp.tid()
+    if phase[world] != Phase.START and phase[world] != Phase.IDLE:
+        return
+    live = word_of(table, world, resets[place])
+    live[0] = fresh[resets[place]]
 
 
 @wp.kernel

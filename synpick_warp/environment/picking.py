@@ -189,7 +189,7 @@ class PickingEnvironment:
         if given.shape != shape:
             raise ActionError(f"actions have the shape {given.shape}; allowed: {shape}, of a {action} for each environment")
         given = np.where(active[:, None], given, np.zeros((), given.dtype))
-        if wrong := np.flatnonzero(~np.isfinite(given).all(axis=1)).tolist():
+        if wrong := np.flatnonzero(~np.isfinite(given.astype(np.float64)).all(axis=1)).tolist():
             raise ActionError(f"the action of environment {wrong[0]} is not finite: {given[wrong[0]].tolist()}")
         if action == PIXEL:
             if wrong := np.flatnonzero((given != np.floor(given)).any(axis=1)).tolist():
@@ -197,6 +197,7 @@ class PickingEnvironment:
             self._check_within(given, np.zeros(2, int), np.array(self.choice.resolution) - 1, active, "image")
         if action == POINT:
             self._check_within(given[:, :3], *self.bounds, active, "space about the bin")
+            given = np.concatenate([given[:, :3], _scaled(given[:, 3:])], axis=1)
         return given
 
     def _check_within(self, given: np.ndarray, low: np.ndarray, high: np.ndarray, active: np.ndarray, place: str) -> None:
@@ -250,3 +251,9 @@ class PickingEnvironment:
         arrays |= results or {}
         exported = {name: self.exporter.from_host(values) for name, values in arrays.items()}
         return exported | {f"_{name}": self.exporter.from_host(np.ones(self.count, bool)) for name in arrays}
+
+
+def _scaled(directions: np.ndarray) -> np.ndarray:
+    """Scale directions (environment, 3) of any length by powers of two, so that single precision holds them; their digits are kept."""
+    values = directions.astype(np.float64)
+    return np.ldexp(values, -np.frexp(np.abs(values).max(axis=1, keepdims=True))[1])

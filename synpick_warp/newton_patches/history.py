@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import newton
@@ -90,7 +91,7 @@ class History:
         self.patches: Any = solver._friction_patches
         self.matcher: Any = pipeline._contact_matcher
         self.families = [family for family in ROW_FAMILIES if hasattr(solver, f"_ws_prev_{family}{ROW_ARRAYS[0]}")]
-        self.rows = dict(_find_rows(model, state, control, solver, self.families))
+        self.rows = find_rows(model, state, control) | dict(_find_solver_rows(solver, self.families))
         self.live = kernels.ContactHistory()
         for source, names in ((self.matcher, MATCHER_ARRAYS), (solver, SOLVER_ARRAYS), (self.patches.previous, PATCH_ARRAYS)):
             for name, theirs in names.items():
@@ -108,7 +109,11 @@ class History:
         self._worlds = wp.array(np.arange(self.worlds), dtype=wp.int32, device=self.device)
         self._live_start, self._start = (wp.zeros(self.worlds + 1, dtype=wp.int32, device=self.device) for _ in range(2))
         self._kept, self._count = (wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._staging = _allocate_history(self.capacity, self.device)
+
+    @cached_property
+    def _staging(self) -> Any:
+        """Scratch of `load_contacts`: a list as long as Newton's."""
+        return _allocate_history(self.capacity, self.device)
 
     def arrays(self) -> list[wp.array]:
         """All arrays of the history."""
@@ -182,10 +187,8 @@ class History:
         )
 
 
-def _find_rows(
-    model: newton.Model, state: newton.State, control: newton.Control, solver: Any, families: Sequence[str]
-) -> Iterator[tuple[str, wp.array]]:
-    """World-major arrays of fixed size, by name: joint and body motion, forces, model data set at run time, warm start, friction patches.
+def find_rows(model: newton.Model, state: newton.State, control: newton.Control) -> dict[str, wp.array]:
+    """World-major arrays that exist before the first step, by name: joint and body motion, forces, model data set at run time.
 
     Masses and shapes of objects are not among them: they follow from the body variants (`Physics.select`).
     """
@@ -194,8 +197,11 @@ def _find_rows(
         control: ("joint_f", "joint_target_q"),
         model: ("body_variant", "joint_X_c", "shape_transform"),
     }
-    for owner, listed in names.items():
-        yield from ((name, getattr(owner, name)) for name in listed)
+    return {name: getattr(owner, name) for owner, listed in names.items() for name in listed}
+
+
+def _find_solver_rows(solver: Any, families: Sequence[str]) -> Iterator[tuple[str, wp.array]]:
+    """World-major arrays of fixed size of the solver, by name: warm start and friction patches."""
     for family in families:
         yield from ((f"{family}{name}", getattr(solver, f"_ws_prev_{family}{name}")) for name in ROW_ARRAYS)
     patches = solver._friction_patches

@@ -53,6 +53,31 @@ def test_points_beside_the_bin_are_refused(target, point):
         target.step([[0, 0, 0.1, 0, 0, 1], [*point, 0, 0, 1]])
 
 
+@pytest.mark.parametrize("length", [2.0**900, 1e300, 3, 2.0**-900, 1e-300])
+def test_directions_of_any_length_are_directions(target, length):
+    """To the bit where the factor is a power of two; 1e300 is infinite in single precision, and 1e-300 is 0."""
+    target.reset(seed=3)
+    unit = np.array([[0.0, 0.0, 0.1, 0.3, -0.2, 1.0]] * 2)
+    active, scaled = np.ones(2, bool), target.check_actions(np.concatenate([unit[:, :3], unit[:, 3:] * length], axis=1), np.ones(2, bool))
+    plain = target.check_actions(unit, active)[:, 3:]
+    cosines = (scaled[:, 3:] * plain).sum(1) / np.linalg.norm(scaled[:, 3:], axis=1) / np.linalg.norm(plain, axis=1)
+    np.testing.assert_allclose(cosines, 1.0, rtol=1e-12)
+    assert (np.abs(scaled[:, 3:]).max(axis=1) < 1.0).all()
+    assert (np.abs(scaled[:, 3:]).max(axis=1) >= 0.5).all()
+    if np.frexp(length)[0] == 0.5:
+        np.testing.assert_array_equal(scaled, target.check_actions(unit, active))
+
+
+def test_a_normal_beyond_single_precision_leaves_the_world_whole(target):
+    """Then an episode begins as ever: 1e300 left worlds that never came to rest again."""
+    target.reset(seed=3)
+    step = target.step([[0.0, 0.0, 0.1, 0.0, 0.0, 1e300], [0.0, 0.0, 0.1, 0.0, 0.0, 1.0]])
+    assert np.isfinite(step.obs["state"]).all()
+    np.testing.assert_array_equal(step.info["ending"], [0, 0])
+    with pytest.raises(ActionError, match="the action of environment 1 is not finite"):
+        target.step([[0, 0, 0.1, 0, 0, 1], [0, 0, 0.1, 0, 0, np.longdouble("1e4000")]])
+
+
 def test_bounds_hold_all_bins(target):
     config = target.worlds.simulation.config
     low, high = action_bounds(config.cell.bins, config.bins)

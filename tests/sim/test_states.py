@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+import warp as wp
 
 from synpick_warp.codes import Ending, Phase, Task
 from synpick_warp.errors import StateError
@@ -112,6 +113,32 @@ def test_arrays_outside_the_state_have_no_influence(device):
     assert list(check_arrays(brief(device, 3), 24, kinds)) == []
     assert kinds["overwritten"] > 100
     assert kinds["state"] > 100
+
+
+def test_nothing_of_a_poisoned_world_reaches_its_next_arrangement(scene, device):
+    """All of its numbers are NaN: its episode ends, the next arrangement is that of a fresh world to the bit, and no other world differs."""
+    simulation, states = scene.simulation, scene.simulation.states
+    state = states.get([0])
+    words = state.words.numpy().copy()
+    for part in states.fields.values():
+        if part.dtype.kind == "f":
+            words[:, part.first : part.first + part.words] = np.float32(np.nan).view(np.uint32)
+    state.words.assign(words)
+    for name, member in state.contacts.history._cls.vars.items():
+        if member.type.dtype in (wp.vec3, wp.vec2):
+            getattr(state.contacts.history, name).fill_(np.nan)
+    states.set(state, [0])
+    others = range(1, WORLDS + 1)
+    (ended,) = watch(simulation, range(WORLDS + 1), 1)
+    assert Ending(ended["worlds.ending"][0]) is Ending.NOT_FINITE
+    assert [list(differing(scene.own[0], ended, world)) for world in others] == [[]] * WORLDS
+    fresh = brief(device, WORLDS + 1, bake__mode="cycle", bake__episodes=WORLDS)
+    fresh.state.arrangement_id.assign([(0, 1)] + [(-1, 0)] * (fresh.layout.worlds - 1))
+    fresh.state.phase.assign([int(Phase.START)] + [int(Phase.IDLE)] * (fresh.layout.worlds - 1))
+    later, expected = watch(simulation, range(WORLDS + 1), TICKS), watch(fresh, [0], TICKS)
+    assert [list(differing(*pair, 0)) for pair in zip(expected, later, strict=True)] == [[]] * TICKS
+    for before, after in zip(scene.own[1:], later, strict=False):
+        assert [list(differing(before, after, world)) for world in others] == [[]] * WORLDS
 
 
 @pytest.mark.parametrize(

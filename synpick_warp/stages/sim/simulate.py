@@ -16,6 +16,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.sim import snapshot as pack
+from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
@@ -29,7 +30,7 @@ from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
 from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.sleep import Sleep
-from synpick_warp.stages.sim.states import State, WorldStates, cell_checksum, checksum
+from synpick_warp.stages.sim.states import State, WorldStates, cell_checksum, checksum, copy_fresh
 from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
@@ -108,6 +109,7 @@ class Simulation:
             self.recorder = StepRecorder(config.gripper, self.scene, *states, self.physics, sizes, **parts)
         self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
         self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
+        self._fresh = copy_fresh(self._groups, self.physics)
         self.behavior = BEHAVIORS[config.gripper.kind]
         self.after_tick: Callable[[], None] | None = None
         """Launches kernels at the end of a tick, after perception."""
@@ -134,9 +136,9 @@ class Simulation:
 
         Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
         """
-        self._is_between_ticks = False
+        resets, self._is_between_ticks = self._is_between_ticks and newton.__version__ == KNOWN_NEWTON, False
         with scope("arrange", self.device):
-            self._arrange()
+            self._arrange(resets)
         yield
         substeps = self.physics.tick_parts(self._drive, self._ignore_contacts, self._watcher)
         while True:
@@ -186,14 +188,17 @@ class Simulation:
         """Checkpoints without what a record of physics keeps, so that simulations without one can load them; after the first tick."""
         return self._make_states()
 
-    def _make_states(self, **recorded: object) -> WorldStates:
-        """Checkpoints of the groups of arrays of this simulation, and of others by name."""
+    @property
+    def _groups(self) -> dict[str, object]:
+        """Groups of arrays that are state, by their names."""
         groups = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
-        if self.sleep is not None:
-            groups["sleep"] = self.sleep.state
+        return groups if self.sleep is None else groups | {"sleep": self.sleep.state}
+
+    def _make_states(self, **recorded: object) -> WorldStates:
+        """Checkpoints of the groups of arrays of this simulation, and of others by name."""
         origin = {"catalog": checksum(self.catalog), "cell": cell_checksum(self.config.cell, self.config.gripper)}
-        return WorldStates(groups | recorded, self.physics, origin, self.state.variant, self.state.restarted)
+        return WorldStates(self._groups | recorded, self.physics, origin, self.state.variant, self.state.restarted, self._fresh)
 
     def get_state(self, worlds: Sequence[int]) -> State:
         """State of worlds; see `WorldStates.get`."""
@@ -222,10 +227,12 @@ class Simulation:
         self.state.next_episode.zero_()
         arrange.free_idle_worlds(self.state)
 
-    def _arrange(self) -> None:
-        """Start episodes in free worlds: objects are sampled and dropped."""
+    def _arrange(self, resets: bool) -> None:
+        """Start episodes in free worlds: objects are sampled and dropped. `resets`: False in the first tick, in which nothing is to reset."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
+        if resets:
+            self._states.reset(state.phase)
         arrange.sample_episodes(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.place_bins(scene, state, physics)

@@ -22,7 +22,7 @@ from synpick_warp.configs.cell.extents import Cell
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import StateError
 from synpick_warp.kernels import world_rows
-from synpick_warp.newton_patches.history import CONTACT_BYTES, ROW_ARRAYS, History, SavedContacts
+from synpick_warp.newton_patches.history import CONTACT_BYTES, ROW_ARRAYS, History, SavedContacts, find_rows
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import ArraySpec
 from synpick_warp.stages.sim.physics import Physics
@@ -36,6 +36,8 @@ VARIANTS = "physics.body_variant"
 """Field of the body variants, by which a world gets the shapes and masses of its objects."""
 COUNT = "contacts.count"
 """Array of the numbers of contacts (row)."""
+KEPT = ("worlds.arrangement_id", "worlds.phase", "worlds.ending", VARIANTS)
+"""Fields that `WorldStates.reset` keeps: the assignment of the episode, and the variants, which `Physics.select` replaces."""
 ORIGINS = {"catalog": "catalog of objects", "cell": "cell or gripper"}
 """Key of a checksum of `WorldStates.origin` -> noun in messages."""
 
@@ -80,7 +82,13 @@ class WorldStates:
     """
 
     def __init__(
-        self, groups: Mapping[str, object], physics: Physics, origin: Mapping[str, str], variant: wp.array, restarted: wp.array
+        self,
+        groups: Mapping[str, object],
+        physics: Physics,
+        origin: Mapping[str, str],
+        variant: wp.array,
+        restarted: wp.array,
+        fresh: Mapping[str, np.ndarray],
     ) -> None:
         """Find all arrays of the state, after the first tick.
 
@@ -90,6 +98,7 @@ class WorldStates:
             origin: Checksums by the keys of ORIGINS (`checksum`, `cell_checksum`).
             variant: Written: body variants to select (body) int32 ...
             restarted: ... in these worlds (world + 1) bool.
+            fresh: Content of a world before the first tick (`copy_fresh`).
         """
         self.physics, self.origin = physics, origin
         self.device, self.worlds = physics.device, physics.layout.worlds
@@ -108,6 +117,10 @@ class WorldStates:
         self._table = world_rows.WordTable()
         self._table.address = wp.array(np.concatenate(addresses), dtype=wp.uint64, device=self.device)
         self._table.stride = wp.array(np.concatenate(strides), dtype=wp.int32, device=self.device)
+        words = [fresh[name].view(np.uint32) if name in fresh else np.zeros(field.words, np.uint32) for name, field in self.fields.items()]
+        resets = [np.arange(field.first, field.first + field.words) for name, field in self.fields.items() if name not in KEPT]
+        self._fresh = wp.array(np.concatenate(words), dtype=wp.uint32, device=self.device)
+        self._resets = wp.array(np.concatenate(resets), dtype=wp.int32, device=self.device)
         self._branch = self.allocate(1)
 
     def arrays(self) -> list[wp.array]:
@@ -167,6 +180,13 @@ class WorldStates:
         dim = (self.worlds, self.words)
         wp.launch(world_rows.load_rows_kernel, dim=dim, inputs=[self._table, row, state.words], device=self.device)
         self.history.load_contacts(row, state.contacts, self.physics.lost, int(Lost.CONTACTS))
+
+    def reset(self, phase: wp.array) -> None:
+        """Reset worlds in the phases START and IDLE to the content before the first tick, but for KEPT, so that nothing of an episode, NaN
+        included, reaches the next one. Contacts are left to `Physics.load`. Only launches kernels.
+        """
+        dim = (self.worlds, len(self._resets))
+        wp.launch(world_rows.reset_rows_kernel, dim=dim, inputs=[self._table, self._fresh, phase, self._resets], device=self.device)
 
     def get(self, worlds: Sequence[int]) -> State:
         """State of worlds, a row each.
@@ -286,6 +306,13 @@ def cell_checksum(cell: Cell, gripper: Gripper) -> str:
     """SHA-256 of the extents of a cell's bins and of the gripper's settings, in hexadecimal digits; meshes count by their own checksums."""
     parts = [*(bin_.measured or bin_ for bin_ in cell.bins), replace(gripper, mesh="")]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def copy_fresh(groups: Mapping[str, object], physics: Physics) -> dict[str, np.ndarray]:
+    """Copy to the host what one world holds before the first tick, by the names of fields (scalar); the solver's fields are missing."""
+    rows = find_rows(physics.model, physics.state, physics.control)
+    named = dict(_find_arrays(groups)) | {f"physics.{name}": array for name, array in rows.items()}
+    return {name: array[: array.shape[0] // physics.layout.worlds].numpy().flatten() for name, array in named.items()}
 
 
 def _find_arrays(groups: Mapping[str, object]) -> Iterator[tuple[str, wp.array]]:
