@@ -153,7 +153,7 @@ def test_without_gymnasium_there_is_one_line(monkeypatch):
 
 @needs_gymnasium
 def test_the_environment_is_gymnasiums(target):
-    import gymnasium
+    import gymnasium  # pyright: ignore[reportMissingImports]
 
     from synpick_warp.environment.registration import IDS
     from synpick_warp.environment.vector import PickingVectorEnv

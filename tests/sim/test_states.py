@@ -12,6 +12,7 @@ import warp as wp
 
 from synpick_warp.codes import Ending, Phase, Task
 from synpick_warp.errors import StateError
+from synpick_warp.kernels.newton_patches.contact_history import ContactHistory
 from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
 from synpick_warp.stages.sim.simulate import Simulation
@@ -124,9 +125,9 @@ def test_nothing_of_a_poisoned_world_reaches_its_next_arrangement(scene, device)
         if part.dtype.kind == "f":
             words[:, part.first : part.first + part.words] = np.float32(np.nan).view(np.uint32)
     state.words.assign(words)
-    for name, member in state.contacts.history._cls.vars.items():
-        if member.type.dtype in (wp.vec3, wp.vec2):
-            getattr(state.contacts.history, name).fill_(np.nan)
+    for array in (getattr(state.contacts.history, str(name)) for name in ContactHistory.vars):
+        if array.dtype in (wp.vec3, wp.vec2):
+            array.fill_(np.nan)
     states.set(state, [0])
     others = range(1, WORLDS + 1)
     (ended,) = watch(simulation, range(WORLDS + 1), 1)

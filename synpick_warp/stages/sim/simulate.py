@@ -86,8 +86,7 @@ class Simulation:
         Raises:
             ValueError: An episode may pick, but there is no `render_scene`.
         """
-        self.config, self.catalog = config, catalog
-        self.device = device
+        self.config, self.catalog, self.device = config, catalog, device
         built = build_model(config, catalog, device)
         self.layout = built.layout
         self.physics = Physics(config.physics, built)
@@ -107,7 +106,7 @@ class Simulation:
             parts = {"steps": records_physics and config.trajectory.steps, "supports": config.bop.graph}
             states = (self.state, self.attempts, self.seals)
             self.recorder = StepRecorder(config.gripper, self.scene, *states, self.physics, sizes, **parts)
-        self.record = replace(record, physics=self.recorder.record if self.recorder is not None else None)
+        self.record = replace(record, physics=self.recorder and self.recorder.record)
         self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
         self._fresh = copy_fresh(self._groups, self.physics)
         self.behavior = BEHAVIORS[config.gripper.kind]
@@ -191,7 +190,7 @@ class Simulation:
     @property
     def _groups(self) -> dict[str, object]:
         """Groups of arrays that are state, by their names."""
-        groups = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
+        groups: dict[str, object] = {"worlds": self.state, "attempts": self.attempts, "seals": self.seals, "last": self.last}
         groups |= {name: getattr(self.record, name) for name in ("snapshot", "status", "observation", "plan")}
         return groups if self.sleep is None else groups | {"sleep": self.sleep.state}
 
