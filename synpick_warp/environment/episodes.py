@@ -62,10 +62,11 @@ class Episodes:
         for array in (self.steps, self.terminated, self.truncated):
             array[environments] = 0
 
-    def reseed(self, seeds: np.ndarray, environments: np.ndarray) -> None:
-        """Set the seeds of environments, and reset their episode counters to 0."""
-        self.seed[environments] = seeds
-        self.count[environments] = 0
+    def reseed(self, seeds: Mapping[int, int], environments: np.ndarray) -> None:
+        """Set the seeds of those of `environments` that have one (seed by environment), and reset their episode counters to 0."""
+        for environment in environments.tolist():
+            if environment in seeds:
+                self.seed[environment], self.count[environment] = seeds[environment] % 2**64, 0
 
     def draw(self, environments: np.ndarray, piles: int, ahead: int = 0) -> np.ndarray:
         """Hash seed and counter to the index of each environment's next episode, 0 to `piles` - 1, or of the one `ahead` episodes later."""
@@ -86,18 +87,20 @@ def _mix(x: np.ndarray) -> np.ndarray:
     return y ^ (y >> np.uint64(31))
 
 
-def make_seeds(seed: int | Sequence[int | None], count: int) -> np.ndarray:
-    """Seeds of environments (environment) uint64: `seed`, `seed` + 1 and so on, or one for each.
+def make_seeds(seed: int | Sequence[int | None] | np.ndarray, count: int) -> dict[int, int]:
+    """Seeds by environment: `seed`, `seed` + 1 and so on, or one for each, of which None are left out.
 
     Raises:
         ConfigError: They are not whole numbers, or not one for each environment.
     """
-    numbers: list[int | None] = [to_index(one) for one in seed] if isinstance(seed, Sequence | np.ndarray) else []
+    given = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str) else []
     if (first := to_index(seed)) is not None:
-        numbers = [first + index for index in range(count)]
-    if len(numbers) != count or any(number is None for number in numbers):
-        raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number, or one for each of {count} environments")
-    return np.array([(number or 0) % 2**64 for number in numbers], np.uint64)
+        given = [first + index for index in range(count)]
+    seeds = {index: number for index, one in enumerate(given) if (number := to_index(one)) is not None and number >= 0}
+    if len(given) != count or len(seeds) + sum(one is None for one in given) != count:
+        allowed = f"a whole number from 0 on, or one (None: none) for each of {count} environments"
+        raise ConfigError(f"seed is {format_value(seed)}; allowed: {allowed}")
+    return seeds
 
 
 def choose_environments(options: Mapping[str, Any], count: int) -> np.ndarray:

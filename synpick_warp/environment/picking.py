@@ -79,7 +79,8 @@ class PickingEnvironment:
         """Begin episodes in all environments, or after the first reset in those that `options` choose.
 
         Args:
-            seed: Seed of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each; None: their next episodes.
+            seed: Seed of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each, of
+                which None continue with their next episodes, as all do by default.
             options: "reset_mask" (environment) bool or "env_idx": environments to reset; "episode": episode index, or one for
                 each environment that is reset.
 
@@ -95,7 +96,7 @@ class PickingEnvironment:
         if self._is_new:
             chosen = np.arange(self.count)
         if seed is not None:
-            self.episodes.reseed(make_seeds(seed, self.count)[chosen], chosen)
+            self.episodes.reseed(make_seeds(seed, self.count), chosen)
         self._begin(chosen, choose_indices(options, len(chosen)))
         self._is_new = False
         return self.observe(), self._describe()
@@ -189,7 +190,9 @@ class PickingEnvironment:
         if given.shape != shape:
             raise ActionError(f"actions have the shape {given.shape}; allowed: {shape}, of a {action} for each environment")
         given = np.where(active[:, None], given, np.zeros((), given.dtype))
-        if wrong := np.flatnonzero(~np.isfinite(given.astype(np.float64)).all(axis=1)).tolist():
+        with np.errstate(over="ignore"):
+            finite = np.isfinite(given.astype(np.float64)).all(axis=1)
+        if wrong := np.flatnonzero(~finite).tolist():
             raise ActionError(f"the action of environment {wrong[0]} is not finite: {given[wrong[0]].tolist()}")
         if action == PIXEL:
             if wrong := np.flatnonzero((given != np.floor(given)).any(axis=1)).tolist():

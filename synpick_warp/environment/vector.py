@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv  # pyright: ignore[reportM
 from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.codes import Segment
-from synpick_warp.configs.check import to_index
+from synpick_warp.environment.episodes import make_seeds
 from synpick_warp.environment.picking import ACTION_SIZES, COMMAND, EnvironmentState, PickingEnvironment
 from synpick_warp.environment.settings import OBSERVATIONS, PIXEL, POINT, Choice
 
@@ -40,10 +40,11 @@ class PickingVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes; see `PickingEnvironment.reset`."""
-        if seed is not None:
-            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(to_index(seed))
-        return self.environment.reset(seed, options)
+        """Begin episodes; see `PickingEnvironment.reset`. The first seed seeds `np_random`, too."""
+        result = self.environment.reset(seed, options)
+        if seed is not None and (seeds := list(make_seeds(seed, self.num_envs).values())):
+            self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random(seeds[0])
+        return result
 
     def step(self, actions: Any) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
         """Carry out an action in each environment; see `PickingEnvironment.step`."""

@@ -184,15 +184,23 @@ def test_bad_options_are_refused(environment, options, message):
         environment.reset(options=options)
 
 
-@pytest.mark.parametrize("seed", [[1], [1, None], "a"])
+@pytest.mark.parametrize("seed", [[1], [1, "b"], [1, True], "ab", -1, [3, -1]])
 def test_bad_seeds_are_refused(environment, seed):
-    with pytest.raises(ConfigError, match="one for each of 2 environments"):
+    with pytest.raises(ConfigError, match=r"for each of 2 environments$"):
         environment.reset(seed=seed)
 
 
 @pytest.mark.parametrize("seed", [3, np.int64(3), [3, 4], np.array([3, 4])])
 def test_integers_of_numpy_are_seeds_too(seed):
-    assert make_seeds(seed, 2).tolist() == [3, 4]
+    assert make_seeds(seed, 2) == {0: 3, 1: 4}
+
+
+def test_an_environment_without_a_seed_of_its_own_continues(environment):
+    first = environment.reset(seed=[5, 6])[1]["episode_index"]
+    second = environment.reset(seed=[5, None])[1]["episode_index"]
+    assert second[0] == first[0]
+    assert second[1] != first[1]
+    assert environment.reset(seed=[None, 6])[1]["episode_index"][1] == first[1]
 
 
 def test_the_course_of_a_trial_has_the_outcome_of_its_table(device):

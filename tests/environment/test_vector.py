@@ -161,7 +161,10 @@ def test_the_environment_is_gymnasiums(target):
     env = PickingVectorEnv(target)
     assert PickingVectorEnv.__bases__ == (gymnasium.vector.VectorEnv,)
     assert env.metadata["autoreset_mode"] is env.autoreset_mode is gymnasium.vector.AutoresetMode.NEXT_STEP
+    env.reset(seed=[None, 7])
+    assert env.np_random_seed == 7
     obs, _ = env.reset(seed=3)
+    assert env.np_random_seed == 3
     assert obs in env.observation_space
     assert env.action_space.sample() in env.action_space
     assert env.single_action_space.shape == (6,)

@@ -259,9 +259,12 @@ def test_a_batch_refuses_use_after_its_time():
         first = next(stream)
         colour = wp.from_dlpack(first.color)
         assert colour.ptr == wp.from_dlpack(first.color).ptr
-        with pytest.raises(BufferError, match="without a copy"):
-            first.color.__dlpack__(copy=True)
+        copied, before = wp.from_dlpack(first.color.__dlpack__(copy=True)), first.color.numpy().copy()
+        assert copied.ptr != colour.ptr
+        with pytest.raises(BufferError, match="move it"):
+            first.color.__dlpack__(dl_device=(99, 0))
         next(stream)
+        assert (copied.numpy() == before).all()
         for use in (lambda: wp.from_dlpack(first.color), first.depth.numpy, first.visible_masks):
             with pytest.raises(BufferError, match="clone what you keep"):
                 use()

@@ -122,14 +122,17 @@ class DeviceArray:
             stream: The consumer's stream, which will wait for the rendering; -1: it does not.
             max_version: Not used: the capsule is of the first version, which all libraries read.
             dl_device: Device that the consumer asks for.
-            copy: Whether the consumer asks for a copy.
+            copy: Whether the consumer asks for a copy, which stays valid when the batch has expired.
 
         Raises:
-            BufferError: The batch has expired, or the consumer asks for a copy or for another device.
+            BufferError: The batch has expired, or the consumer asks for another device.
         """
-        if copy or (dl_device is not None and tuple(dl_device) != self.__dlpack_device__()):
-            raise BufferError(f"this array lies on {self.device} and is exported without a copy; import it there, then copy or move it")
+        if dl_device is not None and tuple(dl_device) != self.__dlpack_device__():
+            raise BufferError(f"this array lies on {self.device}; import it there, then move it")
         array = self._valid()
+        if copy:
+            self._gate.admit_current()
+            return wp.clone(array).__dlpack__(stream=stream)
         self._gate.admit(stream)
         return array.__dlpack__(stream=_NO_ORDER)
 

@@ -2,7 +2,7 @@
 
 Each client runs in a process of its own, in our interpreter or in the one that `--python NAME=PATH` names. Prints a table; a client that is
 not installed is listed as such. Exits with 1 if a client fails. Nothing is fetched; an interpreter for all of them:
-`pip install gymnasium torch skrl torchrl rsl-rl-lib tensorboard synpick-warp`.
+`pip install gymnasium torch skrl torchrl rsl-rl-lib stable-baselines3 tensorboard synpick-warp`.
 
     python -m tools.clients.environments --python all=VENV/bin/python
 """
@@ -23,7 +23,7 @@ from tools.figures import describe_run, write_run
 from tools.options import Row, fail, writable_file
 
 ROOT = Path(__file__).resolve().parents[3]
-NAMES = ("gymnasium", "statistics", "skrl", "torchrl", "rsl_rl")
+NAMES = ("gymnasium", "statistics", "skrl", "torchrl", "rsl_rl", "stable_baselines3")
 """Clients: keys of `training.CLIENTS`, a module that only the client's process imports."""
 TIMEOUT = 900.0
 """Time limit of a client [s]."""

@@ -136,7 +136,7 @@ def check_torchrl(device: str) -> str:
     from torchrl.envs.libs.gym import GymWrapper
     from torchrl.envs.utils import check_env_specs
 
-    from synpick_warp.environment.torchrl import TorchRlEnv
+    from tools.examples.adapters.torchrl import TorchRlEnv
 
     env = TorchRlEnv(make(device, obs=("depth", "state"), autoreset="disabled", max_steps=2))
     check_env_specs(env)
@@ -151,7 +151,7 @@ def train_rsl_rl(device: str) -> str:
     """Train by rsl_rl's `OnPolicyRunner` (PPO) on state vectors, with actions as points."""
     from rsl_rl.runners import OnPolicyRunner
 
-    from synpick_warp.environment.rsl_rl import RslRlEnv
+    from tools.examples.adapters.rsl_rl import RslRlEnv
 
     env = RslRlEnv(make(device, obs=("state",), action="point", autoreset="same_step", max_steps=2))
     model = {"class_name": "MLPModel", "hidden_dims": [32], "activation": "elu", "obs_normalization": True}
@@ -169,12 +169,29 @@ def train_rsl_rl(device: str) -> str:
     return f"{ITERATIONS} iterations"
 
 
+def train_stable_baselines3(device: str) -> str:
+    """Train by stable-baselines3's PPO on state vectors, with actions as points; resets by seed are reproducible."""
+    from stable_baselines3 import PPO
+
+    from tools.examples.adapters.stable_baselines3 import Sb3Env
+
+    env = Sb3Env(make(device, obs=("state",), action="point", autoreset="same_step", backend="numpy", max_steps=2))
+    env.seed(7)
+    first = env.reset()
+    env.seed(7)
+    assert np.array_equal(env.reset()["state"], first["state"])
+    model = PPO("MultiInputPolicy", env, n_steps=STEPS, batch_size=STEPS, n_epochs=1, device=device)
+    model.learn(STEPS * ITERATIONS * env.num_envs)
+    return f"{model.num_timesteps} steps; PPO"
+
+
 CLIENTS: Mapping[str, tuple[str, Callable[[str], str]]] = {
     "gymnasium": ("gymnasium", check_gymnasium),
     "statistics": ("gymnasium", record_statistics),
     "skrl": ("skrl", train_skrl),
     "torchrl": ("torchrl", check_torchrl),
     "rsl_rl": ("rsl-rl-lib", train_rsl_rl),
+    "stable_baselines3": ("stable-baselines3", train_stable_baselines3),
 }
 """Client -> its package, for the version, and its function, which returns a remark and raises on a failure."""
 

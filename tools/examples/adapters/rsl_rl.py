@@ -2,8 +2,6 @@
 
     env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", obs=("state",), autoreset="same_step"))
     OnPolicyRunner(env, settings).learn(100)
-
-This module needs rsl_rl.
 """
 
 from __future__ import annotations
