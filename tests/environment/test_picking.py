@@ -58,7 +58,7 @@ def test_the_number_of_environments_changes_nothing(environment, device):
 
 def test_episodes_are_a_hash_of_seed_and_count():
     episodes = Episodes.of(2)
-    episodes.reseed(np.array([3, 4], np.uint64), np.arange(2))
+    episodes.reseed({0: 3, 1: 4}, np.arange(2))
     drawn = [episodes.draw(np.arange(2), 2**31 - 1, ahead).tolist() for ahead in range(3)]
     gamma = 0x9E3779B97F4A7C15
     assert drawn == [[_mix(seed * gamma + count + 1) % (2**31 - 1) for seed in (3, 4)] for count in range(3)]

@@ -1,7 +1,7 @@
 """Adapter for rsl_rl: a `VecEnv` whose observations are a TensorDict.
 
-    env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", obs=("state",), autoreset="same_step"))
-    OnPolicyRunner(env, settings).learn(100)
+env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", obs=("state",), autoreset="same_step"))
+OnPolicyRunner(env, settings).learn(100)
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Adapter for stable-baselines3: a `VecEnv`, whose episodes restart by themselves.
 
-    env = Sb3Env(synpick_warp.make_env(task="pick", num_envs=8, action="point", obs=("state",), autoreset="same_step", backend="numpy"))
-    PPO("MultiInputPolicy", env).learn(1000)
+env = Sb3Env(synpick_warp.make_env(task="pick", num_envs=8, action="point", obs=("state",), autoreset="same_step", backend="numpy"))
+PPO("MultiInputPolicy", env).learn(1000)
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Adapter for TorchRL: a `GymWrapper` whose partial resets also work on a GPU.
 
-    env = TorchRlEnv(synpick_warp.make_env(task="pick", num_envs=512, autoreset="disabled"))
+env = TorchRlEnv(synpick_warp.make_env(task="pick", num_envs=512, autoreset="disabled"))
 """
 
 from __future__ import annotations
