@@ -117,7 +117,7 @@ def test_arrays_outside_the_state_have_no_influence(device):
 
 
 def test_nothing_of_a_poisoned_world_reaches_its_next_arrangement(scene, device):
-    """All of its numbers are NaN: its episode ends, the next arrangement is that of a fresh world to the bit, and no other world differs."""
+    """All of its numbers are NaN: its episode ends, the next arrangement is that of a fresh world to the bit, and no other differs."""
     simulation, states = scene.simulation, scene.simulation.states
     state = states.get([0])
     words = state.words.numpy().copy()

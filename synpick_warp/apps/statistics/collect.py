@@ -17,6 +17,8 @@ from synpick_warp.system.progress import Report
 
 VIEWS_PER_PROCESS = 5000
 """Minimum number of views per process: starting one takes the time in which this one counts some 5,000 views."""
+REST_EPISODES = 256
+"""Episodes whose step log is read, spread evenly: some 2 MB each."""
 _DEPTH = 2
 """Unanswered tasks per process: one is worked on, the other waits."""
 _KIBIBYTE = 1024
@@ -74,6 +76,7 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
             tasks += [SceneTask(episode, each, len(data_set[episode].images(each))) for each in data_set[episode].cameras]
         else:
             without += 1
+    found.missing += _count_rest(data_set, found.partial)
     episodes = found.partial.episodes.groups()
     if not episodes:
         raise DatasetError(f"{data_set.folder} has no episode to count; finish the bake first")
@@ -95,6 +98,15 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
     return found
 
 
+def _count_rest(data_set: DataSet, partial: Partial) -> Iterator[str]:
+    """Count windows of piles at rest in the step logs of up to REST_EPISODES episodes; yields a sentence for each that cannot be read."""
+    for episode in _spread(list(data_set), REST_EPISODES) if data_set.found is None and data_set.has_store else ():
+        try:
+            partial.rest.add_episode(data_set[episode], data_set.config.physics.step)
+        except DatasetError as error:
+            yield f"the step log of episode {episode} cannot be read: {error}"
+
+
 def _has_images(data_set: DataSet, episode: int) -> bool:
     """Whether an episode has files of its first camera."""
     try:
@@ -104,10 +116,15 @@ def _has_images(data_set: DataSet, episode: int) -> bool:
     return True
 
 
+def _spread(items: Sequence[int], count: int) -> list[int]:
+    """Choose `count` items, or all if they are fewer, spread evenly."""
+    total = len(items)
+    return [items[index] for index in sorted({(2 * index + 1) * total // (2 * count) for index in range(count)})] if total else []
+
+
 def _sample_depth(tasks: Sequence[SceneTask], count: int) -> list[SceneTask]:
     """Tasks with the frames of `count` views that are spread evenly over all views."""
-    total = sum(task.frames for task in tasks)
-    chosen = sorted({(2 * index + 1) * total // (2 * count) for index in range(count)}) if total else []
+    chosen = _spread(range(sum(task.frames for task in tasks)), count)
     result, begin, place = [], 0, 0
     for task in tasks:
         end, frames = begin + task.frames, []

@@ -15,6 +15,7 @@ from synpick_warp.apps.statistics.depth import Depth
 from synpick_warp.apps.statistics.lights import Lights
 from synpick_warp.apps.statistics.looks import LookStatistics
 from synpick_warp.apps.statistics.paper import Comparison, compare
+from synpick_warp.apps.statistics.rest import Rest
 from synpick_warp.apps.statistics.timeline import TimePoint
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.configs.schema import Config
@@ -80,6 +81,8 @@ class Statistics:
     """By part and parameter; none: looks are not randomized."""
     bins: Mapping[str, BinUse] = field(default_factory=dict)
     """By name; empty: no episode names its bin, since the tote is always in its place."""
+    rest: Rest | None = None
+    """None: no steps of piles at rest were recorded."""
 
     @property
     def has_paper_objects(self) -> bool:
@@ -143,7 +146,7 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
-    drawn = partial.looks.result(), partial.bins.result()
+    drawn = partial.looks.result(), partial.bins.result(), partial.rest.result()
     return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), *drawn)
 
 

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from synpick_warp.apps.statistics.attempts import NEAR
 from synpick_warp.apps.statistics.compute import OTHER_OBJECTS, Statistics
+from synpick_warp.apps.statistics.rest import AMPLITUDE, WINDOW
 from synpick_warp.apps.statistics.tables import PAPER, TIMELINE, make_tables
 from synpick_warp.errors import OutputError, escape
 from synpick_warp.exporters.writing.files import output_error
@@ -89,6 +90,9 @@ def print_statistics(console: Console, statistics: Statistics, paper: bool | Non
     if load is not None and load < NEAR:
         line = f"no seal was loaded beyond {load} % of its break force: no pick depended on how strong suction is"
         console.print(line, markup=False, soft_wrap=True)
+    if (rest := statistics.rest) is not None:
+        line = f"piles that vibrate: {rest.vibrating:,} of {rest.windows:,} windows of {WINDOW} s at rest have an object above"
+        console.print(f"{line} {1e3 * AMPLITUDE:g} mm/s, to and fro", markup=False, soft_wrap=True)
     if paper is None and statistics.paper and not shown:
         console.print("the objects are not those of the paper; --paper shows its numbers beside these", markup=False, soft_wrap=True)
 

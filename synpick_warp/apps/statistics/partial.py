@@ -16,6 +16,7 @@ from synpick_warp.apps.statistics.depth import DepthCounts
 from synpick_warp.apps.statistics.lights import LightCounts
 from synpick_warp.apps.statistics.looks import LookCounts
 from synpick_warp.apps.statistics.records import AttemptFacts, EpisodeFacts
+from synpick_warp.apps.statistics.rest import RestCounts
 from synpick_warp.apps.statistics.scenes import SceneTruth, read_scene
 from synpick_warp.apps.statistics.timeline import TimelineCounts
 from synpick_warp.dataset.annotations import check_content
@@ -39,6 +40,7 @@ class Partial:
     lights: LightCounts = field(default_factory=LightCounts)
     looks: LookCounts = field(default_factory=LookCounts)
     bins: BinCounts = field(default_factory=BinCounts)
+    rest: RestCounts = field(default_factory=RestCounts)
 
     def merge(self, other: Partial) -> None:
         """Add the counts of another part. The order of merges does not change the result.

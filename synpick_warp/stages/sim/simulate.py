@@ -227,7 +227,7 @@ class Simulation:
         arrange.free_idle_worlds(self.state)
 
     def _arrange(self, resets: bool) -> None:
-        """Start episodes in free worlds: objects are sampled and dropped. `resets`: False in the first tick, in which nothing is to reset."""
+        """Start episodes in free worlds: objects are sampled and dropped. `resets`: False in the first tick."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
         if resets:

@@ -68,6 +68,6 @@ class Sb3Env(VecEnv):
         """No environment has a wrapper of its own."""
         return [False] * self._count(indices)
 
-    def _count(self, indices: None | int | Sequence[int]) -> int:
+    def _count(self, indices: int | Sequence[int] | None) -> int:
         """Number of environments that are chosen."""
         return len(list(self._get_indices(indices)))
