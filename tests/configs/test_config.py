@@ -57,6 +57,10 @@ COUPLED = {
     "suction.tolerated_misses",
     "suction.good_force",
     "suction.poor_force",
+    "suction.flow",
+    "suction.compliance",
+    "suction.surface",
+    "suction.vacuum",
 }
 COUPLED_SECTIONS = {"tote", "bins", "cameras", "settle", "physics"}
 """Settings with constraints between them: independent random values mostly violate these."""

@@ -37,6 +37,13 @@ from tests.configs.test_config import message
         ({"pick.lift_height": 0.1}, r"pick.lift_height is 0.1 on the command line; allowed: at least the inner height of the tote, 0.195"),
         ({"suction.radius": 0.022}, r"suction.radius is 0.022 on .*; allowed: at most half of gripper.cup_width, 0.021 \[m\]"),
         ({"suction.rays": 4, "suction.tolerated_misses": 4}, "suction.tolerated_misses is 4 on .*; allowed: less than suction.rays, 4: "),
+        ({"suction.flow": 30.0}, r"suction.flow is 30.0 on .*; allowed: none without suction.vacuum, such as 60 \[kPa\]"),
+        (
+            {"suction.vacuum": 60, "suction.rays": 10},
+            "suction.rays is 10 on .*; allowed: at least 48 with suction.vacuum: fewer miss holes",
+        ),
+        ({"suction.vacuum": 60, "suction.surface": "hull"}, 'suction.surface is "hull" on .*; allowed: mesh with suction.vacuum'),
+        ({"suction.vacuum": 60, "suction.good_force": 40}, r"suction.good_force is 40.0 on .*; allowed: none .*, 83.1265 \[N\]"),
         ({"suction.poor_force": 41}, r"suction.poor_force is 41.0 on the command line; allowed: at most suction.good_force, 40 \[N\]"),
         (
             {"physics.sleep": 2e-4, "bop.graph": True},
