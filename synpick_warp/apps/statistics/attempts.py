@@ -46,7 +46,7 @@ class Episodes:
     """Mean over these of the largest seal force [N]; None: there is none."""
     force_histogram: tuple[int, ...]
     """The same, by force: FORCE_BINS bins of FORCE_BIN N."""
-    largest_load: int | None
+    largest_load: int | None = None
     """Largest of these forces relative to the seal's break force [%], rounded up, and 100 from there on; None: there is none."""
 
 
