@@ -223,7 +223,7 @@ def test_a_place_is_a_folder_or_a_prefix(place, found):
         *((f"s3://bucket/{prefix}", "has a part . or ..") for prefix in ("..", "a/./b", "a//b")),
         *((f"s3://bucket/a{letter}b", "has one of") for letter in "@?#%\\\n"),
         ("s3://bucket:9000/a", "names no bucket"),
-        *((f"file:{rest}", "is not of this machine") for rest in ("x", "//host/x", "//host", "", "//127.0.0.1/x")),
+        *((f"file:{rest}", "is not of this machine") for rest in ("x", "//host/x", "//host", "", "//", "//127.0.0.1/x")),
         *((f"file:///a{part}", "name the folder by its path") for part in ("?b", "#b", "%zz", "%", "%2Fb", "%00", "%ff")),
         (Path("file:///data"), "a URL in a Path"),
         (Path("s3:bucket"), "has not two slashes"),

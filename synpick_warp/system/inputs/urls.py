@@ -57,8 +57,8 @@ def _parse_file(text: str, shown: str) -> Path:
     """Path of a file URL (RFC 8089), given what follows "file:"; `shown`: the URL in messages. Raises StoreError."""
     host, path = "", text
     if text.startswith("//"):
-        host, _, path = text[2:].partition("/")
-        path = f"/{path.lstrip('/')}"
+        host, slash, path = text[2:].partition("/")
+        path = f"{slash}{path.lstrip('/')}"
     if not path.startswith("/") or host.lower() not in ("", "localhost"):
         raise StoreError(f"{shown} is not of this machine; write file:///folder, or mount the other machine's folder and name its path")
     data = unquote_to_bytes(path)

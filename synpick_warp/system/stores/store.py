@@ -58,7 +58,7 @@ _PASSING = (
 """Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
 _LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
-_SECRETS = re.compile(r"(?:AWS|AZURE|GOOGLE)_.*(?:KEY|SECRET|TOKEN|SAS|PASSWORD).*")
+_SECRETS = re.compile(r"(?:AWS|AZURE|GOOGLE)_.*(?:KEY|SECRET|TOKEN|SAS|PASSWORD|CREDENTIAL).*")
 """Variables whose values no message shows."""
 _SHORT = 4
 """Length of a variable's value from which on it is a secret [characters]."""
