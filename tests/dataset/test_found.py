@@ -145,7 +145,7 @@ def test_a_contact_sheet_of_any_layout(folders, name, tmp_path):
 def test_estimates_are_made_and_scored(plain, tmp_path):
     """Without models a line says so; without masks, too."""
     results = tmp_path / "refine_plain-test.csv"
-    words = ("estimate", "--data", plain, "--method", "refine", "--every", 1, "--device", "cpu", "--out", results, "--threads", 1)
+    words = ("estimate", "--data", plain, "--method", "refine", "--every", 1, "--out", results, "--threads", 1)
     assert run(*words)[0] == 0
     assert {line.split(",")[0] for line in results.read_text().splitlines()[1:]} == {"0", "1", "2"}
     code, out, _ = run("eval", "--data", plain, "--results", results)
@@ -182,7 +182,7 @@ def test_what_estimation_lacks_is_named(plain, tmp_path, file, said):
         shutil.rmtree(path) if path.is_dir() else path.unlink()
         if file == "scene_gt.json":
             (scene / "scene_gt_info.json").unlink()
-    code, _, line = run("estimate", "--data", plain, "--method", "refine", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
+    code, _, line = run("estimate", "--data", plain, "--method", "refine", "--out", tmp_path / "out.csv", "--threads", 1)
     assert code == 2
     assert said in line
     assert not (tmp_path / "out.csv").exists()
@@ -333,7 +333,7 @@ def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path):
 
 
 def test_tracking_needs_instance_ids(plain, tmp_path):
-    words = ("estimate", "--data", plain, "--method", "track", "--device", "cpu", "--out", tmp_path / "out.csv", "--threads", 1)
+    words = ("estimate", "--data", plain, "--method", "track", "--out", tmp_path / "out.csv", "--threads", 1)
     code, _, said = run(*words)
     assert code == 2
     assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said

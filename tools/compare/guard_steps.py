@@ -101,15 +101,14 @@ def cpu_steps(parts: tuple[str, ...]) -> Iterator[Step]:
 
 def _readers() -> Iterator[Step]:
     """Yield the steps that read a data set, for people and for estimates."""
-    device = ("--device", "cpu", "--threads", "1")
     yield Step("stats tables", ("stats", "picks", "--threads", "1", "--paper"))
     yield Step(
         "estimate single",
-        ("estimate", "--data", "picks", "--method", "single", "--every", "16", "--out", "single.csv", *device),
+        ("estimate", "--data", "picks", "--method", "single", "--every", "16", "--out", "single.csv"),
         "single.csv",
     )
-    noisy = ("--method", "refine", "--every", "8", "--masks", "noisy", "--depth", "sensor")
-    yield Step("estimate refine", ("estimate", "--data", "all", *noisy, "--out", "refine.csv", *device), "refine.csv")
+    sensor = ("--method", "refine", "--every", "8", "--depth", "sensor")
+    yield Step("estimate refine", ("estimate", "--data", "all", *sensor, "--out", "refine.csv"), "refine.csv")
     yield Step("eval json", ("eval", "--data", "picks", "--results", "single.csv", "--format", "json", "--targets", "single-targets.json"))
     yield Step("eval text", ("eval", "--data", "all", "--results", "refine.csv", "--filter", "ema", "--plots", "plots"), "plots")
     yield Step("explain", ("explain", "picks", "--out", "explained.png"), "explained.png")

@@ -12,6 +12,7 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.apps.estimation.models import ObjectModel
 from synpick_warp.apps.evaluation.auc import LIMIT
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.scoring import Scores
@@ -19,9 +20,8 @@ from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.pose.batch import ObjectModel
-from synpick_warp.stages.pose.render import object_scene, render_object
 from synpick_warp.stages.render.scene import build_meshes
+from synpick_warp.stages.render.single_object import object_scene, render_object
 from synpick_warp.system.codecs.charts import INK, SOFT, printable
 
 Color = tuple[int, int, int]

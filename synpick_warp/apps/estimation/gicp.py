@@ -1,19 +1,17 @@
-"""GICP baseline on the CPU (Segal, Haehnel and Thrun, RSS 2009) by small_gicp: observed points of a mask against points on the model."""
+"""Generalized ICP (Segal, Haehnel and Thrun, RSS 2009) by small_gicp: observed points of a mask against points on the model."""
 
 from __future__ import annotations
 
 import importlib
-import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.estimation.methods import to_rotations, to_transforms
+from synpick_warp.apps.estimation.models import ObjectModel
 from synpick_warp.errors import ConfigError
-from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ObjectModel, RgbdBatch
 
 SPACING = 0.003
 """Grid that both clouds are thinned to [m]: some 1,000 points on a visible side of a can."""
@@ -28,67 +26,62 @@ EPSILON = 1e-5
 """Convergence: change of the translation [m], and of the rotation [rad]."""
 MIN_POINTS = 20
 """Observed points below which there is no estimate: covariances of NEIGHBORS points need more than that."""
+DEPTH_OF_CENTER = 0.5
+"""Distance of a start's centre behind the centroid of the observed points, in radii of the model: of a sphere's visible half."""
 
 
-def load_small_gicp() -> Any:
-    """Import small_gicp.
+class Aligner:
+    """Aligns the visible points of objects with their models."""
 
-    Raises:
-        ConfigError: It is not installed.
-    """
-    try:
-        return importlib.import_module("small_gicp")
-    except ImportError:
-        raise ConfigError("--method gicp needs small_gicp, which is not installed: pip install 'synpick-warp[gicp]'") from None
-
-
-class GicpEstimator:
-    """`Estimator` that only refines; instances run in parallel threads."""
-
-    def __init__(self, models: Sequence[ObjectModel], instances: InstanceTable, threads: int) -> None:
-        """
-        Args:
-            models: Models by index.
-            instances: Instances that are refined.
-            threads: Number of threads.
+    def __init__(self, models: Iterable[ObjectModel]) -> None:
+        """Prepare points on each model.
 
         Raises:
             ConfigError: small_gicp is not installed.
         """
-        self._gicp = load_small_gicp()
-        self._instances, self._threads = instances, max(1, threads)
-        self._targets = {index: self._prepare(models[index]) for index in np.unique(instances.model).tolist()}
+        try:
+            self._gicp: Any = importlib.import_module("small_gicp")
+        except ImportError:
+            raise ConfigError("estimate needs small_gicp, which is not installed: pip install 'synpick-warp[gicp]'") from None
+        self._models = {model.object_id: self._prepare(model) for model in models}
 
-    def _prepare(self, model: ObjectModel) -> tuple[Any, Any]:
-        """Points on the model with covariances, and their k-d tree."""
+    def _prepare(self, model: ObjectModel) -> tuple[Any, Any, np.ndarray, float]:
+        """Points on the model with covariances, their k-d tree, and centre and radius of its bounding box [m]."""
         mesh = trimesh.Trimesh(model.mesh.vertices.astype(np.float64), model.mesh.faces, process=False)
         points = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=model.object_id)[0], np.float64)
-        return self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)
+        low, high = points.min(axis=0), points.max(axis=0)
+        return *self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1), (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
-    def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
-        """Align each instance's points from its start pose, in threads; not valid where it has too few points. See `Estimator`."""
-        begin = time.perf_counter()
-        rotations, count = to_rotations(pose), len(self._instances)
-        starts = np.tile(np.eye(4), (count, 1, 1))
-        starts[:, :3, :3], starts[:, :3, 3] = rotations, pose[:, :3]
-        with ThreadPoolExecutor(self._threads, "gicp") as pool:
-            results = list(pool.map(lambda row: self._align(batch, row, starts[row]), range(count)))
-        poses = np.array([matrix for matrix, _ in results]).reshape(-1, 4, 4)
-        scores = np.array([score for _, score in results], np.float32)
-        seconds = np.full(count, (time.perf_counter() - begin) / max(1, len(batch)), np.float32)
-        return Estimates(to_transforms(poses), np.maximum(scores, 0.0), scores >= 0.0, seconds)
+    def refine(self, object_id: int, points: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, float]:
+        """Pose (4, 4) [m] of an object by its observed points (P, 3) in the camera's axes [m], from a start pose.
 
-    def _align(self, batch: RgbdBatch, row: int, start: np.ndarray) -> tuple[np.ndarray, float]:
-        """Refined pose (4, 4), and the fraction of points with a correspondence; -1: there are too few points."""
-        points = observed_points(batch, int(self._instances.view[row]), int(self._instances.slot[row]))
+        Returns:
+            Pose, and the fraction of the points that have a partner on the model; the start and 0 where there are too few.
+        """
         if len(points) < MIN_POINTS:
-            return start, -1.0
-        source, _ = self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)
-        target, tree = self._targets[int(self._instances.model[row])]
+            return start, 0.0
+        return self._align(object_id, self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)[0], start)
+
+    def search(self, object_id: int, points: np.ndarray) -> tuple[np.ndarray, float]:
+        """The best refined pose from the 24 rotations of a cube (the octahedral group), centred behind the points; see `refine`."""
+        if len(points) < MIN_POINTS:
+            return np.eye(4), 0.0
+        cloud = self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)[0]
+        *_, center, radius = self._models[object_id]
+        middle = points.mean(axis=0)
+        middle = middle * (1.0 + DEPTH_OF_CENTER * radius / max(float(np.linalg.norm(middle)), SPACING))
+        starts = np.tile(np.eye(4), (24, 1, 1))
+        starts[:, :3, :3] = Rotation.create_group("O").as_matrix()
+        starts[:, :3, 3] = middle - starts[:, :3, :3] @ center
+        return max((self._align(object_id, cloud, start) for start in starts), key=lambda result: result[1])
+
+    def _align(self, object_id: int, cloud: Any, start: np.ndarray) -> tuple[np.ndarray, float]:
+        """Align a thinned cloud; see `refine`."""
+        target, tree, *_ = self._models[object_id]
         # The observed part moves onto the whole model, so that every point has a partner.
         result = self._gicp.align(
             target,
-            source,
+            cloud,
             tree,
             np.linalg.inv(start),
             registration_type="GICP",
@@ -98,27 +91,6 @@ class GicpEstimator:
             rotation_epsilon=EPSILON,
             translation_epsilon=EPSILON,
         )
-        matrix = np.linalg.inv(result.T_target_source)
-        if not np.isfinite(matrix).all():
+        if not np.isfinite(result.T_target_source).all():
             return start, 0.0
-        return matrix, result.num_inliers / max(1, source.size())
-
-    def estimate(self, batch: RgbdBatch) -> Estimates:
-        """Not implemented (NotImplementedError): GICP needs a start pose."""
-        raise NotImplementedError
-
-    def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
-        """Not implemented (NotImplementedError): GICP does not track."""
-        raise NotImplementedError
-
-    def track(self, batch: RgbdBatch) -> Estimates:
-        """Not implemented (NotImplementedError): GICP does not track."""
-        raise NotImplementedError
-
-
-def observed_points(batch: RgbdBatch, view: int, slot: int) -> np.ndarray:
-    """Depth pixels of an instance's mask as points in the camera's axes (P, 3) float64 [m]."""
-    rows, columns = np.nonzero((batch.label[view] == 1 + slot) & (batch.depth[view] > 0))
-    z = batch.depth[view][rows, columns] * np.float64(batch.depth_scale[view])
-    fx, fy, cx, cy = batch.intrinsics[view].astype(np.float64).tolist()
-    return np.stack(((columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z), axis=-1)
+        return np.linalg.inv(result.T_target_source), result.num_inliers / max(1, cloud.size())

@@ -1,76 +1,80 @@
-"""Run of an estimation: groups of scenes through reader and estimator, to a table of poses, with times."""
+"""Run of a pose estimation: methods, scenes and their images, to a table of poses, with times.
+
+`single` sees nothing but the frame, `refine` starts from the disturbed truth, `track` from the truth in an instance's first frame and
+afterwards from its own estimate, without restart (ICG's protocol). All are given the visible masks of the instances.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from synpick_warp.apps.estimation.decoder_pool import SCENES_AHEAD, DecoderPool, ReadScene
-from synpick_warp.apps.estimation.methods import TRACK, EstimatorFactory, Group, ask, estimate_frame, make_group, to_rotations
-from synpick_warp.apps.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, SceneReader
-from synpick_warp.apps.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
+from synpick_warp.apps.estimation.disturbance import disturb_pose
+from synpick_warp.apps.estimation.gicp import Aligner
+from synpick_warp.apps.estimation.scenes import ABSENT, Scene, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.targets import Target, TargetList, count_targets
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
-from synpick_warp.stages.pose.batch import Estimates
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import Report, ignore_progress
 
-MAX_VIEWS = 128
-"""Views that are estimated at a time, if their number is left open: enough to fill a GPU."""
-MEMORY_FRACTION = 0.25
-"""Of the host's free memory for images, if the number of views is left open."""
+SINGLE, REFINE, TRACK = METHODS = ("single", "refine", "track")
+SPARSE = 20
+"""Default of `--every` for methods that look at one frame at a time: consecutive frames differ little."""
+DEPTHS = {"clean": "depth", "sensor": "depth_sensor"}
+"""Choices of depth images, and the folders they are in."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of an estimation: method, kind of depth, mask errors, least visibility, seed, views at a time (0: automatic), processes."""
+    """Options of an estimation."""
 
     method: str
+    """One of METHODS."""
     depth: str = "clean"
-    """Key of `reading.DEPTHS`."""
-    noisy_masks: bool = False
+    """Key of DEPTHS."""
     min_visibility: float = 0.1
     seed: int = 0
-    """Of disturbed starts and mask errors."""
-    views: int = 0
-    """Views at a time; 0: automatic."""
+    """Of disturbed starts."""
     threads: int = field(default_factory=count_cores)
-    """Processes that read scenes and images, or threads if there are few."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Result of an estimation: table of the finite estimates, numbers of views and of dropped estimates, and wall, reading and estimator
-    time [s].
-    """
+    """Result of an estimation."""
 
     poses: PoseTable
+    """Sorted by scene, image, object and instance."""
     views: int
-    skipped: int
-    """Estimates that were not finite, and are left out."""
     wall: float
     """Time of all [s]."""
-    reading: float
-    """Time that was spent waiting for images [s]; reading goes on behind the estimator."""
-    estimating: float
-    """Time in the estimator [s]."""
+
+
+class Estimate(NamedTuple):
+    """Row of the pose table; the sort key first."""
+
+    scene: int
+    image: int
+    object_id: int
+    instance: int
+    pose: np.ndarray
+    """Object to camera (4, 4) float64 [m]."""
+    score: float
+    """Fraction of the observed points that lie on the model."""
+    seconds: float
+    """Time of the image [s]."""
 
 
 def read_scenes(
-    data_set: DataSet,
-    plans: Sequence[ScenePlan],
-    options: Options,
-    targets: TargetList | None = None,
-    report: Report = ignore_progress,
-    pool: DecoderPool | None = None,
+    data_set: DataSet, plans: Sequence[ScenePlan], options: Options, targets: TargetList | None = None, report: Report = ignore_progress
 ) -> list[Scene]:
-    """Read the ground truth of scenes, and check that there are images to estimate on.
+    """Read the ground truth of scenes, and check that there is something to estimate.
 
     Args:
         data_set: The data set.
@@ -78,35 +82,46 @@ def read_scenes(
         options: Method and inputs.
         targets: Objects that count in each image; None: all.
         report: Observer.
-        pool: Processes that read; None: this one.
 
     Raises:
-        DatasetError: A file is missing or damaged; there are no depth images or masks as they are asked; nothing is visible enough.
+        DatasetError: A file is missing or damaged, there is no such depth, or nothing is visible enough.
     """
-    listed = None if targets is None else targets.objects
-    scenes = []
-    if pool is None:
-        read = (read_scene(data_set, plan) for plan in plans)
-    else:
-        read = pool.map_ordered((ReadScene(data_set.folder, plan) for plan in plans), depth=SCENES_AHEAD, ahead=SCENES_AHEAD)
-    report("scenes", 0, len(plans))
-    for plan, scene in zip(plans, read, strict=True):
+    scenes, layer = [], DEPTHS[options.depth]
+    for plan in plans:
+        scene = read_scene(data_set, plan)
         if options.method == TRACK and not scene.tracked:
             place = scene.files.place
             raise DatasetError(f"{place} has no instance_id in its ground truth, by which instances are tracked; use another method")
-        objects = [None if listed is None else listed[plan.scene, frame] for frame in plan.frames]
-        scenes.append(ask(scene, options.method, options.min_visibility, objects))
-        report("scenes", len(scenes), len(plans))
-    layer = DEPTHS[options.depth]
-    for scene in scenes:
         if layer != "depth" and layer not in scene.files.layers():
             raise DatasetError(f'{scene.files.place} has no {layer}; bake with render.layers = ["{layer}"], or use --depth clean')
+        objects = [None if targets is None else targets.objects[plan.scene, frame] for frame in plan.frames]
+        scenes.append(ask(scene, options.method, options.min_visibility, objects))
+        report("scenes", len(scenes), len(plans))
     if not any(scene.asked.any() for scene in scenes):
         raise DatasetError(f"no instance of {data_set.folder} is as visible as --visib-min {options.min_visibility:g} in these images")
-    first = next(scene for scene in scenes if scene.asked.any())
-    with SceneReader([first], options.depth) as reader:
-        reader.check(int(np.argmax(first.asked.any(axis=1))))
     return scenes
+
+
+def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[frozenset[int] | None]) -> Scene:
+    """Select the instances to estimate in each frame.
+
+    Tracks are asked in all frames from the first one on in which the instance is visible enough, as long as the image has it. Other
+    methods are asked where it is visible enough, and of an object that counts.
+
+    Args:
+        scene: The scene.
+        method: One of METHODS.
+        min_visibility: Smallest visible fraction.
+        objects: obj_ids that count in each planned frame; None: all.
+    """
+    present = scene.index != ABSENT
+    asked = present & ~(scene.visibility < min_visibility) & (scene.boxes[..., 2] >= 0)
+    if method == TRACK:
+        return replace(scene, asked=present & np.logical_or.accumulate(asked, axis=0))
+    for row, known in enumerate(objects):
+        if known is not None:
+            asked[row] &= np.isin(scene.object_ids, sorted(known))
+    return replace(scene, asked=asked)
 
 
 def list_targets(scenes: Sequence[Scene]) -> list[Target]:
@@ -118,109 +133,76 @@ def list_targets(scenes: Sequence[Scene]) -> list[Target]:
     return count_targets(rows)
 
 
-def count_views(scenes: Sequence[Scene], views: int, free: int | None = None) -> int:
-    """Number of views at a time: `views`, or if that is 0, as many as scenes, MAX_VIEWS and memory allow.
-
-    Args:
-        scenes: All scenes.
-        views: Number that is asked for; 0: automatic.
-        free: Free memory [bytes]; None: the host's.
-    """
-    if views:
-        return min(views, len(scenes))
-    width, height = scenes[0].size
-    size = (1 + AHEAD) * BYTES_PER_PIXEL * width * height
-    room = int(MEMORY_FRACTION * (free_host_memory() if free is None else free)) // size
-    return max(1, min(len(scenes), MAX_VIEWS, room))
-
-
-def run_estimation(
-    scenes: Sequence[Scene],
-    object_ids: Sequence[int],
-    factory: EstimatorFactory,
-    options: Options,
-    report: Report = ignore_progress,
-    pool: DecoderPool | None = None,
-) -> Run:
-    """Estimate the poses of all instances that are asked for; returns the table of poses, with times.
-
-    Args:
-        scenes: The scenes.
-        object_ids: obj_id of each model.
-        factory: Makes an estimator for each group of scenes.
-        options: Method and inputs.
-        report: Observer.
-        pool: Processes that decode images; None: as `SceneReader` chooses.
+def run_estimation(scenes: Sequence[Scene], aligner: Aligner, options: Options, report: Report = ignore_progress) -> Run:
+    """Estimate the poses of all instances that are asked for, in threads: a track's scene, or an image, at a time.
 
     Raises:
         DatasetError: An image or mask is missing or damaged, or has another size than the data set's.
     """
-    begin = time.perf_counter()
-    # Views of a batch have at least one instance each, so that the table tells how many views there are.
-    by_scene = {scene.plan.scene: scene for scene in scenes if scene.asked.any()}
-    collector, total = _Collector(), sum(map(len, scenes))
-    collector.views = total - sum(map(len, by_scene.values()))
-    for plans in group_scenes([scene.plan for scene in by_scene.values()], count_views(scenes, options.views)):
-        group = make_group([by_scene[plan.scene] for plan in plans], object_ids)
-        width, height = group.scenes[0].size
-        clock = time.perf_counter()
-        estimator = factory(group.table, height, width)
-        collector.estimating += time.perf_counter() - clock
-        seed = options.seed if options.noisy_masks else None
-        with SceneReader(group.scenes, options.depth, mask_seed=seed, threads=options.threads, pool=pool) as reader:
-            clock = time.perf_counter()
-            for step, batch in enumerate(reader):
-                ready = time.perf_counter()
-                estimates = estimate_frame(options.method, estimator, batch, group, step, options.seed)
-                collector.reading += ready - clock
-                collector.estimating += time.perf_counter() - ready
-                collector.add(estimates, group, step)
-                report("views", collector.views, total)
-                clock = time.perf_counter()
-    return collector.finish(time.perf_counter() - begin)
+    begin, total, views, rows = time.perf_counter(), sum(map(len, scenes)), 0, []
+    jobs = [
+        (scene, part)
+        for scene in scenes
+        for part in ([range(len(scene))] if options.method == TRACK else [[step] for step in range(len(scene))])
+    ]
+    with ThreadPoolExecutor(max(1, options.threads), "estimate") as pool:
+        try:
+            for (_, part), found in zip(jobs, pool.map(lambda job: list(_estimate(*job, aligner, options)), jobs), strict=True):
+                rows += found
+                views += len(part)
+                report("views", views, total)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return Run(_tabulate(sorted(rows, key=lambda row: row[:4])), total, time.perf_counter() - begin)
 
 
-class _Collector:
-    """Collects the rows of the pose table, and the times of an estimation."""
+def _estimate(scene: Scene, steps: Sequence[int], aligner: Aligner, options: Options) -> Iterator[Estimate]:
+    """Estimates in these frames of a scene, in order; tracks go on from one to the next."""
+    tracks: dict[int, np.ndarray] = {}
+    for step in steps:
+        began, found = time.perf_counter(), []
+        for slot in np.flatnonzero(scene.asked[step]).tolist():
+            points, truth = observed_points(scene, step, slot, DEPTHS[options.depth]), scene.poses[step, slot]
+            object_id, instance, frame = int(scene.object_ids[slot]), int(scene.instances[slot]), scene.plan.frames[step]
+            if options.method == SINGLE:
+                pose, score = aligner.search(object_id, points)
+            elif options.method == REFINE:
+                start = disturb_pose(truth, options.seed, scene.plan.scene, frame, instance)
+                pose, score = aligner.refine(object_id, points, start)
+            elif slot in tracks:
+                pose, score = aligner.refine(object_id, points, tracks[slot])
+            else:
+                pose, score = truth, 1.0
+            tracks[slot] = pose
+            # A hidden instance keeps its track; other methods have no estimate of it.
+            if score > 0.0 or options.method == TRACK:
+                found.append((scene.plan.scene, frame, object_id, instance, pose, score))
+        seconds = time.perf_counter() - began  # BOP wants one time for all rows of an image.
+        yield from (Estimate(*row, seconds) for row in found)
 
-    def __init__(self) -> None:
-        self._parts: list[PoseTable] = []
-        self.views = self.skipped = 0
-        self.reading = self.estimating = 0.0
 
-    def add(self, estimates: Estimates, group: Group, step: int) -> None:
-        """Add the valid estimates of a step, and its times."""
-        showing = [step < len(scene) for scene in group.scenes]
-        self.views += sum(showing)
-        # A quaternion that cannot be normalised is no rotation.
-        finite = np.isfinite(estimates.pose).all(axis=1) & np.isfinite(estimates.score) & (np.abs(estimates.pose[:, 3:]).max(axis=1) > 0.0)
-        self.skipped += int((estimates.valid & ~finite).sum())
-        rows = np.flatnonzero(estimates.valid & finite)
-        if not len(rows):
-            return
-        views, slots = group.table.view[rows], group.table.slot[rows]
-        # BOP wants one time for all rows of an image.
-        seconds = np.zeros(len(group.scenes))
-        np.maximum.at(seconds, views, estimates.seconds[rows])
-        scenes = group.scenes
-        self._parts.append(
-            PoseTable(
-                scene=np.array([scenes[view].plan.scene for view in views], np.int64),
-                image=np.array([scenes[view].plan.frames[step] for view in views], np.int64),
-                object_id=np.array([scenes[view].object_ids[slot] for view, slot in zip(views, slots, strict=True)], np.int64),
-                rotation=to_rotations(estimates.pose[rows]),
-                translation=estimates.pose[rows, :3].astype(np.float64),
-                score=estimates.score[rows].astype(np.float64),
-                seconds=seconds[views],
-                instance=np.array([scenes[view].instances[slot] for view, slot in zip(views, slots, strict=True)], np.int64),
-            )
-        )
+def observed_points(scene: Scene, step: int, slot: int, layer: str) -> np.ndarray:
+    """Depth pixels of an instance's visible mask as points in the camera's axes (P, 3) float64 [m].
 
-    def finish(self, wall: float) -> Run:
-        """Result with the table sorted by scene, image, object and instance."""
-        names = PoseTable.__dataclass_fields__
-        ints, reals = np.empty(0, np.int64), np.empty(0)
-        empty = PoseTable(ints, ints, ints, np.empty((0, 3, 3)), np.empty((0, 3)), reals, reals, ints)
-        table = PoseTable(*(np.concatenate([getattr(part, name) for part in (empty, *self._parts)]) for name in names))
-        order = np.lexsort((table.instance, table.object_id, table.image, table.scene))
-        return Run(table.select(order), self.views, self.skipped, wall, self.reading, self.estimating)
+    Raises:
+        DatasetError: The image or the mask is missing or damaged, or has another size than the data set's.
+    """
+    frame = scene.plan.frames[step]
+    if scene.boxes[step, slot, 2] < 0:
+        return np.empty((0, 3))
+    depth = scene.files.typed_image(layer, frame, None, "uint16")
+    mask = scene.files.mask("mask_visib", frame, int(scene.index[step, slot]))
+    rows, columns = np.nonzero(mask & (depth > 0))
+    z = depth[rows, columns] * np.float64(scene.depth_scale[step])
+    fx, fy, cx, cy = scene.intrinsics[step].astype(np.float64).tolist()
+    return np.stack(((columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z), axis=-1)
+
+
+def _tabulate(rows: Sequence[Estimate]) -> PoseTable:
+    """Table of estimates."""
+    integers = np.array([row[:4] for row in rows], np.int64).reshape(-1, 4)
+    scene, image, object_id, instance = integers.T
+    poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
+    score, seconds = (np.array([getattr(row, name) for row in rows], np.float64) for name in ("score", "seconds"))
+    return PoseTable(scene, image, object_id, poses[:, :3, :3], poses[:, :3, 3], score, seconds, instance)

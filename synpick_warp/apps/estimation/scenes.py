@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from synpick_warp.dataset.bop.arrays import SceneArrays, read_arrays
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError
-from synpick_warp.stages.pose.batch import MAX_SLOTS
 
 _METERS = 1e-3
 """In a millimetre."""
@@ -89,8 +87,6 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     if len(other):
         instance, frame = truth.instance[other[0]], frames[other[0]]
         raise DatasetError(f"{place}: instance {instance} of image {frame} has another obj_id than before; {ADVICE}")
-    if len(instances) > MAX_SLOTS:
-        raise DatasetError(f"{place} has {len(instances)} instances; allowed: {MAX_SLOTS}")
     counts = truth.counts
     shape = len(counts), len(instances)
     index, visibility = np.full(shape, ABSENT, np.int32), np.zeros(shape)
@@ -121,7 +117,7 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     )
 
 
-_INPUTS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images", "depth": "depth images", "mask_visib": "masks (mask_visib)"}
+_INPUTS = {"gt": "ground truth (scene_gt.json)", "depth": "depth images", "mask_visib": "masks (mask_visib)"}
 
 
 def _check_inputs(source: SceneFiles) -> None:
@@ -152,9 +148,3 @@ def _check_rotations(rotations: np.ndarray, plan: ScenePlan, place: object) -> N
     off = np.where(np.linalg.det(rotations) > 0.0, off, np.inf).max(axis=1, initial=0.0)
     if (off > _ORTHOGONAL).any():
         raise DatasetError(f"{place}: a cam_R_m2c of image {plan.frames[int(np.argmax(off > _ORTHOGONAL))]} is no rotation; {ADVICE}")
-
-
-def group_scenes(plans: Sequence[ScenePlan], views: int) -> list[list[ScenePlan]]:
-    """Divide scenes into groups of at most `views` that are read side by side; scenes of similar length share a group."""
-    ordered = sorted(plans, key=lambda plan: (-len(plan.frames), plan.scene))
-    return [ordered[start : start + views] for start in range(0, len(ordered), views)]

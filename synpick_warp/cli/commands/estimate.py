@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,9 +19,6 @@ if TYPE_CHECKING:
 
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
-_MASKS = ("exact", "noisy")
-_MAX_BATCH = 4096
-"""Upper bound of --batch [views]."""
 _MAX_SEED = 2**63 - 1
 _MAX_INDEX = 2**31 - 1
 _RANGE = re.compile(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?")
@@ -53,12 +49,10 @@ def estimate(
         str,
         Parameter(
             help="single: each frame by itself; refine: from the truth moved by 2 cm and turned by 15°; track: from the truth in an"
-            " instance's first frame on, without restart; gicp: small_gicp from the start of refine, on the CPU."
+            " instance's first frame on, without restart."
         ),
     ],
     depth: Annotated[str, Parameter(help="Depth images: clean, or sensor for the layer depth_sensor.")] = "clean",
-    masks: Annotated[str, Parameter(help="exact, or noisy: 5 % each eroded, dilated and swapped with a neighbour.")] = "exact",
-    color: Annotated[bool, Parameter(help="Use colour; --no-color leaves depth and masks. gicp never uses it.")] = True,
     every: Annotated[
         WholeNumber | None, Parameter(help="Every n-th frame of a scene, from the first one (default 20; track takes every frame).")
     ] = None,
@@ -72,12 +66,10 @@ def estimate(
     visib_min: Annotated[float, Parameter(help="Smallest visible fraction of an instance that is estimated, from 0 to 1.")] = (
         DEFAULT_VISIBILITY
     ),
-    seed: Annotated[WholeNumber, Parameter(help="Seed of disturbed starts and of noisy masks.")] = 0,
-    batch: Annotated[WholeNumber, Parameter(help="Views that are estimated at a time; 0: as many as memory allows, up to 128.")] = 0,
-    device: Annotated[str, Parameter(help="cpu, cuda:N, or auto: the first GPU if there is one.")] = "auto",
-    threads: Annotated[WholeNumber, Parameter(help="Processes or threads that read images, threads of gicp; 0: one per core.")] = 0,
+    seed: Annotated[WholeNumber, Parameter(help="Seed of disturbed starts.")] = 0,
+    threads: Annotated[WholeNumber, Parameter(help="Threads; 0: one per core.")] = 0,
 ) -> int:
-    """Estimate object poses, given the visible masks of the instances, and write a BOP result file for `eval`.
+    """Estimate object poses by generalized ICP (small_gicp) from depth and visible masks, and write a BOP result file for `eval`.
 
     Unless all images of the data set are estimated, their list is written beside it as OUT-targets.json, for `eval --targets`.
     """
@@ -85,16 +77,12 @@ def estimate(
     from synpick_warp.dataset.reading import open_data_set
 
     selection = make_selection(method, every, targets, modes, cameras, episodes)
-    options = make_options(method, depth, masks, visib_min, seed, batch, threads)
+    options = make_options(method, depth, visib_min, seed, threads)
     data = find_data_set(data, "synpick-warp estimate DIR", has_images)
     out = Path(f"{method}_{toolkit_ending(open_data_set(data))}.csv") if out is None else out
     check_output(out, selection)
     check_output_file(out, "--out", data)
-    if options.method == "gicp":
-        from synpick_warp.apps.estimation.gicp import load_small_gicp
-
-        load_small_gicp()
-    run, listed = run_method(data, selection, options, device, out, color=color, split=split)
+    run, listed = run_method(data, selection, options, out, split=split)
     print(describe_run(run))
     print(f"results: {escape(str(out))}")
     if listed is not None:
@@ -102,12 +90,9 @@ def estimate(
     return 0
 
 
-def run_method(
-    data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool, split: str | None = None
-) -> tuple[Run, Path | None]:
+def run_method(data: Path, selection: Selection, options: Options, out: Path, *, split: str | None = None) -> tuple[Run, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
-    from synpick_warp.apps.estimation import factories
-    from synpick_warp.apps.estimation.decoder_pool import open_pool
+    from synpick_warp.apps.estimation.gicp import Aligner
     from synpick_warp.apps.estimation.models import read_object_models
     from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
     from synpick_warp.apps.estimation.selection import plan_scenes
@@ -123,14 +108,10 @@ def run_method(
     if selection.targets is not None:
         selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.sensors))
     plans, complete = plan_scenes(data_set, selection)
-    processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
-    with processes or nullcontext() as pool, CountProgress(make_console()) as counter:
-        scenes = read_scenes(data_set, plans, options, selection.targets, counter.report, pool)
+    with CountProgress(make_console()) as counter:
+        scenes = read_scenes(data_set, plans, options, selection.targets, counter.report)
         wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
-        models = read_object_models(data_set.folder, wanted)
-        noise = factories.sensor_noise(data_set.config.depth_sensor, scenes) if options.depth == "sensor" else 0.0
-        factory = factories.make_factory(options.method, models, device, options.threads, color=color, depth_noise=noise)
-        run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report, pool)
+        run = run_estimation(scenes, Aligner(read_object_models(data_set.folder, wanted)), options, counter.report)
     listed = None if complete and split is None else targets_file(out)
     if listed is not None:
         with output_errors(listed):
@@ -148,7 +129,7 @@ def make_selection(
         ConfigError: A value is not allowed, or two exclude each other.
         ResultError: The target list cannot be read.
     """
-    from synpick_warp.apps.estimation.methods import METHODS, SPARSE, TRACK
+    from synpick_warp.apps.estimation.run import METHODS, SPARSE, TRACK
     from synpick_warp.apps.estimation.selection import Selection
     from synpick_warp.apps.evaluation.targets import read_targets
 
@@ -169,24 +150,21 @@ def make_selection(
     )
 
 
-def make_options(method: str, depth: str, masks: str, visib_min: float, seed: int, batch: int, threads: int) -> Options:
+def make_options(method: str, depth: str, visib_min: float, seed: int, threads: int) -> Options:
     """Make the options of the estimation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed.
     """
-    from synpick_warp.apps.estimation.reading import DEPTHS
-    from synpick_warp.apps.estimation.run import Options
+    from synpick_warp.apps.estimation.run import DEPTHS, Options
 
-    for option, value, allowed in (("--depth", depth, tuple(DEPTHS)), ("--masks", masks, _MASKS)):
-        if value not in allowed:
-            raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
+    if depth not in DEPTHS:
+        raise ConfigError(f"--depth is {format_value(depth)}; allowed: {', '.join(DEPTHS)}")
     check_range("--visib-min", visib_min, 0, 1)
     check_range("--seed", seed, 0, _MAX_SEED)
-    check_range("--batch", batch, 0, _MAX_BATCH)
     check_range("--threads", threads, 0, MAX_THREADS)
     given = {"threads": threads} if threads else {}
-    return Options(method, depth, masks == "noisy", visib_min, seed, batch, **given)
+    return Options(method, depth, visib_min, seed, **given)
 
 
 def parse_indices(option: str, text: str) -> tuple[int, ...]:
@@ -224,9 +202,5 @@ def check_output(out: Path, selection: Selection) -> None:
 
 
 def describe_run(run: Run) -> str:
-    """One line on a run: views, poses, rates, shares of the time, estimates left out."""
-    wall = max(run.wall, 1e-9)
-    rate = f"{len(run.poses) / wall:,.0f} poses/s, {run.views / wall:,.0f} views/s"
-    parts = f"waiting for images {run.reading / wall:.0%}, estimating {run.estimating / wall:.0%}"
-    left = f"; {run.skipped:,} estimates were not finite and are left out" if run.skipped else ""
-    return f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({rate}; {parts}){left}"
+    """One line on a run: views, poses, rate."""
+    return f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({len(run.poses) / max(run.wall, 1e-9):,.0f} poses/s)"

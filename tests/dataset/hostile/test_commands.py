@@ -15,13 +15,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
-from synpick_warp.apps.estimation import factories
 from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
 from tests.builders import PICKED, bake_boxes, once, run
-from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
 
@@ -193,12 +191,10 @@ def evaluate(sandbox: Sandbox) -> None:
 
 
 def estimate(sandbox: Sandbox) -> int:
-    """Run `estimate` with an estimator that answers with the masks' centroids; returns the exit code."""
-    out = sandbox.scratch / "single.csv"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(factories, "make_factory", lambda *_, **__: lambda table, height, width: FakeEstimator(table))
-        options = ("--every", 1, "--masks", "noisy", "--visib-min", 0)
-        code = run_command("estimate", "--data", sandbox.folder, "--method", "single", *options, "--out", out)
+    """Run `estimate`; returns the exit code."""
+    out = sandbox.scratch / "refine.csv"
+    options = ("--method", "refine", "--every", 1, "--visib-min", 0, "--threads", 1)
+    code = run_command("estimate", "--data", sandbox.folder, *options, "--out", out)
     assert (code == 0) == out.exists()
     out.unlink(missing_ok=True)
     return code

@@ -1,4 +1,4 @@
-"""Renders single objects without light or surroundings, by the rasterizer: depth templates, and pictures of estimated poses."""
+"""Renders single objects without light or surroundings, by the rasterizer, for validation and pictures of estimated poses."""
 
 from __future__ import annotations
 

@@ -1,2 +1,0 @@
-"""Launchers of the pose estimation kernels: observation, refinement, template search, tracking;
-and of the nearest-vertex search for ADD-S."""
