@@ -1,14 +1,19 @@
-"""Readers of camera calibration files of OpenCV, ROS, BOP, RealSense and Zivid; all return intrinsics with pixel centres at + 0.5.
+"""Readers of camera calibration files; all return intrinsics with pixel centres at + 0.5.
 
 | format | file | pixel centres | lens |
 |---|---|---|---|
-| OpenCV | YAML, XML, JSON of `FileStorage`, names as in its samples | integers | pinhole 4, 5, 8, 12 (14 without tilt), fisheye |
-| ROS | `camera_info` YAML, or a `CameraInfo` message as text | integers | plumb_bob, rational_polynomial, equidistant |
-| BOP | `camera.json` | + 0.5, as here | none |
+| OpenCV | YAML, XML, JSON of `FileStorage`, `.npz`, `.npy`; samples' names | integers | pinhole 4, 5, 8, 12 (14 without tilt), fisheye |
+| cam_K.txt | the nine numbers of the matrix, as FoundationPose has them; also as a list of JSON | integers | none |
+| ROS | `camera_info` YAML or `.ini`, or a `CameraInfo` message as text | integers | plumb_bob, rational_polynomial, equidistant |
+| Kalibr | `camchain.yaml` | integers | radtan, equidistant |
+| BOP | `camera.json`, `scene_camera.json` | + 0.5, as here | as this program adds it |
+| Open3D | `PinholeCameraIntrinsic`, whose matrix stands column by column | integers | none |
+| COLMAP | `cameras.txt` | + 0.5 | those that are OpenCV's: radial, OPENCV, FULL_OPENCV, fisheye |
+| nerfstudio | `transforms.json` | + 0.5 | OPENCV, OPENCV_FISHEYE |
 | RealSense | JSON with the fields of `rs2_intrinsics` | integers | brown_conrady, kannala_brandt4; others if all are 0 |
 | Zivid | YAML or JSON of `CameraIntrinsics` | integers | pinhole 5; K3 stands before P1 and P2 |
 
-Raw images are described: rectification and projection matrices are not read.
+A file of several cameras is read where they are equal. Raw images are described: rectification and projection matrices are not read.
 """
 
 from __future__ import annotations
@@ -31,15 +36,23 @@ INTEGERS, HALVES = 0.0, 0.5
 """Image coordinates of the centre of the first pixel [px]."""
 MAX_SIDE = 8192
 """Largest width and height of an image [px]: the limit of cameras.resolution."""
+MAX_NUMBER = 1e6
+"""Largest focal length, coordinate of the principal point [px] and coefficient of distortion: the limit of camera.matrix."""
 _MAX_NUMBERS = 64
 _NO_SKEW = 1e-9
 """Largest skew of a camera matrix, relative to fx."""
 _ROS_MODELS = {
-    "plumb_bob": (PINHOLE, (4, 5)), "rational_polynomial": (PINHOLE, (8, 12, 14)),
+    "plumb_bob": (PINHOLE, (4, 5)), "radtan": (PINHOLE, (4,)), "rational_polynomial": (PINHOLE, (8, 12, 14)),
     "equidistant": (FISHEYE, (4,)), "fisheye": (FISHEYE, (4,)),
 }  # fmt: skip
 _RS_MODELS = ("none", "modified_brown_conrady", "inverse_brown_conrady", "ftheta", "brown_conrady", "kannala_brandt4")
 """Names of `rs2_distortion`, in the order of its values."""
+_COLMAP_MODELS = {
+    "SIMPLE_PINHOLE": "f cx cy", "PINHOLE": "fx fy cx cy", "SIMPLE_RADIAL": "f cx cy k1", "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2", "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1", "RADIAL_FISHEYE": "f cx cy k1 k2",
+}  # fmt: skip
+"""Parameters of COLMAP's models that are OpenCV's, in their order."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +87,30 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
             is one that is not rendered.
     """
     tree = read_document(path)
-    try:
-        name, counted, convert = next((row[0], row[2], row[3]) for row in _FORMATS if row[1](tree))
-    except StopIteration:
-        keys = ", ".join(map(str, list(tree)[:6]))
+    trees = [tree] if _format(tree) else [part for part in tree.values() if isinstance(part, dict) and _format(part)]
+    if not trees:
+        keys = format_value(", ".join(map(str, list(tree)[:6])))
         raise ConfigError(
-            f"{path} has no intrinsics of a known format, but {format_value(keys)}; known: {', '.join(row[0] for row in _FORMATS)}"
-        ) from None
-    try:
-        found = _check(convert(tree, model), model)
-    except _FaultError as fault:
-        raise ConfigError(f"{path} ({name}): {fault}") from None
-    shift = HALVES - (counted if pixel_center is None else pixel_center)
-    return replace(found, cx=found.cx + shift, cy=found.cy + shift)
+            f"{path} has no intrinsics of a known format, but {keys}; known: {', '.join(dict.fromkeys(row[0] for row in _FORMATS))}; "
+            "or write resolution, matrix and distortion into the settings"
+        )
+    read = set()
+    for part in trees:
+        name, _, counted, convert = _format(part) or _FORMATS[-1]
+        try:
+            found = _check(convert(part, model), model)
+        except _FaultError as fault:
+            raise ConfigError(f"{path} ({name}): {fault}") from None
+        shift = HALVES - (counted if pixel_center is None else pixel_center)
+        read.add(replace(found, cx=found.cx + shift, cy=found.cy + shift))
+    if len(read) > 1:
+        raise ConfigError(f"{path} has {len(read)} cameras that differ; write each into a file of its own")
+    return read.pop()
+
+
+def _format(tree: Tree) -> _Format | None:
+    """The first of the formats that a tree is of."""
+    return next((row for row in _FORMATS if row[1](tree)), None)
 
 
 class _FaultError(Exception):
@@ -97,8 +121,12 @@ def _check(found: Calibration, model: str) -> Calibration:
     """Validate what all formats have in common; coefficients that are all 0 are none, except those of a fisheye."""
     if min(found.fx, found.fy) <= 0:
         raise _FaultError(f"the focal lengths are {found.fx:g} and {found.fy:g}; allowed: above 0 [px]")
+    if max(map(abs, (found.fx, found.fy, found.cx, found.cy, *found.distortion))) > MAX_NUMBER:
+        raise _FaultError(f"it has a focal length, centre or coefficient above {MAX_NUMBER:g}; check its numbers")
     if (found.width or found.height) and not (0 < found.width <= MAX_SIDE and 0 < found.height <= MAX_SIDE):
-        raise _FaultError(f"the image has {found.width} x {found.height} pixels; allowed: 1 to {MAX_SIDE}")
+        raise _FaultError(f"the image has {found.width:g} x {found.height:g} pixels; allowed: 1 to {MAX_SIDE}")
+    if found.model not in COUNTS:
+        raise _FaultError(f"its distortion model is {format_value(found.model)}; allowed: {', '.join(COUNTS)}")
     if found.model == PINHOLE and not any(found.distortion):
         found = replace(found, distortion=())
     elif model not in ("", found.model):
@@ -111,31 +139,34 @@ def _check(found: Calibration, model: str) -> Calibration:
 
 def _opencv(tree: Tree, model: str) -> Calibration:
     """Values of OpenCV's calibration samples, of C++ and Python."""
-    width, height = _size(tree, ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height"))
-    coefficients = _numbers(_first(tree, _DISTORTION, []), "distortion coefficients")
+    coefficients = _coefficients(tree)
     flag = str(_first(tree, ("fisheye_model", "fisheye"), "")).strip().lower()
     said = FISHEYE if flag in ("1", "true") or str(_first(tree, _MODEL, "")).lower() in ("fisheye", "equidistant") else ""
     said = said or (PINHOLE if flag or len(coefficients) != 4 else model or ("" if any(coefficients) else PINHOLE))
     if not said:
         raise _FaultError('its 4 coefficients may be of both models; set model = "pinhole" or "fisheye"')
-    return Calibration(width, height, *_matrix(_first(tree, _MATRIX, None)), said, _without_tilt(coefficients))
+    matrix = _four(tree, "fx fy cx cy") if "fx" in tree else _matrix(_first(tree, _MATRIX, None))
+    return Calibration(*_size(tree), *matrix, said, _without_tilt(coefficients))
 
 
 def _ros(tree: Tree, model: str) -> Calibration:
-    """Values of ROS's camera_calibration, or of a message."""
-    width, height = _size(tree, ("image_width", "width"), ("image_height", "height"))
+    """Values of ROS's camera_calibration, of a message, or of Kalibr."""
+    width, height = _size(tree)
     for key in ("binning_x", "binning_y"):
-        if _number(tree.get(key, 0), key) > 1:
-            raise _FaultError(f"{key} is {tree[key]}; give intrinsics of the image as it is, without binning")
+        if (binning := _number(tree.get(key, 0), key)) > 1:
+            raise _FaultError(f"{key} is {binning:g}; give intrinsics of the image as it is, without binning")
     roi = tree.get("roi", {})
     part = tuple(int(_number(roi.get(key, 0), f"roi.{key}")) for key in ("width", "height")) if isinstance(roi, dict) else (0, 0)
     if part not in ((0, 0), (width, height)):
-        raise _FaultError(f"its region of interest has {part[0]} x {part[1]} of {width} x {height} pixels; calibrate the whole image")
+        raise _FaultError(
+            f"its region of interest has {part[0]:g} x {part[1]:g} of {width:g} x {height:g} pixels; calibrate the whole image"
+        )
     matrix = _numbers(_first(tree, _MATRIX, None), "camera matrix")
     if not any(matrix[:1]):
         raise _FaultError("its camera is not calibrated: K[0] is 0")
-    coefficients = _numbers(_first(tree, _DISTORTION, []), "distortion coefficients")
     named = str(_first(tree, _MODEL, "")).strip().lower()
+    # Files of camera_calibration state 5 columns of the 8 coefficients.
+    coefficients = _coefficients(tree, any_size=named == "rational_polynomial")
     if named not in _ROS_MODELS:
         if any(coefficients):
             raise _FaultError(f"its distortion model is {format_value(named)}; allowed: {', '.join(_ROS_MODELS)}")
@@ -146,10 +177,63 @@ def _ros(tree: Tree, model: str) -> Calibration:
     return Calibration(width, height, *_matrix(matrix), kind, _without_tilt(coefficients))
 
 
+def _kalibr(tree: Tree, model: str) -> Calibration:
+    """A camera of Kalibr's camchain.yaml."""
+    if tree.get("camera_model") != PINHOLE:
+        raise _FaultError(f"its camera model is {format_value(tree.get('camera_model'))}; allowed: {PINHOLE}")
+    fx, fy, cx, cy = _exactly(_numbers(tree.get("intrinsics"), "intrinsics"), 4, "intrinsics")
+    size = _exactly(_numbers(tree.get("resolution", [0, 0]), "resolution"), 2, "resolution")
+    lens = {name: tree.get(name) for name in ("distortion_model", "distortion_coeffs")}
+    return _ros({"width": size[0], "height": size[1], "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], **lens}, model)
+
+
 def _bop(tree: Tree, model: str) -> Calibration:
-    """Values of BOP's camera.json; with the distortion that this program adds to it."""
-    lens = (str(tree.get("cam_dist_model", PINHOLE)), _numbers(tree.get("cam_dist", []), "cam_dist"))
-    return Calibration(*_size(tree, ("width",), ("height",)), *_four(tree, "fx fy cx cy"), *lens)
+    """Values of BOP's camera.json, or of an image in its scene_camera.json; with the distortion that this program adds to them."""
+    lens = (str(tree.get("cam_dist_model", PINHOLE)), _numbers(tree.get("cam_dist") or [], "cam_dist"))
+    return Calibration(*_size(tree), *(_matrix(tree["cam_K"]) if "cam_K" in tree else _four(tree, "fx fy cx cy")), *lens)
+
+
+def _open3d(tree: Tree, model: str) -> Calibration:
+    """Open3D's PinholeCameraIntrinsic."""
+    columns = _exactly(_numbers(tree["intrinsic_matrix"], "intrinsic_matrix"), 9, "intrinsic_matrix")
+    return Calibration(*_size(tree), *_matrix([columns[3 * (index % 3) + index // 3] for index in range(9)]))
+
+
+def _colmap(tree: Tree, model: str) -> Calibration:
+    """A line of COLMAP's cameras.txt."""
+    named = str(tree["MODEL"])
+    if named not in _COLMAP_MODELS:
+        raise _FaultError(f"its model is {format_value(named)}; allowed: {', '.join(_COLMAP_MODELS)}")
+    names = _COLMAP_MODELS[named].split()
+    values = dict(zip(names, _exactly(_numbers(tree["PARAMS"], "PARAMS"), len(names), "PARAMS"), strict=True))
+    fx, fy = (values.get(key, values.get("f", 0.0)) for key in ("fx", "fy"))
+    return Calibration(*_size(tree), fx, fy, values["cx"], values["cy"], *_by_name(values, named.endswith("FISHEYE")))
+
+
+def _nerfstudio(tree: Tree, model: str) -> Calibration:
+    """Values of nerfstudio's transforms.json, for all frames or equal in each."""
+    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2")
+    frames = tree.get("frames")
+    frames = [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
+    sets = {tuple(_number(frame.get(key, tree.get(key, 0)), key) for key in keys) for frame in frames or [tree]}
+    if len(sets) > 1:
+        raise _FaultError(f"its frames are of {len(sets)} cameras; write the values of one into a file of its own")
+    values = dict(zip(keys, sets.pop(), strict=True))
+    named, allowed = str(tree.get("camera_model", "OPENCV")), ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "OPENCV_FISHEYE")
+    fisheye = named == "OPENCV_FISHEYE" or tree.get("is_fisheye") is True
+    if named not in allowed or (values["k4"] and not fisheye):
+        raise _FaultError(
+            f"its camera_model is {format_value(named)} with k4 = {values['k4']:g}; allowed: {', '.join(allowed)}, k4 of a fisheye"
+        )
+    focal = values["fl_x"], values["fl_y"] or values["fl_x"]
+    return Calibration(*_size(values), *focal, values["cx"], values["cy"], *_by_name(values, fisheye))
+
+
+def _by_name(values: Tree, fisheye: bool) -> tuple[str, tuple[float, ...]]:
+    """Model and coefficients that have names of their own."""
+    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    found = tuple(_number(values.get(name, 0.0), name) for name in names)
+    return (FISHEYE, found) if fisheye else (PINHOLE, found if any(found[5:]) else found[:5])
 
 
 def _realsense(tree: Tree, model: str) -> Calibration:
@@ -158,11 +242,11 @@ def _realsense(tree: Tree, model: str) -> Calibration:
     `brown_conrady` and `kannala_brandt4` are OpenCV's. `modified_brown_conrady` shifts points that are scaled already, and so is OpenCV's
     only without tangential coefficients; `inverse_brown_conrady` takes distorted points to undistorted ones.
     """
-    plain = Calibration(*_size(tree, ("width",), ("height",)), *_four(tree, "fx fy ppx ppy"))
+    plain = Calibration(*_size(tree), *_four(tree, "fx fy ppx ppy"))
     coefficients = _numbers(tree.get("coeffs", []), "coeffs")
     named = str(_first(tree, _MODEL, "none"))
     name = named.strip().lower().rpartition(".")[2].replace(" ", "_").removeprefix("rs2_distortion_")
-    name = _RS_MODELS[int(name)] if name.isdigit() and int(name) < len(_RS_MODELS) else name
+    name = dict(zip("012345", _RS_MODELS, strict=True)).get(name, name)
     if name == "kannala_brandt4":
         return replace(plain, model=FISHEYE, distortion=coefficients[:4])
     if not any(coefficients):
@@ -184,29 +268,59 @@ def _zivid(tree: Tree, model: str) -> Calibration:
     )
 
 
-_MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "camera_Matrix", "mtx", "K", "k")
+_MATRIX = ("cameramatrix", "cammatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "mtx", "k")
 _DISTORTION = (
-    "distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist_coeff", "distortion_coeffs", "dist", "D", "d",
+    "distortioncoefficients", "distortioncoeffs", "distortion",
+    "distcoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "dist", "d",
 )  # fmt: skip
-_MODEL = ("distortion_model", "model", "camera_model")
-_FORMATS: tuple[tuple[str, Callable[[Tree], bool], float, Callable[[Tree, str], Calibration]], ...] = (
+_MODEL = ("distortionmodel", "model", "cameramodel")
+"""Names of values, as of `_short`."""
+_Format = tuple[str, Callable[[Tree], bool], float, Callable[[Tree, str], Calibration]]
+_FORMATS: tuple[_Format, ...] = (
     ("Zivid", lambda tree: "CameraIntrinsics" in tree or {"CameraMatrix", "Distortion"} <= tree.keys(), INTEGERS, _zivid),
     ("RealSense", lambda tree: {"ppx", "ppy"} <= tree.keys(), INTEGERS, _realsense),
-    ("ROS", lambda tree: bool({"camera_name", "distortion_model", "header"} & tree.keys()) and _has_matrix(tree), INTEGERS, _ros),
-    ("OpenCV", lambda tree: _has_matrix(tree), INTEGERS, _opencv),
+    ("COLMAP", lambda tree: {"MODEL", "PARAMS"} <= tree.keys(), HALVES, _colmap),
+    ("nerfstudio", lambda tree: "fl_x" in tree or {"camera_angle_x", "frames"} <= tree.keys(), HALVES, _nerfstudio),
+    ("Kalibr", lambda tree: {"intrinsics", "camera_model"} <= tree.keys(), INTEGERS, _kalibr),
+    ("Open3D", lambda tree: {"intrinsic_matrix", "width", "height"} == tree.keys(), INTEGERS, _open3d),
+    ("BOP", lambda tree: "cam_K" in tree, HALVES, _bop),
+    ("ROS", lambda tree: bool({"camera_name", "distortion_model", "header"} & tree.keys()) and _has(tree, _MATRIX), INTEGERS, _ros),
+    ("OpenCV", lambda tree: _has(tree, _MATRIX), INTEGERS, _opencv),
+    ("OpenCV", lambda tree: {"fx", "fy", "cx", "cy"} <= tree.keys() and (_has(tree, _DISTORTION) or "k1" in tree), INTEGERS, _opencv),
     ("BOP", lambda tree: {"fx", "fy", "cx", "cy"} <= tree.keys(), HALVES, _bop),
 )
 """Name, test of a file's content, place of the first pixel's centre, and reader of each format; the first whose test passes is taken."""
 
 
-def _has_matrix(tree: Tree) -> bool:
-    """Whether there is a camera matrix under one of its names."""
-    return any(name in tree for name in _MATRIX)
+def _short(name: object) -> str:
+    """Name in small letters and digits alone."""
+    return "".join(letter for letter in str(name) if letter.isalnum()).lower()
+
+
+def _has(tree: Tree, names: Sequence[str]) -> bool:
+    """Whether there is a value under one of these names."""
+    return any(_short(name) in names for name in tree)
+
+
+def _coefficients(tree: Tree, any_size: bool = False) -> tuple[float, ...]:
+    """Distortion coefficients under one of their names, or k1, k2, p1, p2 and so on under their own; none if there are none.
+
+    Raises:
+        _FaultError: A name looks like one of coefficients, and is not known.
+    """
+    known = (*_DISTORTION, *_MODEL, "camdist")
+    if unknown := [name for name in tree if _short(name).startswith("dist") and _short(name) not in known]:
+        raise _FaultError(f"it has {format_value(unknown[0])}, which is no known name; call coefficients distortion_coefficients")
+    if _has(tree, _DISTORTION):
+        return _numbers(_first(tree, _DISTORTION, None), "distortion coefficients", any_size)
+    # With k4 and without p1 they are the four of a fisheye, or may be.
+    return _by_name(tree, fisheye="k4" in tree and "p1" not in tree)[1] if "k1" in tree else ()
 
 
 def _first(tree: Tree, names: Sequence[str], default: Any) -> Any:
     """Value of the first of these names that is there."""
-    return next((tree[name] for name in names if name in tree), default)
+    short = {_short(name): value for name, value in tree.items()}
+    return next((short[_short(name)] for name in names if _short(name) in short), default)
 
 
 def _mapping(tree: Any, key: str) -> Tree:
@@ -236,16 +350,24 @@ def _four(tree: Tree, keys: str) -> tuple[float, float, float, float]:
     return a, b, c, d
 
 
-def _numbers(value: Any, key: str) -> tuple[float, ...]:
-    """Numbers of a matrix: OpenCV's or ROS's mapping with rows, cols and data, nested lists, or a text with blanks between them."""
+def _numbers(value: Any, key: str, any_size: bool = False) -> tuple[float, ...]:
+    """Numbers of a matrix: OpenCV's or ROS's mapping with rows, cols and data (whose number need not fit with `any_size`), nested lists, or
+    a text with blanks between them."""
     sizes = None
     if isinstance(value, dict):
-        sizes = int(_number(value.get("rows"), f"rows of {key}")), int(_number(value.get("cols"), f"cols of {key}"))
+        sizes = _number(value.get("rows"), f"rows of {key}"), _number(value.get("cols"), f"cols of {key}")
         value = value.get("data")
     items = tuple(_flatten(value.split() if isinstance(value, str) else [] if value is None else value))
-    if len(items) > _MAX_NUMBERS or (sizes and sizes[0] * sizes[1] != len(items)):
-        raise _FaultError(f"{key} has {len(items)} numbers{f' for {sizes[0]} x {sizes[1]}' if sizes else ''}")
+    if len(items) > _MAX_NUMBERS or (sizes and not any_size and sizes[0] * sizes[1] != len(items)):
+        raise _FaultError(f"{key} has {len(items)} numbers{f' for {sizes[0]:g} x {sizes[1]:g}' if sizes else ''}")
     return tuple(_number(item, key) for item in items)
+
+
+def _exactly(numbers: tuple[float, ...], count: int, key: str) -> tuple[float, ...]:
+    """Numbers, of which there must be `count`."""
+    if len(numbers) != count:
+        raise _FaultError(f"{key} has {len(numbers)} numbers; allowed: {count}")
+    return numbers
 
 
 def _flatten(value: Any) -> Iterator[Any]:
@@ -254,9 +376,9 @@ def _flatten(value: Any) -> Iterator[Any]:
         yield from item if isinstance(item, list) else [item]
 
 
-def _size(tree: Tree, width: Sequence[str], height: Sequence[str]) -> tuple[int, int]:
+def _size(tree: Tree) -> tuple[int, int]:
     """Width and height of the image; 0, 0 if the file does not say."""
-    values = [_number(_first(tree, names, 0), names[0]) for names in (width, height)]
+    values = [_number(_first(tree, names, 0), names[1]) for names in (("imagewidth", "width", "w"), ("imageheight", "height", "h"))]
     if any(value != int(value) for value in values):
         raise _FaultError(f"the image has {values[0]:g} x {values[1]:g} pixels; allowed: whole numbers")
     return int(values[0]), int(values[1])
@@ -264,9 +386,7 @@ def _size(tree: Tree, width: Sequence[str], height: Sequence[str]) -> tuple[int,
 
 def _matrix(value: Any) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy of a camera matrix, row by row."""
-    numbers = _numbers(value, "camera matrix")
-    if len(numbers) != 9:
-        raise _FaultError(f"the camera matrix has {len(numbers)} numbers; allowed: 9")
+    numbers = _exactly(_numbers(value, "camera matrix"), 9, "the camera matrix")
     fx, skew, cx, zero, fy, cy, *last = numbers
     if (skew, zero) == (0.0, 0.0) and last[:2] != [0.0, 0.0] and (cx, cy) == (0.0, 0.0):
         raise _FaultError("the camera matrix is written column by column; write it row by row")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.calibration.files import COUNTS, FISHEYE, PINHOLE
+from synpick_warp.configs.calibration.files import COUNTS, FISHEYE, MAX_NUMBER, PINHOLE
 from synpick_warp.errors import ConfigError, format_value
 
 MAX_ANGLE = 85.0
@@ -47,7 +47,7 @@ class Lens:
     """Distortion model and its coefficients, in OpenCV's order.
 
     Raises:
-        ConfigError: There is no such model, it has another number of coefficients, or one is not finite.
+        ConfigError: There is no such model, it has another number of coefficients, or one is not finite or absurdly large.
     """
 
     model: str = PINHOLE
@@ -59,8 +59,9 @@ class Lens:
         if len(self.coefficients) not in COUNTS[self.model]:
             allowed = " or ".join(map(str, COUNTS[self.model]))
             raise ConfigError(f"distortion has {len(self.coefficients)} coefficients; allowed: {allowed} with the model {self.model}")
-        if not np.isfinite(self.coefficients).all():
-            raise ConfigError(f"distortion has coefficients that are not finite: {format_value(list(self.coefficients))}; give numbers")
+        if not (np.abs(self.coefficients) <= MAX_NUMBER).all():
+            given = format_value(list(self.coefficients))
+            raise ConfigError(f"distortion has the coefficients {given}; allowed: finite numbers of at most {MAX_NUMBER:g}")
 
     @property
     def is_identity(self) -> bool:
@@ -190,8 +191,13 @@ class LensMap:
             size: Width and height of the image [px].
 
         Raises:
-            ConfigError: The distortion folds over inside the image, or a pixel's ray is more than MAX_ANGLE off the axis.
+            ConfigError: The distortion folds over inside the image, a pixel's ray is more than MAX_ANGLE off the axis, or intrinsics are
+                none of an image.
         """
+        if not (min(intrinsics[:2]) > 1 / MAX_NUMBER and (np.abs(intrinsics) <= MAX_NUMBER).all()):
+            raise ConfigError(
+                f"fx, fy, cx, cy are {format_value(list(intrinsics))}; allowed: focal lengths above 0 and a centre in the image"
+            )
         self.lens, self.size = lens, size
         self._focal, self._center = np.array(intrinsics[:2], float), np.array(intrinsics[2:], float)
         limit, folds = _limit(lens)

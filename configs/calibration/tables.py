@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.calibration.files import HALVES, INTEGERS, MODELS, Calibration, read_calibration
+from synpick_warp.configs.calibration.files import HALVES, INTEGERS, MAX_NUMBER, MODELS, Calibration, read_calibration
 from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import ConfigError, format_value, suggest
@@ -56,7 +56,10 @@ def _fill(key: str, table: Mapping[str, Any], source: str) -> dict[str, Any]:
         raise ConfigError(f"{key}.file does not say the image's size {source}; set {key}.resolution")
     if found.width and table.get("resolution", size) != size:
         given = format_value(table["resolution"])
-        raise ConfigError(f"{key}.resolution is {given} {source}; allowed: {format_value(size)}, that of its {named[0]}, or none")
+        raise ConfigError(
+            f"{key}.resolution is {given} {source}; allowed: {format_value(size)}, that of its {named[0]}, or none; "
+            f"{key}.scale = 0.5 makes images of half that size"
+        )
     rest |= {"resolution": size} if found.width else {}
     rest["matrix"] = [[found.fx, 0.0, found.cx], [0.0, found.fy, found.cy], [0.0, 0.0, 1.0]]
     rest.pop("model", None)
@@ -80,6 +83,6 @@ def _shifted(table: dict[str, Any], center: float | None) -> dict[str, Any]:
     matrix = table.get("matrix")
     if center is None or center == HALVES or not (isinstance(matrix, list) and len(matrix) == 3):
         return table
-    if not all(isinstance(row, list) and len(row) == 3 and isinstance(row[2], int | float) for row in matrix):
+    if not all(isinstance(row, list) and len(row) == 3 and isinstance(row[2], int | float) and abs(row[2]) <= MAX_NUMBER for row in matrix):
         return table
     return table | {"matrix": [[*row[:2], row[2] + HALVES - center] for row in matrix[:2]] + matrix[2:]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 
@@ -82,6 +83,21 @@ def opencv(coefficients, more=""):
     return OPENCV + yaml_matrix("distortion_coefficients", len(coefficients), numbers(coefficients)) + more
 
 
+def array(values):
+    np.save(file := io.BytesIO(), values)
+    return file.getvalue()
+
+
+def archive(**arrays):
+    np.savez(file := io.BytesIO(), **arrays)
+    return file.getvalue()
+
+
+def nerfstudio(**more):
+    return json.dumps({"w": 320, "h": 240, "fl_x": 275.0, "fl_y": 274.6, "cx": 163.8, "cy": 117.5, "frames": [{"file_path": "a"}]} | more)
+
+
+K = np.array([[275, 0, 163.3], [0, 274.6, 117], [0, 0, 1]])
 FILES = {
     "OpenCV, 5": (opencv(FIVE), with_lens(FIVE)),
     "OpenCV, 8, of Python": (
@@ -107,6 +123,50 @@ FILES = {
     "RealSense, inverse, zeros": (realsense("distortion.inverse_brown_conrady", (0.0,) * 5), SIZED),
     "RealSense, modified, radial": (realsense("Modified Brown Conrady", (-0.1, 0.08, 0, 0, 0.01)), with_lens((-0.1, 0.08, 0.0, 0.0, 0.01))),
     "RealSense, fisheye": (realsense("distortion.kannala_brandt4", (*FIVE[:4], 0)), with_lens(FIVE[:4], FISHEYE)),
+    "cam_K.txt": ("275.0 0.0 163.3\n0.0 274.6 117.0\n0.0 0.0 1.0\n", with_lens((), size=(0, 0))),
+    "cam_K.txt with commas": ("275,0,163.3\r\n0,274.6,117\r\n0,0,1e0\r\n", with_lens((), size=(0, 0))),
+    "a list": ("[[2.75e2, 0, 163.3], [0, 274.6, 117], [0, 0, 1]]", with_lens((), size=(0, 0))),
+    "NumPy, .npz": (
+        archive(mtx=K, dist=np.array([FIVE]), rvecs=np.ones((900, 3, 1)), odd=np.array([K, 1], object)),
+        with_lens(FIVE, size=(0, 0)),
+    ),
+    "NumPy, .npy": (array(K), with_lens((), size=(0, 0))),
+    "ROS, .ini": (
+        "# left\n\n[image]\n\nwidth\n320\n\nheight\n240\n\n[left]\n\ncamera matrix\n275.0 0.0 163.3\n0.0 274.6 117.0\n0.0 0.0 1.0\n\n"
+        f"distortion\n{' '.join(map(str, FIVE))}\n\nprojection\n250 0 160 0\n0 250 120 0\n0 0 1 0\n",
+        with_lens(FIVE),
+    ),
+    "ROS, rational with 5 columns": (ros("rational_polynomial", EIGHT).replace("cols: 8", "cols: 5"), with_lens(EIGHT)),
+    "Kalibr": (
+        "cam0:\n  camera_model: pinhole\n  distortion_coeffs: [-0.12, 0.08, 0.0005, -0.0003]\n  distortion_model: radtan\n"
+        "  intrinsics: [275, 274.6, 163.3, 117]\n  resolution: [320, 240]\n",
+        with_lens(FIVE[:4]),
+    ),
+    "COLMAP": (
+        "# Camera list\n# CAMERA_ID, MODEL\n\n1 OPENCV 320 240 275 274.6 163.8 117.5 -0.12 0.08 5e-4 -3e-4\n",
+        with_lens((*FIVE[:4], 0.0)),
+    ),
+    "COLMAP, fisheye": ("1 OPENCV_FISHEYE 320 240 275 274.6 163.8 117.5 -0.12 0.08 5e-4 -3e-4\n", with_lens(FIVE[:4], FISHEYE)),
+    "COLMAP, two alike": ("1 PINHOLE 320 240 275 274.6 163.8 117.5\n2 PINHOLE 320 240 275 274.6 163.8 117.5\n", SIZED),
+    "nerfstudio": (nerfstudio(k1=-0.12, k2=0.08, p1=5e-4, p2=-3e-4, k3=0.01), with_lens(FIVE)),
+    "nerfstudio, fisheye": (
+        nerfstudio(camera_model="OPENCV_FISHEYE", **dict(zip(("k1", "k2", "k3", "k4"), FIVE, strict=False))),
+        with_lens(FIVE[:4], FISHEYE),
+    ),
+    "nerfstudio, equal frames": (json.dumps({"camera_angle_x": 1.0, "frames": [json.loads(nerfstudio())] * 2}), SIZED),
+    "BOP, scene_camera": (
+        json.dumps({key: {"cam_K": [275, 0, 163.8, 0, 274.6, 117.5, 0, 0, 1], "depth_scale": 0.1} for key in "03"}),
+        with_lens((), size=(0, 0)),
+    ),
+    "Open3D": ('{"width": 320, "height": 240, "intrinsic_matrix": [275, 0, 0, 0, 274.6, 0, 163.3, 117, 1]}', SIZED),
+    "names of one's own": (
+        '{"Camera Matrix": [275, 0, 163.3, 0, 274.6, 117, 0, 0, 1], "distCoef": [-0.12, 0.08, 5e-4, -3e-4, 0.01], "W": 320, "H": 240}',
+        with_lens(FIVE),
+    ),
+    "names of each": (
+        '{"fx": 275, "fy": 274.6, "cx": 163.3, "cy": 117, "k1": -0.12, "k2": 0.08, "p1": 5e-4, "p2": -3e-4, "k3": 0.01}',
+        with_lens(FIVE, size=(0, 0)),
+    ),
     "Zivid": (ZIVID, with_lens(FIVE, size=(0, 0))),
 }
 
@@ -129,7 +189,7 @@ def test_what_opencv_writes_is_read(suffix, tmp_path):
     storage = cv2.FileStorage(path, cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 320), ("image_height", 240)):
         storage.write(name, value)
-    storage.write("camera_matrix", np.array([[275, 0, 163.3], [0, 274.6, 117], [0, 0, 1]]))
+    storage.write("camera_matrix", K)
     storage.write("distortion_coefficients", np.array([FIVE]))
     storage.release()
     assert read_calibration(tmp_path / f"camera{suffix}") == with_lens(FIVE)
@@ -145,7 +205,7 @@ def test_the_callers_words_hold_where_the_file_says_nothing(tmp_path):
 REFUSED = {
     "nothing": ("", "no calibration file"),
     "a list": ("- 1\n- 2\n", "no calibration file"),
-    "another file": ('{"object_rows": 3}', 'no intrinsics of a known format, but "object_rows"; known: Zivid, RealSense, ROS, OpenCV, BOP'),
+    "another file": ('{"object_rows": 3}', 'no intrinsics of a known format, but "object_rows"; known: Zivid, RealSense, COLMAP'),
     "stereo": (yaml_matrix("M1", 3, MATRIX), "no intrinsics of a known format"),
     "four coefficients": (opencv(FIVE[:4]), 'may be of both models; set model = "pinhole" or "fisheye"'),
     "three coefficients": (opencv(FIVE[:3]), "it has 3 coefficients of distortion; allowed: 4 or 5 or 8 or 12"),
@@ -180,6 +240,43 @@ REFUSED = {
     "broken XML": ("<opencv_storage><a></opencv_storage>", "is no XML"),
     "entities": ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "document type or entities"),
     "not UTF-8": (b"\xff\xfe\0a", "byte 0 is not UTF-8"),
+    "four numbers": ("275 274.6 163.3 117", "the camera matrix has 4 numbers; allowed: 9"),
+    "a projection": ("275 0 163.3 0\n0 274.6 117 0\n0 0 1 0\n", "the camera matrix has 12 numbers"),
+    "decimal commas": ("275,0 0,0 163,3\n0,0 274,6 117,0\n0,0 0,0 1,0\n", "the camera matrix has 18 numbers"),
+    "a transposed text": ("275 0 0\n0 274.6 0\n163.3 117 1\n", "column by column"),
+    "a negative focal length": ("-275 0 163.3\n0 274.6 117\n0 0 1\n", "focal lengths are -275 and 274.6; allowed: above 0"),
+    "an unknown model of BOP": (
+        '{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "cam_dist_model": "weird"}',
+        'model is "weird"; allowed: pinhole, fisheye',
+    ),
+    "a raised digit": (realsense("²"), 'distortion model "²"'),
+    "a raised digit as width": (ros("plumb_bob", FIVE).replace("320", "²"), 'width is "²"; allowed: a finite number'),
+    "thousands of digits": (ros("plumb_bob", FIVE).replace("320", "9" * 5000), 'width is "999.*…; allowed: a finite number'),
+    "thousands of digits of JSON": (realsense(width=0).replace('"width": 0', f'"width": {"9" * 5000}'), "damaged|allowed: a finite number"),
+    "a huge size": (realsense(width=1e308), "the image has 1e\\+308 x 240 pixels"),
+    "unnamed coefficients": (
+        '{"K": [275, 0, 163.3, 0, 274.6, 117, 0, 0, 1], "dist_params": [1, 2]}',
+        '"dist_params", which is no known name',
+    ),
+    "four named coefficients": ('{"fx": 1, "fy": 1, "cx": 1, "cy": 1, "k1": 1, "k2": 1, "k3": 1, "k4": 1}', "may be of both models"),
+    "a model of COLMAP": (
+        "1 THIN_PRISM_FISHEYE 320 240 275 274.6 163 117 0 0 0 0 0 0 0 0",
+        'model is "THIN_PRISM_FISHEYE"; allowed: SIMPLE_',
+    ),
+    "parameters of COLMAP": ("1 PINHOLE 320 240 275 163 117", "PARAMS has 3 numbers; allowed: 4"),
+    "two cameras": ("1 PINHOLE 320 240 275 275 163 117\n2 PINHOLE 320 240 276 275 163 117", "has 2 cameras that differ"),
+    "frames that differ": (
+        json.dumps({"camera_angle_x": 1.0, "frames": [{"fl_x": 1.0, "cx": 1, "cy": 1}, {"fl_x": 2.0, "cx": 1, "cy": 1}]}),
+        "its frames are of 2 cameras",
+    ),
+    "a model of nerfstudio": (nerfstudio(camera_model="EQUIRECTANGULAR"), 'camera_model is "EQUIRECTANGULAR"'),
+    "Kalibr, omni": ("cam0: {camera_model: omni, intrinsics: [1, 2, 3, 4]}", 'camera model is "omni"; allowed: pinhole'),
+    "a cut archive": (archive(mtx=K)[:200], "is no archive of NumPy's arrays: its reader failed"),
+    "an archive of objects": (archive(mtx=np.array([K, 1], object)), "no intrinsics of a known format"),
+    "an array of a shape that is not there": (
+        array(K).replace(b"(3, 3), }" + 12 * b" ", b"(9999999999999, 3), }"),
+        "is no archive of NumPy's arrays",
+    ),
     "a large file": (b" " * (2**20 + 1), "larger than 1 MiB"),
 }
 
@@ -205,7 +302,8 @@ def test_what_is_no_file_is_one_line(tmp_path):
 @given(st.sampled_from(sorted(FILES)), st.data())
 def test_damaged_files_are_read_or_refused(tmp_path_factory, name, data):
     """Any cut and any replaced piece: a camera of finite numbers, or one line."""
-    text = FILES[name][0].encode()
+    text = FILES[name][0]
+    text = text if isinstance(text, bytes) else text.encode()
     start, stop = (data.draw(st.integers(0, len(text))) for _ in range(2))
     piece = data.draw(st.binary(max_size=4) | st.sampled_from([b"-", b": ", b"[", b"{", b"*a", b"&a ", b"<", b"1e999", b"!!str "]))
     path = saved(tmp_path_factory.getbasetemp(), text[:start] + piece + text[max(start, stop) :])
