@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 import synpick_warp
+from synpick_warp.apps.evaluation import filter_poses
 from synpick_warp.apps.evaluation.models import read_models
 from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.results import ResultFile
 from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
+from synpick_warp.cli.commands.evaluate import make_methods
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 from tests.harness.fuzz import fuzz_examples
@@ -118,6 +122,33 @@ def test_sets_that_cannot_be_evaluated_on_are_named(folder, tmp_path):
         path.unlink()
     with pytest.raises(DatasetError, match="has no episode to evaluate on"):
         read_truth(synpick_warp.open(broken))
+
+
+def test_estimates_of_a_camera_that_moves_are_filtered_in_the_world(folder, tmp_path):
+    """A camera turns over a pile at rest: exact estimates stay exact, and nothing has a speed that has none in the world."""
+    out = shutil.copytree(folder, tmp_path / "set")
+    scene = sorted((out / "train_pbr").iterdir())[0]
+    cameras, poses = (json.loads((scene / f"scene_{name}.json").read_text()) for name in ("camera", "gt"))
+    for frame, camera in cameras.items():
+        turn = Rotation.from_euler("xyz", [10 * int(frame), 0, 25 * int(frame)], degrees=True).as_matrix()
+        shift = np.array([40.0, -30.0, 15.0]) * int(frame)
+        camera |= {"cam_R_w2c": turn.ravel().tolist(), "cam_t_w2c": shift.tolist()}
+        for row in poses[frame]:
+            row["cam_t_m2c"] = (turn @ row["cam_t_m2c"] + shift).tolist()
+            row["cam_R_m2c"] = (turn @ np.reshape(row["cam_R_m2c"], (3, 3))).ravel().tolist()
+    for name, content in (("camera", cameras), ("gt", poses)):
+        (scene / f"scene_{name}.json").write_text(json.dumps(content))
+    truth, before = read_truth(synpick_warp.open(out)), read_truth(synpick_warp.open(folder))
+    assert (truth.motion.scene.tolist(), truth.motion.image.tolist()) == ([0] * FRAMES, list(range(FRAMES)))
+    np.testing.assert_allclose(truth.speed, before.speed, atol=1e-9)
+    world, back = truth.motion.to_world(truth.poses), truth.motion.to_camera(truth.motion.to_world(truth.poses))
+    for name in ("rotation", "translation"):
+        np.testing.assert_allclose(getattr(world, name), getattr(before.poses, name), atol=1e-12)
+        np.testing.assert_allclose(getattr(back, name), getattr(truth.poses, name), atol=1e-12)
+    (method,) = make_methods([tmp_path / "a.csv"], [ResultFile(tmp_path / "a.csv", truth.poses, np.arange(len(truth)))], 0.2, truth.motion)
+    resting = np.array(SPEED)[truth.poses.instance] == 0.0
+    np.testing.assert_allclose(method.filtered.translation[resting], truth.poses.translation[resting], atol=1e-9)
+    assert np.abs(filter_poses(truth.poses, 0.2).translation - truth.poses.translation)[resting].max() > 0.05
 
 
 @pytest.mark.parametrize("body", ["nan 0 0", "1e400 0 0", ""])

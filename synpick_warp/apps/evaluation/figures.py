@@ -95,14 +95,16 @@ def draw_figures(
         ChartError: The charts' library cannot run.
     """
     charts = _draw_errors(truth, scores)
-    chosen = _farthest_track(truth, methods, settings.min_visibility) if track is None else track
+    world, to_world = replace(truth, poses=truth.motion.to_world(truth.poses)), truth.motion.to_world
+    tracked = [replace(one, poses=to_world(one.poses), filtered=one.filtered and to_world(one.filtered)) for one in methods]
+    chosen = _farthest_track(world, tracked, settings.min_visibility) if track is None else track
     names = file_names([method.name for method in methods])
     if chosen is not None:
         rows = _track_rows(truth, chosen)
         frames = (attempts or {}).get(int(truth.episode[rows[0]]), ())
-        for method, name in zip(methods, names, strict=True):
+        for method, name in zip(tracked, names, strict=True):
             ending = f"scene_{chosen[0]:06d}_instance_{chosen[1]}"
-            charts[f"trajectory_{name}_{ending}.png"] = _draw_trajectory(truth.poses.select(rows), method, chosen, frames)
+            charts[f"trajectory_{name}_{ending}.png"] = _draw_trajectory(world.poses.select(rows), method, chosen, frames)
     for method, name in zip(methods, names, strict=True):
         if method.filtered is not None:
             charts[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), score="ADD-S AUC [%]")
@@ -182,11 +184,11 @@ def _sweep(truth: Truth, method: Method, settings: Settings) -> AlphaSweep:
     target = truth.shown(settings.min_visibility)
     seen = set(truth.mode[target].tolist())
     modes = {int(scene): str(mode) for scene, mode in zip(truth.poses.scene, truth.mode, strict=True) if mode in seen}
-    poses = method.poses.select(np.isin(method.poses.scene, list(modes)))
+    poses = truth.motion.to_world(method.poses.select(np.isin(method.poses.scene, list(modes))))
 
     def score_of(mode: str, estimates: PoseTable) -> float:
         part = _part(truth, truth.mode == mode)
-        scores = score(method.name, part, estimates, thinned, settings.min_visibility, settings.top)
+        scores = score(method.name, part, truth.motion.to_camera(estimates), thinned, settings.min_visibility, settings.top)
         return summarize(part, [scores], {}, ())[-1].cells[0]["ADD-S exact"]
 
     tables = split_by_mode(poses, modes)

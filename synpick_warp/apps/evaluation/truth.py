@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import UNSET
 
-from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.poses import CameraMotion, PoseTable
 from synpick_warp.dataset.bop.arrays import SceneArrays, read_arrays
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
@@ -36,6 +37,8 @@ class Truth:
     instance is in a single frame only."""
     images: np.ndarray
     """Scene and image index of all images (M, 2) int64, those without objects included, sorted."""
+    motion: CameraMotion
+    """Poses of the cameras that move."""
 
     def shown(self, minimum: float) -> np.ndarray:
         """Whether instances are at least so visible (N,) bool; also those of which it is not known."""
@@ -108,16 +111,29 @@ def _assemble(parts: list[tuple[SceneArrays, int, int, int, str]], period: float
         mode=repeat(part[4] for part in parts).astype(str)[order],
         speed=np.empty(0),
         images=images[np.lexsort(images.T[::-1])],
+        motion=_read_motion([(arrays, scene) for arrays, scene, *_ in parts]),
     )
-    speed = np.full(len(truth), np.nan) if period is None else instance_speeds(truth.poses, period)
+    speed = np.full(len(truth), np.nan) if period is None else instance_speeds(truth.motion.to_world(truth.poses), period)
     return replace(truth, speed=speed)
 
 
+def _read_motion(scenes: list[tuple[SceneArrays, int]]) -> CameraMotion:
+    """Poses of the cameras of those scenes whose images all have one, and not the same."""
+    keys, poses = list[tuple[int, int]](), list[list[float]]()
+    for arrays, scene in sorted(scenes, key=lambda pair: pair[1]):
+        found = [(one.cam_R_w2c, one.cam_t_w2c) for one in arrays.cameras if UNSET not in (one.cam_R_w2c, one.cam_t_w2c)]
+        if len(found) == len(arrays.images) and any(pose != found[0] for pose in found):
+            keys += [(scene, image) for image in arrays.images.tolist()]
+            poses += [[*rotation, *translation] for rotation, translation in found]
+    numbers, places = np.reshape(np.array(poses, np.float64), (-1, 12)), np.reshape(np.array(keys, np.int64), (-1, 2))
+    return CameraMotion(*places.T, numbers[:, :9].reshape(-1, 3, 3), _METERS * numbers[:, 9:])
+
+
 def instance_speeds(poses: PoseTable, period: float) -> np.ndarray:
-    """Speed of each instance's origin from consecutive frames of a camera that stands still.
+    """Speed of each instance's origin from consecutive frames.
 
     Args:
-        poses: Poses with instances.
+        poses: Poses with instances, of cameras that stand still or in the world.
         period: Time from frame to frame [s].
 
     Returns:

@@ -18,6 +18,7 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, 
 
 if TYPE_CHECKING:
     from synpick_warp.apps.evaluation.figures import Method
+    from synpick_warp.apps.evaluation.poses import CameraMotion, PoseTable
     from synpick_warp.apps.evaluation.results import ResultFile
     from synpick_warp.apps.evaluation.scoring import Scores
     from synpick_warp.apps.evaluation.truth import Truth
@@ -168,7 +169,7 @@ def make_table(
     if not truth.shown(visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     print(*describe_gaps(files, truth, listed=targets is not None), sep="", end="", file=sys.stderr)
-    methods = make_methods(results, files, alpha)
+    methods = make_methods(results, files, alpha, truth.motion)
     scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
     # Modes are those of a bake.
     groups = [group for group in GROUPS if group != "mode" or data_set.found is None]
@@ -193,13 +194,15 @@ def describe_gaps(files: Sequence[ResultFile], truth: Truth, *, listed: bool) ->
             yield f"{escape(text)}\n"
 
 
-def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
-    """Named estimates of each file, with the filtered ones if there is a weight `alpha`."""
+def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None, motion: CameraMotion) -> list[Method]:
+    """Named estimates of each file, with the filtered ones, by their motion in the world, if there is a weight `alpha`."""
     from synpick_warp.apps.evaluation.figures import Method
     from synpick_warp.apps.evaluation.tracking.filtering import filter_poses
 
-    named = zip(method_names(results), files, strict=True)
-    return [Method(name, file.poses, None if alpha is None else filter_poses(file.poses, alpha), alpha) for name, file in named]
+    def filtered(poses: PoseTable) -> PoseTable | None:
+        return None if alpha is None else motion.to_camera(filter_poses(motion.to_world(poses), alpha))
+
+    return [Method(name, file.poses, filtered(file.poses), alpha) for name, file in zip(method_names(results), files, strict=True)]
 
 
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
