@@ -349,6 +349,12 @@ class Bop:
         "and so on for each camera, as BOP-Industrial 2025); shards are always classic.",
         choices=LAYOUTS,
     )
+    rectified: bool = setting(
+        False,
+        "",
+        "Render cameras as pinholes of the same camera matrices, without the distortion of their lenses, in all formats: for readers that "
+        "know none. Undistort real pictures to the same matrix.",
+    )
     keypoints: int = setting(
         0,
         "",
@@ -436,7 +442,7 @@ class Config:
     @property
     def rig(self) -> Rig:
         """All cameras."""
-        return Rig.of(self.cameras, self.camera)
+        return Rig.of(self.cameras, self.camera, self.bop.rectified)
 
     @property
     def cell(self) -> Cell:

@@ -88,13 +88,22 @@ def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gri
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 
-def describe_blocked(picks: bool, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
-    """Warnings about cameras in the gripper's swept volume in picks from any bin, a line each; none if no episode `picks`."""
-    return [
-        f"camera {camera.name} stands over the {bins[0].noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
-        for camera in (make_cameras(rig) if picks else ())
-        if camera.fixed_to == WORLD and any(is_in_way(camera.center, each, gripper, pick) for each in bins)
-    ]
+def describe_cameras(picks: bool, rig: Rig, bins: Sequence[BinSizes], gripper: Gripper, pick: Pick) -> list[str]:
+    """Warnings about cameras, a line each: in the gripper's swept volume in picks from any bin, if an episode `picks`; or with a pose of
+    numbers from which none of the bins' middles is in the image, as by chance with the inverse of a pose."""
+    noun, lines = bins[0].noun, []
+    for camera, row in zip(make_cameras(rig), rig.rows, strict=True):
+        if camera.fixed_to == WORLD and picks and any(is_in_way(camera.center, each, gripper, pick) for each in bins):
+            lines.append(
+                f"camera {camera.name} stands over the {noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
+            )
+        points = np.array([np.mean(each.corners, axis=0) for each in bins]) @ camera.rotation.T + camera.translation
+        pixels = (points @ camera.matrix.T)[:, :2] / np.where(points[:, 2:] > 0.0, points[:, 2:], np.nan)
+        seen = ((pixels >= 0.0) & (pixels <= (camera.width, camera.height))).all(axis=1)
+        if camera.fixed_to == WORLD and row.pose.look_at is None and not seen.any():
+            advice = "if its pose leads from the world to the camera, invert it"
+            lines.append(f"camera {camera.name} has the middle of the {noun} beside its images; {advice}")
+    return lines
 
 
 class EpisodeCameras:

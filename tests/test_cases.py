@@ -20,15 +20,8 @@ PENDING = {
     "bins/hopper.stl",
     "bins/nofloor.stl",
     "bins/sloped.stl",
-    "calibrations/D_1e308.yaml",
-    "calibrations/bop_cam_dist_model_weird_132.json",
-    "calibrations/cam_K.txt",
-    "calibrations/cam_K.txt.toml",
-    "calibrations/ros.ini",
-    "calibrations/ros_rational_cols5.yaml",
     "cells/decomposition_limit.toml",
     "parts/bin_wire",
-    "settings/posegl.toml",
 }
 
 

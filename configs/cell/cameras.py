@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from synpick_warp.configs.calibration.files import MODELS
+from synpick_warp.configs.calibration.files import MAX_NUMBER, MODELS
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import setting
 from synpick_warp.views.layers import LAYER_TABLE
@@ -13,6 +13,8 @@ from synpick_warp.views.layers import LAYER_TABLE
 Vector = tuple[float, float, float]
 WORLD, GRIPPER = "world", "gripper"
 """What cameras are fixed to."""
+OPENCV, OPENGL = "opencv", "opengl"
+"""Axes of a camera: x right, y down, z forward; or x right, y up, z backward."""
 
 
 COLOR, DEPTH, MASKS = "color", "depth", "masks"
@@ -45,7 +47,7 @@ class Cameras:
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a camera in the tote's frame, in one of three forms; the camera's axes are OpenCV's and ROS's: x right, y down, z forward."""
+    """Pose of a camera in the tote's frame, in one of three forms."""
 
     matrix: tuple[tuple[float, float, float, float], ...] | None = setting(
         None, "m", "Camera-to-world transform, 4 x 4 (extrinsics as OpenCV's are its inverse).", low=-100.0, high=100.0
@@ -56,6 +58,13 @@ class Pose:
     quaternion: tuple[float, float, float, float] | None = setting(None, "", "Camera-to-world rotation: x, y, z, w.", low=-1.1, high=1.1)
     look_at: tuple[float, float, float] | None = setting(None, "m", "Point that the optical axis meets.", low=-100.0, high=100.0)
     up: tuple[float, float, float] | None = setting(None, "", "Direction that is up in the image.", low=-1e3, high=1e3)
+    axes: str | None = setting(
+        None,
+        "",
+        "Axes of the camera in matrix or quaternion: opencv (x right, y down, z forward; ROS too), unless it is given, or opengl (x right, "
+        "y up, z backward; Blender, nerfstudio and USD too).",
+        choices=(OPENCV, OPENGL),
+    )
 
 
 _NONE = Distribution()
@@ -87,18 +96,29 @@ class CameraRow:
         None, "°", "Horizontal field of view, with square pixels and the principal point in the middle.", low=1.0, high=170.0
     )
     matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = setting(
-        None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-1e6, high=1e6
+        None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-MAX_NUMBER, high=MAX_NUMBER
     )
     distortion: tuple[float, ...] | None = setting(
         None,
         "",
         "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.",
-        low=-1e6,
-        high=1e6,
+        low=-MAX_NUMBER,
+        high=MAX_NUMBER,
     )
     model: str | None = setting(None, "", "Distortion model, pinhole unless it is given.", choices=MODELS)
     file: str | None = setting(
-        None, "", "Calibration file of OpenCV, ROS, BOP, RealSense or Zivid, instead of matrix, distortion and resolution.", path=True
+        None,
+        "",
+        "Calibration file of OpenCV, ROS, Kalibr, BOP, COLMAP, nerfstudio, Open3D, RealSense or Zivid, or cam_K.txt, instead of matrix, "
+        "distortion and resolution.",
+        path=True,
+    )
+    scale: float | None = setting(
+        None,
+        "",
+        "Factor on the size of the images, and on the camera matrix with it, such as 0.25 for pictures scaled to a quarter; not given: 1.",
+        above=0.0,
+        high=1.0,
     )
     sensor: str | None = setting(None, "", "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
     pixel_center: float | None = setting(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.cell.cameras import COLOR, GRIPPER, CameraRow, Cameras, Pose, Vector
+from synpick_warp.configs.cell.cameras import COLOR, GRIPPER, OPENGL, CameraRow, Cameras, Pose, Vector
 from synpick_warp.configs.episodes.randomize import OFF
 from synpick_warp.errors import ConfigError
 from synpick_warp.views.layers import LAYER_TABLE
@@ -30,8 +30,8 @@ class Rig:
     """Whether they come from [[camera]] tables."""
 
     @classmethod
-    def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = ()) -> Rig:
-        """Rig of [[camera]] tables, or without any of the section.
+    def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = (), rectified: bool = False) -> Rig:
+        """Rig of [[camera]] tables, or without any of the section; `rectified`: pinholes of the same matrices, without distortion.
 
         Raises:
             ConfigError: The section has no position, or another number of up vectors.
@@ -45,8 +45,9 @@ class Rig:
                 raise ConfigError(f"cameras.positions has {counts}; each camera needs one of both")
             pairs = zip(cameras.positions, cameras.ups, strict=True)
             rows = tuple(CameraRow(fov=cameras.fov, pose=Pose(position=at, look_at=cameras.target, up=up)) for at, up in pairs)
-        named = (replace(row, name=row.name or f"camera_{index}") for index, row in enumerate(rows))
-        return cls(tuple(replace(row, resolution=row.resolution or cameras.resolution) for row in named), listed)
+        named = (replace(row, name=row.name or f"camera_{index}", pose=in_opencv_axes(row.pose)) for index, row in enumerate(rows))
+        sized = (replace(row, resolution=row.resolution or cameras.resolution) for row in named)
+        return cls(tuple(scaled(replace(row, distortion=None, model=None) if rectified else row) for row in sized), listed)
 
     def __len__(self) -> int:
         """Number of cameras."""
@@ -148,6 +149,47 @@ def lens_map(row: CameraRow) -> LensMap | None:
 
     made = make_lens_map(row.model or PINHOLE, row.distortion, intrinsics(row), row.resolution)
     return None if made.lens.is_identity else made
+
+
+def scaled(row: CameraRow) -> CameraRow:
+    """Camera of a row with a resolution whose pictures were scaled by `scale` to whole pixels: the same row without it."""
+    if row.scale is None or row.resolution is None:
+        return row
+    width, height = (max(1, round(row.scale * side)) for side in row.resolution)
+    # Pixel centres are at + 0.5, so that coordinates scale about the corner of the image.
+    across, down = width / row.resolution[0], height / row.resolution[1]
+    matrix = row.matrix and (_times(row.matrix[0], across), _times(row.matrix[1], down), row.matrix[2])
+    return replace(row, resolution=(width, height), matrix=matrix, scale=None)
+
+
+def _times(vector: Vector, factor: float) -> Vector:
+    """Vector times a number."""
+    return factor * vector[0], factor * vector[1], factor * vector[2]
+
+
+def turned(pose: Pose) -> Pose:
+    """The pose of a camera whose y and z axes are the opposite of those given, in matrix or quaternion; `axes` stays."""
+    if pose.matrix is not None:
+        rows = [(row[0], 0.0 - row[1], 0.0 - row[2], row[3]) for row in pose.matrix[:3]]
+        return replace(pose, matrix=(*rows, *pose.matrix[3:]))
+    if pose.quaternion is not None:
+        x, y, z, w = pose.quaternion
+        return replace(pose, quaternion=(w, z, 0.0 - y, 0.0 - x))
+    return pose
+
+
+def in_opencv_axes(pose: Pose) -> Pose:
+    """The same pose with OpenCV's axes."""
+    return replace(turned(pose) if pose.axes == OPENGL else pose, axes=None)
+
+
+def inverted(pose: Pose) -> Pose:
+    """The inverse of a pose that is a matrix; others as they are."""
+    if pose.matrix is None:
+        return pose
+    columns, at = tuple(zip(*(row[:3] for row in pose.matrix[:3]), strict=True)), position(pose)
+    rows = ((x, y, z, 0.0 - x * at[0] - y * at[1] - z * at[2]) for x, y, z in columns)
+    return replace(pose, matrix=(*rows, *pose.matrix[3:]))
 
 
 def position(pose: Pose) -> Vector:

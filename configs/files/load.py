@@ -75,14 +75,16 @@ def load_config(
         ConfigError: There is no such preset or file, the file is not valid TOML, a key is unknown, a value is not allowed, or
             values contradict each other. The message names key, value and source, and what is allowed.
     """
-    values = _read(str(preset_or_file or DEFAULT_PRESET))
+    if not isinstance(preset_or_file, str | os.PathLike | None):
+        raise ConfigError(f"the preset passed is {format_value(preset_or_file)}; allowed: a name, or the path of a .toml file")
+    values = _read(os.fspath(preset_or_file or DEFAULT_PRESET))
     offered = values.pop(_OFFERED, None)
     if splits and offered and SPLITS not in values:
         values[SPLITS] = offered
-    if not isinstance(settings or {}, Mapping):
+    if not isinstance(settings or {}, Mapping) or not all(isinstance(key, str) for key in settings or {}):
         raise ConfigError(f"the settings passed are {format_value(settings)}; allowed: a dict, of full keys such as bake.episodes")
     for key, value in (settings or {}).items():
-        section, _, name = str(key).partition(".")
+        section, _, name = key.partition(".")
         if section == SPLITS:
             values[SPLITS] = (override_table(values.get(SPLITS, ({}, ""))[0], name, value, source), source)
         else:

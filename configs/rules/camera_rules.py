@@ -11,9 +11,9 @@ from dataclasses import replace
 from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS, MODALITIES, CameraRow, Cameras, Jitter, Pose
+from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS, MODALITIES, OPENCV, OPENGL, CameraRow, Cameras, Jitter, Pose
 from synpick_warp.configs.cell.extents import BinSizes, Sides
-from synpick_warp.configs.cell.rig import Rig, intrinsics, lens_map, moved, position, viewing_direction
+from synpick_warp.configs.cell.rig import Rig, intrinsics, inverted, lens_map, moved, position, turned, viewing_direction
 from synpick_warp.configs.dataset.modes import may_pick
 from synpick_warp.configs.episodes.randomize import FIXED
 from synpick_warp.configs.fields import Conflict
@@ -96,6 +96,8 @@ def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
     given = {name for name in ("matrix", "position", "quaternion", "look_at", "up") if getattr(pose, name) is not None}
     if given not in map(set, FORMS):
         yield key, " or ".join(f"{{{', '.join(form)}}}" for form in FORMS)
+    elif pose.axes == OPENGL and pose.look_at is not None:
+        yield f"{key}.axes", "none beside look_at and up, which have no axes"
     elif pose.quaternion is not None and abs(math.hypot(*pose.quaternion) - 1.0) > ORTHONORMAL:
         yield key, "a quaternion x, y, z, w of length 1"
     elif pose.matrix is not None:
@@ -131,9 +133,26 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     placement = partial(_placement, label=label, bins=bins, shift=config.bins.shift)
     if rig.moves(index):
         placement = partial(_mounting, label=label, gripper=config.gripper)
-    yield from placement(row, keys)
+    for place, rule in placement(row, keys):
+        axes = config.camera[index].pose.axes if config.camera else None
+        yield place, rule + _other_pose(row.pose, lambda pose: not list(placement(replace(row, pose=pose), keys)), bins[0].noun, axes)
     if row.jitter is not None:
         yield from _jitter(rig.key(index, "jitter"), row, row.jitter, placement)
+
+
+def _other_pose(pose: Pose, fits: Callable[[Pose], bool], noun: str, axes: str | None) -> str:
+    """Clause on a pose of other axes, or the inverse, if that `fits` in place of one that does not; empty: none does."""
+    name, owner = (OPENCV, "OpenCV's") if axes == OPENGL else (OPENGL, "OpenGL's or Blender's")
+    turn = f'columns 2 and 3 negated: set axes = "{name}" if its axes are {owner}'
+    inverse = f"it would see the {noun} with the inverse, so it may lead from the world to the camera: invert it"
+    for other, clause in (
+        (turned(pose), f"it looks away from the {noun}, and would see it with {turn}"),
+        (inverted(pose), inverse),
+        (turned(inverted(pose)), f"{inverse}; and with {turn}"),
+    ):
+        if other != pose and fits(other):
+            return f"; {clause}"
+    return ""
 
 
 def _modalities(key: str, chosen: tuple[str, ...], formats: tuple[str, ...], layers: tuple[str, ...]) -> Iterator[Conflict]:

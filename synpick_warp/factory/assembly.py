@@ -31,7 +31,7 @@ from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.bins import Bin, make_bins
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
-from synpick_warp.scenes.cameras import EpisodeCameras, describe_blocked
+from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
 from synpick_warp.scenes.capacities import FEW, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
@@ -275,7 +275,7 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
         check_reach(config.gripper, config.suction, catalog)
         if config.bake.models and config.suction.vacuum is None:
             progress.note(describe_forces(config.gripper, config.suction))
-    for line in describe_blocked(picks, config.rig, config.cell.bins, config.gripper, config.pick):
+    for line in describe_cameras(picks, config.rig, config.cell.bins, config.gripper, config.pick):
         progress.note(line)
     filled = config.with_values(REPEATS) if must_repeat(labelled, catalog) else config
     if find_repeat_rules(filled.bake, filled.pick, filled.move) != find_repeat_rules(config.bake, config.pick, config.move):

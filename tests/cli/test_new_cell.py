@@ -20,7 +20,7 @@ from synpick_warp.configs.files.cell_file import WIDTH
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.scenes.cameras import describe_blocked, make_cameras
+from synpick_warp.scenes.cameras import describe_cameras, make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
@@ -148,7 +148,7 @@ def test_a_camera_is_that_of_its_calibration_and_sees_the_bin(tmp_path, drawn, f
         pixels, depth = project(camera, np.array(config.cell.bins[0].corners))
         assert (depth > 0.0).all()
         assert ((pixels > 0.0) & (pixels < (320.0, 240.0))).all()
-        assert not describe_blocked(True, config.rig, config.cell.bins, config.gripper, config.pick)
+        assert not describe_cameras(True, config.rig, config.cell.bins, config.gripper, config.pick)
         # No farther than needed: the bin reaches a border that is kept free.
         assert np.min([pixels, (320.0, 240.0) - pixels]) < 0.06 * 320
     assert path.read_bytes() == before
@@ -251,6 +251,7 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         ),
         (["c", "--calibration", "zivid.json"], "zivid.json does not say the image's size; add --resolution WIDTHxHEIGHT"),
         (["c", "--lens", "fish"], '--lens is "fish"; allowed: pinhole, fisheye; did you mean fisheye?'),
+        (["c", "--resolution", "0x0"], "--resolution is 0x0; allowed: each side at least 1, at most 8192 [px]"),
         (["c", "--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT'),
         (["c", "--bin", "600x400"], '--bin is "600x400"; allowed: LENGTHxWIDTHxHEIGHT in metres'),
         (["c", "--bin", "1.2.3x1x1"], '--bin is "1.2.3x1x1"; allowed'),

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from synpick_warp.configs.cell.cameras import CameraRow
@@ -12,10 +14,12 @@ from synpick_warp.configs.files.load import COMMAND_LINE, load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.errors import ConfigError
+from synpick_warp.scenes.cameras import describe_cameras, make_cameras
 
 K = "matrix = [[275.0, 0.0, 163.8], [0.0, 274.6, 117.5], [0.0, 0.0, 1.0]]"
 LOOK = "pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }"
 DOWN = "[[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 1.2], [0, 0, 0, 1]]"
+FIVE = [-0.12, 0.08, 0.0005, -0.0003, 0.01]
 LEFT = f'[[camera]]\nname = "left"\nresolution = [320, 240]\n{K}\n{LOOK}\n'
 TOP = f"[[camera]]\nfov = 40.0\npose = {{ matrix = {DOWN} }}\n"
 
@@ -61,6 +65,86 @@ def test_another_size_keeps_width_of_view_and_middle():
     assert intrinsics(resized(row, (640, 360))) == pytest.approx((550.0, 549.2, 327.6, 175.0))
 
 
+@pytest.mark.parametrize(
+    "pose",
+    [
+        "matrix = [[1, 0, 0, 0.1], [0, 0.6, -0.8, -0.9], [0, 0.8, 0.6, 1.2], [0, 0, 0, 1]]",
+        "position = [0.1, -0.9, 1.2], quaternion = [0.4472135955, 0, 0, 0.894427191]",
+    ],
+)
+def test_poses_of_opengl_are_those_of_opencv_with_y_and_z_turned(tmp_path, pose):
+    """A camera that is tilted by atan2(0.8, 0.6) about x looks along its -z axis, and up is its y axis."""
+    config = load(tmp_path, f'[[camera]]\nfov = 60.0\npose = {{ axes = "opengl", {pose} }}\n')
+    (camera,) = make_cameras(config.rig)
+    np.testing.assert_allclose(camera.rotation, [[1, 0, 0], [0, -0.6, -0.8], [0, 0.8, -0.6]], atol=1e-9)
+    np.testing.assert_allclose(camera.center, [0.1, -0.9, 1.2], atol=1e-12)
+    (tmp_path / "again.toml").write_text(config_to_toml(config))
+    assert load_config(str(tmp_path / "again.toml")) == config
+
+
+SIDE = "[[1, 0, 0, 0.1], [0, -0.6, 0.8, -0.9], [0, -0.8, -0.6, 1.2], [0, 0, 0, 1]]"
+FROM_WORLD = "[[1, 0, 0, -0.1], [0, -0.6, -0.8, 0.42], [0, 0.8, -0.6, 1.44], [0, 0, 0, 1]]"
+
+
+@pytest.mark.parametrize(
+    ("pose", "words"),
+    [
+        (f'axes = "opengl", matrix = {SIDE}', 'columns 2 and 3 negated: set axes = "opencv" if its axes are OpenCV\'s'),
+        ("position = [0, 0, 1.2], quaternion = [0, 0, 0, 1]", "it looks away from the tote, and would see it with columns 2 and 3 negated"),
+        (f"matrix = {FROM_WORLD}", "; it would see the tote with the inverse, so it may lead from the world to the camera: invert it"),
+        (
+            f"matrix = {FROM_WORLD.replace('[0, -0.6, -0.8, 0.42], [0, 0.8, -0.6, 1.44]', '[0, 0.6, 0.8, -0.42], [0, -0.8, 0.6, -1.44]')}",
+            "invert it; and with columns 2 and 3 negated",
+        ),
+    ],
+)
+def test_a_pose_of_other_axes_or_the_inverse_is_named(tmp_path, pose, words):
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, f"[[camera]]\nfov = 20.0\npose = {{ {pose} }}\n")
+    assert words in str(caught.value)
+
+
+def test_an_inverse_that_sees_the_bin_by_chance_is_named_as_it_is_baked(tmp_path):
+    def lines(matrix: str) -> list[str]:
+        config = load(tmp_path, f"[[camera]]\nfov = 40.0\npose = {{ matrix = {matrix} }}\n")
+        return describe_cameras(False, config.rig, config.cell.bins, config.gripper, config.pick)
+
+    assert lines(SIDE) == lines(DOWN) == []
+    (line,) = lines(FROM_WORLD)
+    assert "the middle of the tote beside its images; if its pose leads from the world to the camera, invert it" in line
+
+
+@pytest.mark.parametrize(("scale", "size"), [(0.25, (80, 60)), (0.3, (96, 72)), (1 / 3, (107, 80))])
+def test_a_scaled_camera_projects_where_its_scaled_picture_has_it(tmp_path, scale, size):
+    """OpenCV counts pixel centres at integers: there a point at x is at (x + 0.5) s - 0.5 of a picture that is scaled by s."""
+    lens = f"distortion = {FIVE}\n"
+    (full,), (small,) = (make_cameras(load(tmp_path, LEFT + lens + more).rig) for more in ("", f"scale = {scale}\n"))
+    assert (small.width, small.height) == small.lens.size == size
+    point = np.array([[0.2, -0.1, 1.0]])
+    x, y = (
+        cv2.projectPoints(point, np.zeros(3), np.zeros(3), one.matrix - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), np.array(FIVE))[
+            0
+        ].ravel()
+        for one in (full, small)
+    )
+    np.testing.assert_allclose(y, (x + 0.5) * np.divide(size, (320, 240)) - 0.5, atol=1e-9)
+    np.testing.assert_allclose(small.lens.project(point[:, :2])[0], y + 0.5, atol=1e-9)
+    (row,) = load(tmp_path, TOP + f"resolution = [320, 240]\nscale = {scale}\n").rig.rows
+    assert (row.fov, row.resolution) == (40.0, size)
+
+
+def test_a_rectified_rig_has_the_same_matrices_without_distortion(tmp_path):
+    lens = f"distortion = {FIVE}\n"
+    bent, flat = (
+        load(tmp_path, LEFT + lens + HAND.replace("60", "60\ndistortion = [0.1, 0, 0, 0]"), bop__rectified=value) for value in (False, True)
+    )
+    assert [camera.lens is None for camera in make_cameras(bent.rig)] == [False, False]
+    for camera, plain in zip(make_cameras(bent.rig), make_cameras(flat.rig), strict=True):
+        assert plain.distortion == {}
+        np.testing.assert_array_equal(plain.matrix, camera.matrix)
+    assert flat.camera == bent.camera
+
+
 HEAD = '[[camera]]\nname = "left"\nresolution = [320, 240]\n'
 
 
@@ -77,6 +161,9 @@ HEAD = '[[camera]]\nname = "left"\nresolution = [320, 240]\n'
         (LEFT.replace('"left"', '"Left"'), 'camera[0].name is "Left" in {path}; allowed: a lower-case letter, '),
         (LEFT.replace('"left"', '"info"'), 'camera[0].name is "info" in {path}; allowed: a lower-case letter, '),
         (LEFT + "fov = 3\n", "camera[0].matrix is "),
+        (LEFT + "scale = 0.0\n", "camera[0].scale is 0.0 in {path}; allowed: above 0, at most 1"),
+        (LEFT.replace("up =", 'axes = "opengl", up ='), 'camera[0].pose.axes is "opengl" in {path}; allowed: none beside look_at'),
+        (TOP.replace("{ matrix", '{ axes = "blender", matrix'), 'camera[0].pose.axes is "blender" in {path}; allowed: opencv, opengl'),
         (HEAD + LOOK, "camera[0].fov is null in {path}; allowed: either fov or matrix"),
         (LEFT.replace("275.0", "0.0"), "allowed: fx from "),
         (LEFT.replace("275.0", "nan"), "camera[0].matrix is "),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
@@ -157,6 +157,8 @@ OBJECTS = st.recursive(
 
 
 @settings(max_examples=fuzz_examples(150))
-@given(overrides=st.dictionaries(st.sampled_from(KEYS), OBJECTS, max_size=3))
-def test_any_objects_from_python_are_a_configuration_or_one_line(overrides):
-    check(lambda: load_config("smoke", overrides))
+@given(overrides=st.dictionaries(st.sampled_from(KEYS) | SCALARS, OBJECTS, max_size=3), preset=st.just("smoke") | OBJECTS)
+@example(overrides={10**5000: 1}, preset="smoke")
+@example(overrides={}, preset=10**5000)
+def test_any_objects_from_python_are_a_configuration_or_one_line(overrides, preset):
+    check(lambda: load_config(preset, overrides))

@@ -14,7 +14,7 @@ from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, sc
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.scenes.cameras import describe_blocked
+from synpick_warp.scenes.cameras import describe_cameras
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
@@ -138,7 +138,7 @@ def test_what_a_camera_covers_is_said():
 )
 def test_a_camera_in_the_way_of_the_gripper_is_named(settings, blocked):
     config = load_config("smoke", settings)
-    lines, none = (describe_blocked(picks, config.rig, config.cell.bins, config.gripper, config.pick) for picks in (True, False))
+    lines, none = (describe_cameras(picks, config.rig, config.cell.bins, config.gripper, config.pick) for picks in (True, False))
     assert none == []
     assert [int(line[14]) for line in lines] == blocked
     assert all(line.startswith("camera camera_") and " stands over the t" in line for line in lines)

@@ -19,7 +19,7 @@ from cyclopts import Parameter
 from synpick_warp.cli.commands.pictures import draw_cell
 from synpick_warp.cli.folders import check_output_file
 from synpick_warp.cli.options import parse_resolution
-from synpick_warp.configs.calibration.files import MODELS, read_calibration
+from synpick_warp.configs.calibration.files import MAX_SIDE, MODELS, read_calibration
 from synpick_warp.configs.cell.bins import AXES, BinRow
 from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.cell.extents import BinSizes
@@ -130,7 +130,7 @@ def new_cell(
         sizes, shape = BinSizes.of_row(shape), _copy_bin(shape, stage)
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
-        perception = (_PERCEPTION, max(_LEAST, round(_PERCEPTION * height / width)))
+        perception = (_PERCEPTION, min(max(_LEAST, round(_PERCEPTION * height / width)), MAX_SIDE))
         cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, *weights, perception=perception)
         _fill(cell, folder, stage, progress, calibration or [], f"{place.name}/{CELL}")
     print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
@@ -332,6 +332,8 @@ def _read_cameras(files: Sequence[Path], resolution: str | None, model: str, sta
     if model not in ("", *MODELS):
         raise ConfigError(f"--lens is {format_value(model)}; allowed: {', '.join(MODELS)}{suggest(model, MODELS)}")
     size = None if resolution is None else parse_resolution(resolution)
+    if size and not all(1 <= side <= MAX_SIDE for side in size):
+        raise ConfigError(f"--resolution is {resolution}; allowed: each side at least 1, at most {MAX_SIDE} [px]")
     if not files:
         pixels = (size[0], size[1]) if size else _RESOLUTION
         return [(CameraRow(name=name, resolution=pixels, fov=_FOV), {"resolution": pixels, "fov": _FOV}) for name in ("top", "side")]

@@ -157,10 +157,10 @@ def draw_cell(
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
     from synpick_warp.configs.dataset.modes import may_pick
-    from synpick_warp.scenes.cameras import describe_blocked
+    from synpick_warp.scenes.cameras import describe_cameras
 
     scene = CellScene(config, progress, say, objects)
-    for line in describe_blocked(may_pick(config.bake, config.splits), config.rig, config.cell.bins, config.gripper, config.pick):
+    for line in describe_cameras(may_pick(config.bake, config.splits), config.rig, config.cell.bins, config.gripper, config.pick):
         say(line)
     progress.stage(f"rendering {len(config.rig)} cameras")
     write_cell_sheet(scene, config.rig, config.bins, name, out)

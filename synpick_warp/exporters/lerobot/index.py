@@ -20,7 +20,6 @@ import pyarrow.parquet as pq
 from synpick_warp.configs.cell.rig import Size
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Bake
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot.episode import make_folders
 from synpick_warp.exporters.lerobot.layout import (
@@ -45,6 +44,7 @@ from synpick_warp.exporters.lerobot.layout import (
 from synpick_warp.exporters.lerobot.part import Part, outcome_names
 from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
+from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.system.inputs.json import read_json
 from synpick_warp.system.inputs.paths import path_inside
 
@@ -94,7 +94,7 @@ def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) 
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
         _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
-    _place(out, CARD, lambda path: path.write_text(_make_card(settings.bake, bool(settings.layout.splits), totals), encoding="utf-8"))
+    _place(out, CARD, lambda path: path.write_text(_make_card(settings, totals), encoding="utf-8"))
     return [INFO, STATS, TASKS, EPISODES, DATA, CARD]
 
 
@@ -246,8 +246,9 @@ def _task_table(tasks: dict[str, int]) -> pa.Table:
     return table.replace_schema_metadata({"pandas": json.dumps(notes)})
 
 
-def _make_card(bake: Bake, has_splits: bool, totals: _Totals) -> str:
+def _make_card(settings: ExportSettings, totals: _Totals) -> str:
     """Dataset card for the Hugging Face hub, whose visualizer of LeRobot data sets goes by the tag."""
+    bake, has_splits = settings.bake, bool(settings.layout.splits)
     licence = "unknown" if bake.models or bake.lights else "mit"
     names = list(dict.fromkeys(row["source/split"] for row in totals.rows))
     only = "validation" if names == ["val"] else names[0] if names else "train"
@@ -262,7 +263,7 @@ configs:
   data_files:{files}
 ---
 # Bin picking with a suction gripper
-
+{describe_lenses(settings)}
 {len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {VERSION}.
 State: cup pose in the tote's frame (x, y, z [m], quaternion x, y, z, w), whether the suction is on, whether an object hangs on the cup.
 Action: setpoint of the wrist [m] and suction command. Tasks name the object that each attempt picks.

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from synpick_warp.configs.cell.rig import lens_map
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.scenes.types import Camera
@@ -39,12 +40,20 @@ def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:
     return ", ".join(f"{camera.width} x {camera.height} ({camera.name})" for camera in cameras) + " pixels"
 
 
-def describe_lenses(cameras: tuple[Camera, ...]) -> str:
-    """Clause on lens distortion."""
-    bent = [camera.name for camera in cameras if camera.lens is not None]
-    if not bent:
-        return "no lens distortion"
-    return f"are distorted by the lens (`cam_dist`, OpenCV's coefficients of `cam_dist_model`) in {', '.join(bent)}"
+def describe_lenses(settings: ExportSettings) -> str:
+    """First lines of cards and notes: whether pictures are rectified, or which are distorted and by which keys; empty: there is no lens."""
+    if settings.bop.rectified:
+        return """
+**Pictures are rectified** (`bop.rectified`): those of pinhole cameras with the same `cam_K`, without the distortion of the
+calibrations. Undistort real pictures to the same matrix, as `cv2.undistort(picture, K, coefficients)` does.
+"""
+    rig = settings.rig
+    bent = ", ".join(name for name, row in zip(rig.names, rig.rows, strict=True) if lens_map(row) is not None)
+    text = f"""
+**Pictures are distorted** by the lens of {bent}: points are projected into them by `cam_K` with `cam_dist` (OpenCV's
+coefficients of `cam_dist_model`), not by `cam_K` alone. For readers that know no distortion, bake with `bop.rectified = true`.
+"""
+    return text if bent else ""
 
 
 def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
@@ -79,12 +88,13 @@ def _describe(settings: ExportSettings, names: Mapping[int, str], cameras: tuple
     bake = settings.bake
     objects = "\n".join(f"| {index} | {name} |" for index, name in sorted(names.items()))
     poses = "\n".join(f"| {index} | {_row(one.rotation.ravel())} | {_row(one.translation)} |" for index, one in enumerate(cameras))
+    lenses, pictures = describe_lenses(settings), describe_sizes(settings.layout, cameras)
     return f"""# A SynPick data set
-
+{lenses}
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(cameras)} cameras, formats
 {", ".join(sorted(bake.formats))}). Frames are {settings.physics.tick_time:g} s apart.
 
-- Pictures have {describe_sizes(settings.layout, cameras)} and {describe_lenses(cameras)}; {_INTRINSICS[settings.layout.is_listed]}.
+- Pictures have {pictures}{"" if lenses else " and no lens distortion"}; {_INTRINSICS[settings.layout.is_listed]}.
   The centre of pixel (row, column) is (column + 0.5, row + 0.5): for OpenCV and Open3D, whose pixel centres have whole
   coordinates, subtract 0.5 from cx and cy. Cameras have x right, y down, z forward.
 - The world is the {settings.bins[0].noun}'s frame: centre of its inner floor, z up, metres.

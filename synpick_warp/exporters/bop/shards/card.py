@@ -58,6 +58,8 @@ class CardContent:
     """Names of the active camera effects."""
     distorted: bool = False
     """Whether a camera has a lens that distorts."""
+    lens_note: str = ""
+    """See `describe_lenses`."""
 
 
 def hub_splits(layout: DataLayout) -> tuple[str, ...]:
@@ -90,7 +92,7 @@ def make_card(content: CardContent) -> str:
 {header}
 ---
 # Synthetic bin picking
-
+{content.lens_note}
 {views:,} views in {shards:,} webdataset shards of {size:,} bytes in all, made by synpick-warp:
 colour, 16-bit depth, 6D poses, boxes and masks as in the BOP challenge. One shard is one camera's scene; `dataset_info.md` has
 the conventions and the objects.

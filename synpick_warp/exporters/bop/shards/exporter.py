@@ -24,6 +24,7 @@ from synpick_warp.exporters.bop.shards.tar_files import (
     write_view,
 )
 from synpick_warp.exporters.writing.files import LINES, PARTIAL, join_lines, output_errors, write_atomically
+from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -99,6 +100,7 @@ def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardConte
         layers=settings.render.layers,
         effects=settings.effects,
         distorted=any(lens_map(row) is not None for row in settings.rig.rows),
+        lens_note=describe_lenses(settings),
     )
 
 

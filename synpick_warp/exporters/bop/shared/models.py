@@ -203,10 +203,8 @@ def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[
     layout, period = settings.layout, settings.physics.tick_time
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     pictures = describe_sizes(layout, cameras)
-    if any(camera.lens is not None for camera in cameras):
-        pictures += f" and {describe_lenses(cameras)}"
     return f"""# A SynPick data set
-
+{describe_lenses(settings)}
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {settings.bake.seed}, {layout.cameras} cameras), in the format of the
 BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layout)}. Frames are {period:g} s apart.
 
