@@ -126,7 +126,7 @@ def _read_motion(scenes: list[tuple[SceneArrays, int]]) -> CameraMotion:
             keys += [(scene, image) for image in arrays.images.tolist()]
             poses += [[*rotation, *translation] for rotation, translation in found]
     numbers, places = np.reshape(np.array(poses, np.float64), (-1, 12)), np.reshape(np.array(keys, np.int64), (-1, 2))
-    return CameraMotion(*places.T, numbers[:, :9].reshape(-1, 3, 3), _METERS * numbers[:, 9:])
+    return CameraMotion(places[:, 0], places[:, 1], numbers[:, :9].reshape(-1, 3, 3), _METERS * numbers[:, 9:])
 
 
 def instance_speeds(poses: PoseTable, period: float) -> np.ndarray:
