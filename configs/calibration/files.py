@@ -271,7 +271,7 @@ def _zivid(tree: Tree, model: str) -> Calibration:
 _MATRIX = ("cameramatrix", "cammatrix", "intrinsicmatrix", "cameraintrinsics", "intrinsics", "mtx", "k")
 _DISTORTION = (
     "distortioncoefficients", "distortioncoeffs", "distortion",
-    "distcoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "dist", "d",
+    "distcoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "dist", "d", "coeffs", "coefficients",
 )  # fmt: skip
 _MODEL = ("distortionmodel", "model", "cameramodel")
 """Names of values, as of `_short`."""
@@ -283,7 +283,7 @@ _FORMATS: tuple[_Format, ...] = (
     ("nerfstudio", lambda tree: "fl_x" in tree or {"camera_angle_x", "frames"} <= tree.keys(), HALVES, _nerfstudio),
     ("Kalibr", lambda tree: {"intrinsics", "camera_model"} <= tree.keys(), INTEGERS, _kalibr),
     ("Open3D", lambda tree: {"intrinsic_matrix", "width", "height"} == tree.keys(), INTEGERS, _open3d),
-    ("BOP", lambda tree: "cam_K" in tree, HALVES, _bop),
+    ("BOP", lambda tree: bool({"cam_K", "cam_dist", "cam_dist_model"} & tree.keys()), HALVES, _bop),
     ("ROS", lambda tree: bool({"camera_name", "distortion_model", "header"} & tree.keys()) and _has(tree, _MATRIX), INTEGERS, _ros),
     ("OpenCV", lambda tree: _has(tree, _MATRIX), INTEGERS, _opencv),
     ("OpenCV", lambda tree: {"fx", "fy", "cx", "cy"} <= tree.keys() and (_has(tree, _DISTORTION) or "k1" in tree), INTEGERS, _opencv),
@@ -308,8 +308,7 @@ def _coefficients(tree: Tree, any_size: bool = False) -> tuple[float, ...]:
     Raises:
         _FaultError: A name looks like one of coefficients, and is not known.
     """
-    known = (*_DISTORTION, *_MODEL, "camdist")
-    if unknown := [name for name in tree if _short(name).startswith("dist") and _short(name) not in known]:
+    if unknown := [name for name in tree if _short(name).startswith("dist") and _short(name) not in (*_DISTORTION, *_MODEL)]:
         raise _FaultError(f"it has {format_value(unknown[0])}, which is no known name; call coefficients distortion_coefficients")
     if _has(tree, _DISTORTION):
         return _numbers(_first(tree, _DISTORTION, None), "distortion coefficients", any_size)

@@ -106,7 +106,7 @@ def test_a_pose_of_other_axes_or_the_inverse_is_named(tmp_path, pose, words):
 
 def test_an_inverse_that_sees_the_bin_by_chance_is_named_as_it_is_baked(tmp_path):
     def lines(matrix: str) -> list[str]:
-        config = load(tmp_path, f"[[camera]]\nfov = 40.0\npose = {{ matrix = {matrix} }}\n")
+        config = load(tmp_path, f"[[camera]]\nfov = 60.0\npose = {{ matrix = {matrix} }}\n")
         return describe_cameras(False, config.rig, config.cell.bins, config.gripper, config.pick)
 
     assert lines(SIDE) == lines(DOWN) == []
