@@ -61,7 +61,7 @@ class Lens:
             raise ConfigError(f"distortion has {len(self.coefficients)} coefficients; allowed: {allowed} with the model {self.model}")
         if not (np.abs(self.coefficients) <= MAX_NUMBER).all():
             given = format_value(list(self.coefficients))
-            raise ConfigError(f"distortion has the coefficients {given}; allowed: finite numbers of at most {MAX_NUMBER:g}")
+            raise ConfigError(f"distortion has coefficients that are not finite or above {MAX_NUMBER:g}: {given}; give numbers")
 
     @property
     def is_identity(self) -> bool:

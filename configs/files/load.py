@@ -81,10 +81,10 @@ def load_config(
     offered = values.pop(_OFFERED, None)
     if splits and offered and SPLITS not in values:
         values[SPLITS] = offered
-    if not isinstance(settings or {}, Mapping) or not all(isinstance(key, str) for key in settings or {}):
+    if not isinstance(settings or {}, Mapping):
         raise ConfigError(f"the settings passed are {format_value(settings)}; allowed: a dict, of full keys such as bake.episodes")
     for key, value in (settings or {}).items():
-        section, _, name = key.partition(".")
+        section, _, name = (key if isinstance(key, str) else format_value(key)).partition(".")
         if section == SPLITS:
             values[SPLITS] = (override_table(values.get(SPLITS, ({}, ""))[0], name, value, source), source)
         else:
