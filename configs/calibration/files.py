@@ -218,7 +218,7 @@ def _nerfstudio(tree: Tree, model: str) -> Calibration:
     sets = {tuple(_number(frame.get(key, tree.get(key, 0)), key) for key in keys) for frame in frames or [tree]}
     if len(sets) > 1:
         raise _FaultError(f"its frames are of {len(sets)} cameras; write the values of one into a file of its own")
-    values = dict(zip(keys, sets.pop(), strict=True))
+    values: Tree = dict(zip(keys, sets.pop(), strict=True))
     named, allowed = str(tree.get("camera_model", "OPENCV")), ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "OPENCV_FISHEYE")
     fisheye = named == "OPENCV_FISHEYE" or tree.get("is_fisheye") is True
     if named not in allowed or (values["k4"] and not fisheye):
