@@ -19,6 +19,8 @@ from synpick_warp.configs.cell.rig import Rig, lens_map
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
+from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul, nearest_rotation, norm
+from synpick_warp.system.linear_algebra import rotation as rotation_matrix
 from synpick_warp.system.random_numbers import stream_key, uniform
 
 PARALLEL = 1e-6
@@ -44,7 +46,7 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
     """Camera of a row with a resolution."""
     width, height = row.resolution or (0, 0)
     if row.matrix is None:
-        focal = width / 2 / np.tan(np.radians(row.fov or 0.0) / 2)
+        focal = width / 2 / round(float(np.tan(np.radians(row.fov or 0.0) / 2)), DECIMALS)
         matrix = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     else:
         matrix = np.array(row.matrix, dtype=float)
@@ -52,14 +54,14 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
     if pose.matrix is not None:
         to_world = np.array(pose.matrix, dtype=float)
         # The digits of a file end; the columns of a rotation must stay perpendicular.
-        rotation, position = Rotation.from_matrix(to_world[:3, :3]).as_matrix().T, to_world[:3, 3]
+        rotation, position = nearest_rotation(to_world[:3, :3]).T, to_world[:3, 3]
     else:
         position = np.array(pose.position, dtype=float)
         if pose.quaternion is not None:
             rotation = Rotation.from_quat(pose.quaternion).as_matrix().T
         else:
             rotation = _look_at(label, position, np.array(pose.look_at, dtype=float), np.array(pose.up, dtype=float))
-    return Camera(width, height, matrix, rotation, -rotation @ position, row.name, lens_map(row), row.fixed_to or WORLD)
+    return Camera(width, height, matrix, rotation, -dot(rotation, position), row.name, lens_map(row), row.fixed_to or WORLD)
 
 
 def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -67,13 +69,13 @@ def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarra
     if not all(np.isfinite(vector).all() for vector in (position, target, up)):
         raise ConfigError(f"{label} has a position, look-at point or up vector that is not finite; give numbers")
     forward = target - position
-    distance = np.linalg.norm(forward)
+    distance = norm(forward)
     if distance < _MIN_DISTANCE:
         raise ConfigError(f"{label} is at its look-at point {_plain(target)}; move one of them")
     forward = forward / distance
     right = np.cross(forward, up)
-    length = np.linalg.norm(right)
-    if length <= PARALLEL * np.linalg.norm(up):
+    length = norm(right)
+    if length <= PARALLEL * norm(up):
         raise ConfigError(
             f"the up vector {_plain(up)} of {label} must not be zero or parallel to its viewing direction {_plain(forward)}; tilt it"
         )
@@ -157,9 +159,10 @@ class EpisodeCameras:
         matrix[[0, 1], [0, 1]] *= 1.0 + focal_length
         matrix[:2, 2] += center
         at = position + camera.center
-        turned = Rotation.from_rotvec(rotation, degrees=True).as_matrix().T @ camera.rotation
+        angle = norm(rotation)
+        turned = matmul(rotation_matrix(rotation / (angle or 1.0), np.radians(angle)).T, camera.rotation)
         lens = with_matrix(camera.lens, matrix)
-        return replace(camera, matrix=matrix, rotation=turned, translation=-turned @ at, lens=lens)
+        return replace(camera, matrix=matrix, rotation=turned, translation=-dot(turned, at), lens=lens)
 
 
 def carry(rotation: np.ndarray, translation: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,8 +172,8 @@ def carry(rotation: np.ndarray, translation: np.ndarray, pose: np.ndarray) -> tu
     """
     at, quaternion = pose[:, :3].astype(np.float64), pose[:, 3:].astype(np.float64)
     quaternion[~quaternion.any(axis=1), 3] = 1.0
-    turned = rotation @ Rotation.from_quat(quaternion).as_matrix().transpose(0, 2, 1)
-    return turned, translation - np.einsum("nij,nj->ni", turned, at)
+    turned = matmul(rotation, Rotation.from_quat(quaternion).as_matrix().transpose(0, 2, 1))
+    return turned, translation - dot(turned, at[:, None])
 
 
 def draw_jitter(jitter: Jitter, seed: int, episode: int, camera: int) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:

@@ -13,6 +13,7 @@ from synpick_warp.configs.schema import Physics
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.fills import count_entries
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
+from synpick_warp.system.linear_algebra import dot, eigh, matmul
 
 # Contacts of two convex shapes side by side, and such pairs of an object with floor and walls: a pile of 24 plates of 1 mm has up to 713.
 _PAIR_CONTACTS, _FIXTURES = 5, 1.5
@@ -103,7 +104,7 @@ def _contacts_of_many(catalog: Catalog, margin: float, fixtures: float, count: i
     drawn = each[len(numbers) :] if counts else each
     counted = each[: len(numbers)][numbers > 0]
     most = max(counted.max(initial=0.0), drawn.max(initial=0.0))
-    return float(counted @ numbers[numbers > 0]) + room * float(drawn.max(initial=0.0)), float(most)
+    return float(dot(counted, numbers[numbers > 0])) + room * float(drawn.max(initial=0.0)), float(most)
 
 
 def _count_beside(one: Bin, reach: float) -> float:
@@ -117,7 +118,7 @@ def _count_beside(one: Bin, reach: float) -> float:
     for center, mouth, *parts in zip(one.sizes.centers, one.sizes.mouths, *(one.sizes.waypoints(k, reach) for k in _SHARES), strict=True):
         places, half = np.concatenate(parts), np.array(mouth) / 2.0
         sides += len(places) + int((half - np.abs(places[:, :2] - center) <= reach).sum())
-        shapes += sum(int(((places @ each[:, :3].T + each[:, 3]).max(axis=1) <= reach).sum()) for each in planes)
+        shapes += sum(int(((matmul(places, each[:, :3].T) + each[:, 3]).max(axis=1) <= reach).sum()) for each in planes)
     return _FIXTURES * shapes / sides
 
 
@@ -125,4 +126,4 @@ def oriented_sides(pieces: Sequence[ConvexPiece]) -> np.ndarray:
     """Side lengths (3) [m] of a box about convex pieces, along their principal axes."""
     points = np.concatenate([piece.vertices for piece in pieces]).astype(np.float64)
     centered = points - points.mean(axis=0)
-    return np.maximum(np.ptp(centered @ np.linalg.svd(centered, full_matrices=False)[2].T, axis=0), MIN_SIDE)
+    return np.maximum(np.ptp(matmul(centered, eigh(matmul(centered.T, centered))[1][:, ::-1]), axis=0), MIN_SIDE)

@@ -28,6 +28,7 @@ from synpick_warp.scenes.embedded.solids import solids
 from synpick_warp.scenes.symmetries.likeness import look_alike, shape_profile
 from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
+from synpick_warp.system.linear_algebra import norm
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -372,7 +373,7 @@ def _check_fits_bin(vertices: np.ndarray, size: float, origin: str, sizes: BinSi
 
 def _inner_diagonal(sizes: BinSizes) -> float:
     """Diagonal of a bin's inside, or of the area where objects are dropped [m]."""
-    return float(np.linalg.norm((*sizes.mouth, sizes.height)))
+    return float(norm(np.array((*sizes.mouth, sizes.height))))
 
 
 def _by(sides: list[float]) -> str:

@@ -10,6 +10,8 @@ import functools
 import cv2
 import numpy as np
 
+from synpick_warp.system.linear_algebra import DECIMALS
+
 BACKGROUND_ROWS = 256
 """Rows of the background, which cameras see out of focus; 0.7° a texel is fine enough to tell lamps apart."""
 WHITE_VALUE = 1.25
@@ -30,9 +32,9 @@ def _compute_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions (rows, 2 rows, 3) and solid angles of an equirectangular map's pixels, read-only; uncached `map_directions`."""
     polar = (np.arange(rows) + 0.5) / rows * np.pi
     azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
-    polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")
-    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
-    edges = np.cos(np.arange(rows + 1) / rows * np.pi)
+    (down, out), (x, y) = (np.round([np.cos(angle), np.sin(angle)], DECIMALS) for angle in (polar, azimuth))
+    directions = np.stack([np.outer(out, x), np.outer(out, y), np.repeat(down[:, None], 2 * rows, axis=1)], axis=-1)
+    edges = np.cos(np.arange(rows + 1) / rows * np.pi).round(DECIMALS)
     solid_angles = np.repeat((edges[:-1] - edges[1:])[:, None], 2 * rows, axis=1) * (2.0 * np.pi / (2 * rows))
     for values in (directions, solid_angles):
         values.setflags(write=False)

@@ -12,6 +12,7 @@ from synpick_warp.configs.episodes.fills import Counts
 from synpick_warp.configs.schema import LAYERED, Arrangement
 from synpick_warp.errors import ConfigError, format_value, suggest
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.system.linear_algebra import dot
 
 _DENSEST = 0.74
 """Packing fraction of the densest packing of equal spheres, π / √18; dropped parts stay below."""
@@ -52,7 +53,7 @@ def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, 
         sizes: The bin; in layers its compartments are taken to have equal shares of the objects.
     """
     if arrangement.drop != LAYERED:
-        return float(most @ (2.0 * radius + arrangement.clearance))
+        return float(dot(most, 2.0 * radius + arrangement.clearance))
     pitch = float(2.0 * radius[most > 0].max(initial=0.0) + arrangement.clearance)
     cells = sum(max(1, int(length / pitch)) * max(1, int(width / pitch)) for length, width in sizes.mouths)
     return pitch * math.ceil(int(most.sum()) / cells)
@@ -68,7 +69,7 @@ def check_fill(arrangement: Arrangement, guide_height: float, catalog: Catalog, 
         return
     most = count_entries(arrangement.counts, catalog)[:, 1]
     volume, radius = (np.array([getattr(entry, name) for entry in catalog.entries]) for name in ("volume", "radius"))
-    volume = float(most @ volume)
+    volume = float(dot(most, volume))
     for sizes in bins:
         height = drop_height(most, radius, arrangement, sizes)
         if height > guide_height:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
+from scipy import ndimage
 
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.sun import SUN_CONTRAST, disc_radius_tangent
+from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, matmul, norm
 
 LAMP_RADIUS = np.radians(6.0)
 """Radius of the search window [rad]: light within this angle of a lamp's center belongs to it. Wider light is split into several lamps.
@@ -60,8 +61,8 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
         The map without the lamps, and the lamps, those with the largest irradiance of a surface that faces up first.
     """
     directions, solid_angles = map_directions(len(radiance))
-    luminance = radiance @ LUMINANCE
-    total = solid_angles * (luminance if whole is None else whole @ LUMINANCE)
+    luminance = dot(radiance, LUMINANCE)
+    total = solid_angles * (luminance if whole is None else dot(whole, LUMINANCE))
     threshold = LAMP_CONTRAST * total.sum() / (4.0 * np.pi)
     min_irradiance = MIN_LAMP_SHARE * (total * np.maximum(directions[..., 2], 0.0)).sum()
     high = directions[..., 2] > MIN_LAMP_HEIGHT
@@ -70,7 +71,7 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
     for _ in range(2 * max_lamps):
         bright = np.maximum(left - threshold, 0.0)
         # Searches start at texels above the threshold: a window around any other could be empty.
-        blurred = np.where(high & (bright > 0.0), cv2.GaussianBlur(bright, (0, 0), SEARCH_BLUR), 0.0)
+        blurred = np.where(high & (bright > 0.0), _blur(bright), 0.0)
         if blurred.max() <= 0.0:
             break
         excess = _shift_window(bright, directions[np.unravel_index(blurred.argmax(), blurred.shape)])
@@ -84,6 +85,15 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
     return radiance * (1.0 - sum(fractions, np.zeros_like(luminance)))[..., None], lamps
 
 
+def _blur(bright: np.ndarray) -> np.ndarray:
+    """Gaussian blur of a map (rows, 2 rows) by SEARCH_BLUR [texels]. OpenCV's and SciPy's weights have digits of the processor."""
+    reach = np.arange(-round(4 * SEARCH_BLUR), round(4 * SEARCH_BLUR) + 1)
+    weights = np.exp(-0.5 * (reach / SEARCH_BLUR) ** 2).round(DECIMALS)
+    for axis in (0, 1):
+        bright = ndimage.correlate1d(bright, weights / weights.sum(), axis, mode="mirror")
+    return bright
+
+
 def _shift_window(bright: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Mean shift of the search window, from the unit direction `center` (3) of a texel above the threshold.
 
@@ -92,22 +102,22 @@ def _shift_window(bright: np.ndarray, center: np.ndarray) -> np.ndarray:
     directions, solid_angles = map_directions(len(bright))
     result = bright
     for _ in range(SHIFTS):
-        inside = (directions @ center > np.cos(LAMP_RADIUS)) & (directions[..., 2] > 0.0)
+        inside = (dot(directions, center) > round(float(np.cos(LAMP_RADIUS)), DECIMALS)) & (directions[..., 2] > 0.0)
         excess = np.where(inside, bright, 0.0)
         if not excess.any():
             break
         result = excess
         center = ((excess * solid_angles)[..., None] * directions).sum(axis=(0, 1))
-        center /= np.linalg.norm(center)
+        center /= norm(center)
     return result
 
 
 def _build_lamp(radiance: np.ndarray, points: int) -> Lamp:
     """Build a lamp from a map (rows, 2 rows, 3) that is black elsewhere."""
     directions, solid_angles = map_directions(len(radiance))
-    weight = (radiance @ LUMINANCE) * solid_angles
+    weight = (dot(radiance, LUMINANCE)) * solid_angles
     center = (weight[..., None] * directions).sum(axis=(0, 1))
-    center /= np.linalg.norm(center)
+    center /= norm(center)
     irradiance = (radiance * solid_angles[..., None]).sum(axis=(0, 1))
     lit = weight > 0.0
     samples = stratify_light(weight[lit], directions[lit], points)
@@ -119,12 +129,12 @@ def sample_disc(direction: np.ndarray, radius_tangent: float, count: int) -> np.
     radius = radius_tangent * np.sqrt((np.arange(DISC_RINGS) + 0.5) / DISC_RINGS)
     angle = 2.0 * np.pi * (np.arange(DISC_SPOKES) + 0.5) / DISC_SPOKES
     across = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
-    across /= np.linalg.norm(across)
+    across /= norm(across)
     side = np.stack([across, np.cross(direction, across)])
     # A slight eccentricity makes the first principal axis unique; of a disc, eigenvalue solvers return an arbitrary one.
-    offsets = (1.0, 0.999) * (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
-    directions = direction + offsets @ side
-    return stratify_light(np.ones(len(directions)), directions / np.linalg.norm(directions, axis=1)[:, None], count)
+    offsets = (1.0, 0.999) * (radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1).round(DECIMALS)).reshape(-1, 2)
+    directions = direction + matmul(offsets, side)
+    return stratify_light(np.ones(len(directions)), directions / norm(directions)[:, None], count)
 
 
 def stratify_light(weight: np.ndarray, directions: np.ndarray, count: int) -> np.ndarray:
@@ -141,12 +151,12 @@ def stratify_light(weight: np.ndarray, directions: np.ndarray, count: int) -> np
     """
     mean = (weight[:, None] * directions).sum(axis=0) / weight.sum()
     if count == 1:
-        return (mean / np.linalg.norm(mean))[None]
+        return (mean / norm(mean))[None]
     offset = directions - mean
-    axis = np.linalg.eigh((weight[:, None] * offset).T @ offset)[1][:, -1]
+    axis = eigh(matmul((weight[:, None] * offset).T, offset))[1][:, -1]
     # Eigenvalue solvers differ in the sign of eigenvectors.
     axis *= np.sign(axis[np.abs(axis).argmax()])
-    order = np.argsort(offset @ axis, kind="stable")
+    order = np.argsort(dot(offset, axis), kind="stable")
     weight, directions = weight[order], directions[order]
     total = np.cumsum(weight)
     middle = int(np.searchsorted(total, 0.5 * total[-1]))

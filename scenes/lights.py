@@ -21,6 +21,7 @@ from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.linear_algebra import DECIMALS, dot
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 READ_LIMITS = Limits(300.0, 2**32)
@@ -183,10 +184,10 @@ def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
     if u is None or v is None:
         return None
     azimuth, polar = (0.5 - u[0]) * 2 * np.pi, v[0] * np.pi
-    direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]).round(DECIMALS)
     linear = np.ones(3) if color is None else srgb_to_linear(color / 255.0)
     irradiance = np.pi * (1.0 if gain is None else gain[0]) * linear
-    return Sun(direction, irradiance) if v[0] < 0.5 and float(irradiance @ LUMINANCE) >= MIN_RADIANCE else None
+    return Sun(direction, irradiance) if v[0] < 0.5 and float(dot(irradiance, LUMINANCE)) >= MIN_RADIANCE else None
 
 
 def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count: int, high: float) -> np.ndarray | None:
@@ -212,9 +213,9 @@ def _is_bright(radiance: np.ndarray, direction: np.ndarray) -> bool:
     """
     height = min(radiance.shape[0], SUN_ROWS)
     bright = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA).sum(axis=2)
-    cosine = map_directions(height)[0] @ direction
+    cosine = dot(map_directions(height)[0], direction)
     # In coarse maps even the nearest texel may lie farther away than the angle.
-    near = cosine >= min(np.cos(np.radians(MAX_SUN_OFFSET)), cosine.max())
+    near = cosine >= min(np.cos(np.radians(MAX_SUN_OFFSET)).round(DECIMALS), cosine.max())
     return bool(bright[near].max() >= MIN_SUN_BRIGHTNESS * bright.max())
 
 
@@ -250,10 +251,10 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
         raise LightError(f"{path} cannot be read as an image: it is empty, cut short or of another format; replace it")
     if image.ndim != 3 or image.shape[2] < 3:
         raise LightError(f"{path} is not a colour image; an environment map needs red, green and blue")
-    linear = image[..., 2::-1].astype(np.float32)
     if image.dtype in (np.uint8, np.uint16):
-        linear = (linear / np.float32(255 if image.dtype == np.uint8 else 65535)) ** np.float32(gamma)
-    return linear
+        levels = np.linspace(0.0, 1.0, 256 if image.dtype == np.uint8 else 65536) ** gamma
+        return levels.astype(np.float32)[image[..., 2::-1]]
+    return image[..., 2::-1].astype(np.float32)
 
 
 def _decode(path: Path) -> np.ndarray | None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from synpick_warp.scenes.assets.polygons import clip_ears
 from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul
 
 Rect = tuple[float, float, float, float]
 """Rectangle of a texture atlas: u0, v0, u1, v1, with v upward."""
@@ -50,7 +51,7 @@ class Patch:
 
     def rotate(self, axis: str, angle: float) -> Patch:
         """Rotate the patch about a coordinate axis through the origin [°]."""
-        return Patch(self.corners @ rotation(axis, angle).T, self.uv)
+        return Patch(matmul(self.corners, rotation(axis, angle).T), self.uv)
 
 
 def rotation(axis: str, angle: float) -> np.ndarray:
@@ -76,8 +77,8 @@ def ellipse(width: float, depth: float, points: int, exponent: float = 2.0) -> n
     """
     angles = np.pi / 2 + 2 * np.pi * np.arange(points) / points
     bend = 2.0 / exponent
-    waves = np.stack([np.cos(angles), np.sin(angles)], axis=1).round(12)
-    return np.sign(waves) * np.abs(waves) ** bend * np.array([width / 2, depth / 2])
+    waves = np.stack([np.cos(angles), np.sin(angles)], axis=1).round(DECIMALS)
+    return np.sign(waves) * (np.abs(waves) ** bend).round(DECIMALS) * np.array([width / 2, depth / 2])
 
 
 def rounded_rectangle(width: float, depth: float, radius: float, segments: int) -> np.ndarray:
@@ -89,7 +90,7 @@ def rounded_rectangle(width: float, depth: float, radius: float, segments: int) 
     for side in range(4):
         center = np.array(centers[side]) * (width / 2 - radius, depth / 2 - radius)
         angles = np.pi / 2 * (side + 1) + quarter
-        ring += [np.array([middles[side]]), center + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)]
+        ring += [np.array([middles[side]]), center + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1).round(DECIMALS)]
     return np.concatenate(ring)
 
 
@@ -115,7 +116,7 @@ def sweep(path: np.ndarray, section: np.ndarray, scales: np.ndarray, hint: tuple
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    first = np.asarray(hint) - tangent * (tangent @ np.asarray(hint))[:, None]
+    first = np.asarray(hint) - tangent * dot(tangent, np.asarray(hint))[:, None]
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(tangent, first)
     flat = section[None] * np.broadcast_to(scales, (len(path), 2))[:, None]
@@ -152,7 +153,7 @@ def face(outline: np.ndarray, *holes: np.ndarray) -> Patch:
     normal = np.cross(first, np.roll(first, -1, axis=0)).sum(axis=0)
     for hole in holes:
         turn = np.cross(hole - hole[0], np.roll(hole, -1, axis=0) - hole[0]).sum(axis=0)
-        ring = hole[::-1] if turn @ normal > 0.0 else hole
+        ring = hole[::-1] if dot(turn, normal) > 0.0 else hole
         near, to = np.unravel_index(np.linalg.norm(outline[:, None] - ring[None], axis=2).argmin(), (len(outline), len(ring)))
         bridged = [outline[: near + 1], np.roll(ring, -to, axis=0), ring[to : to + 1], outline[near:]]
         outline = np.concatenate(bridged)
@@ -189,7 +190,7 @@ def torus(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
 
 def rounded_box(size: tuple[float, float, float], radius: float, rects: dict[str, Rect], segments: int = 3) -> Patch:
     """Box about the origin with rounded edges [m]; `rects`: texture rectangle of each of `BOX_FACES`."""
-    angles = np.tan(np.pi / 4 * np.arange(segments + 1) / segments)
+    angles = np.tan(np.pi / 4 * np.arange(segments + 1) / segments).round(DECIMALS)
     slopes = np.concatenate([-angles[::-1], angles])
     sides = np.concatenate([-np.ones(segments + 1), np.ones(segments + 1)])
     half = np.array(size) / 2
@@ -201,7 +202,7 @@ def rounded_box(size: tuple[float, float, float], radius: float, rects: dict[str
         bulge /= np.linalg.norm(bulge, axis=2, keepdims=True)
         inner = sides[None, :, None] * right + sides[:, None, None] * up + out
         points = inner * (half - radius) + radius * bulge
-        across, along = (0.5 + points @ axis / (2 * half @ np.abs(axis)) for axis in (right, up))
+        across, along = (0.5 + dot(points, axis) / (2 * dot(half, np.abs(axis))) for axis in (right, up))
         patches.append(_grid(points, _texture_grid(across[0], along[:, 0], rects[name])))
     return join(*patches)
 
@@ -265,7 +266,7 @@ def _corner_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     edges /= np.linalg.norm(edges, axis=2, keepdims=True)
     flat = np.cross(edges[:, 0], edges[:, 1])
     flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), SNAP)
-    angle = np.arccos(np.clip(-(edges * np.roll(edges, 1, axis=1)).sum(axis=2), -1.0, 1.0)).reshape(-1)
+    angle = np.arccos(np.clip(-dot(edges, np.roll(edges, 1, axis=1)), -1.0, 1.0)).reshape(-1).round(DECIMALS)
     normal = np.repeat(flat, 3, axis=0)
 
     order = np.argsort(faces.reshape(-1), kind="stable")
@@ -276,7 +277,7 @@ def _corner_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     ends = np.cumsum(counts[group])
     other = np.arange(len(own)) - np.repeat(ends - counts[group], counts[group]) + np.repeat(starts[group], counts[group])
     own, other = order[own], order[other]
-    near = (normal[own] * normal[other]).sum(axis=1) > np.cos(np.radians(CREASE))
+    near = dot(normal[own], normal[other]) > round(float(np.cos(np.radians(CREASE))), DECIMALS)
     total = np.stack(
         [np.bincount(own[near], weights=(normal[other, axis] * angle[other])[near], minlength=len(normal)) for axis in range(3)], axis=1
     )

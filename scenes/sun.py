@@ -11,14 +11,15 @@ import numpy as np
 
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import Sun
+from synpick_warp.system.linear_algebra import DECIMALS, dot, norm
 
 SUN_SEARCH_RADIUS = np.radians(15.0)
 """Texels within this angle of its direction can belong to the sun [rad]."""
 SUN_CONTRAST = 4.0
 """The part of a texel's luminance above this multiple of the map's mean belongs to the sun."""
-MAX_SUN_TANGENT = np.tan(np.radians(4.0))
+MAX_SUN_TANGENT = np.tan(np.radians(4.0)).round(DECIMALS)
 """Tangent of the maximum angular radius of a sun that is a light of its own. A larger one is drawn into the map as a disc."""
-SOLAR_TANGENT = np.tan(np.radians(0.267))
+SOLAR_TANGENT = np.tan(np.radians(0.267)).round(DECIMALS)
 """Tangent of the real sun's angular radius: the minimum for an sIBL set's sun."""
 
 
@@ -43,13 +44,13 @@ def extract_sun(radiance: np.ndarray, direction: np.ndarray) -> ExtractedSun:
         direction: Unit direction (3) to extract light around.
     """
     directions, solid_angles = map_directions(radiance.shape[0])
-    luminance = radiance @ LUMINANCE
+    luminance = dot(radiance, LUMINANCE)
     fraction = sun_fraction(radiance, direction)
     weight = fraction * luminance * solid_angles
     if weight.sum() <= 0.0:
         return ExtractedSun(radiance, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)
     center = (weight[..., None] * directions).sum(axis=(0, 1))
-    center /= np.linalg.norm(center)
+    center /= norm(center)
     irradiance = (radiance * (fraction * solid_angles)[..., None]).sum(axis=(0, 1))
     return ExtractedSun(radiance * (1.0 - fraction)[..., None], center, irradiance, disc_radius_tangent(weight, center))
 
@@ -60,9 +61,13 @@ def sun_fraction(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
     1 - t / luminance within SUN_SEARCH_RADIUS, above the horizon and where luminance exceeds t = SUN_CONTRAST · the map's mean; else 0.
     """
     directions, solid_angles = map_directions(radiance.shape[0])
-    luminance = radiance @ LUMINANCE
+    luminance = dot(radiance, LUMINANCE)
     threshold = SUN_CONTRAST * (luminance * solid_angles).sum() / (4.0 * np.pi)
-    near = (directions @ direction > np.cos(SUN_SEARCH_RADIUS)) & (directions[..., 2] > 0.0) & (luminance > threshold)
+    near = (
+        (dot(directions, direction) > round(float(np.cos(SUN_SEARCH_RADIUS)), DECIMALS))
+        & (directions[..., 2] > 0.0)
+        & (luminance > threshold)
+    )
     return np.where(near, 1.0 - threshold / np.maximum(luminance, 1e-12), 0.0)
 
 
@@ -75,7 +80,7 @@ def disc_radius_tangent(weight: np.ndarray, direction: np.ndarray) -> float:
     """
     directions, _ = map_directions(len(weight))
     # The mean squared sine over a disc is half the squared sine of its radius.
-    sine = np.sqrt(np.clip(2.0 * (weight * (1.0 - (directions @ direction) ** 2)).sum() / weight.sum(), 0.0, 0.25))
+    sine = np.sqrt(np.clip(2.0 * (weight * (1.0 - dot(directions, direction) ** 2)).sum() / weight.sum(), 0.0, 0.25))
     return float(sine / np.sqrt(1.0 - sine**2))
 
 
@@ -91,7 +96,7 @@ def replace_sun(radiance: np.ndarray, sun: Sun) -> ExtractedSun:
         sun: The set's sun.
     """
     taken = extract_sun(radiance, sun.direction)
-    gain = max(1.0, float(taken.irradiance @ LUMINANCE) / float(sun.irradiance @ LUMINANCE))
+    gain = max(1.0, float(dot(taken.irradiance, LUMINANCE) / dot(sun.irradiance, LUMINANCE)))
     return ExtractedSun(taken.rest, sun.direction, gain * sun.irradiance, max(taken.radius_tangent, float(SOLAR_TANGENT)))
 
 
@@ -106,7 +111,7 @@ def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndar
         radius_tangent: Tangent of the disc's angular radius; the disc has at least one texel.
     """
     directions, solid_angles = map_directions(len(bright))
-    cosine = np.where(directions[..., 2] > 0.0, directions @ direction, -1.0)
+    cosine = np.where(directions[..., 2] > 0.0, dot(directions, direction), -1.0)
     inside = cosine >= min(1.0 / np.sqrt(1.0 + radius_tangent**2), cosine.max())
     if (inside & bright).any():
         inside &= bright

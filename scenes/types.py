@@ -10,6 +10,7 @@ import numpy as np
 
 from synpick_warp.configs.calibration.lens import LensMap
 from synpick_warp.configs.cell.cameras import WORLD
+from synpick_warp.system.linear_algebra import dot
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +220,7 @@ class Camera:
     @property
     def center(self) -> np.ndarray:
         """Optical centre (3) in the frame that the camera is fixed to [m]."""
-        return -self.rotation.T @ self.translation
+        return -dot(self.rotation.T, self.translation)
 
     @property
     def distortion(self) -> dict[str, Any]:

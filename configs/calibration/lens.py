@@ -17,6 +17,7 @@ import numpy as np
 
 from synpick_warp.configs.calibration.files import COUNTS, FISHEYE, MAX_NUMBER, PINHOLE
 from synpick_warp.errors import ConfigError, format_value
+from synpick_warp.system.linear_algebra import matmul
 
 MAX_ANGLE = 85.0
 """Largest angle between a ray and the optical axis [°]; planar depth and the normalised plane end at 90°."""
@@ -284,7 +285,7 @@ class LensMap:
             unit, step = edge / self.radius, 1e-5 * self.radius
             turn = (self.lens.linearize(edge + step * unit)[1] - self.lens.linearize(edge - step * unit)[1]) / (2 * step)
             foot = (self.radius / distance[beyond])[..., None] * (np.eye(2) - unit[:, :, None] * unit[:, None, :])
-            jacobian[beyond] += np.linalg.norm(out, axis=-1)[:, None, None] * (turn @ foot)
+            jacobian[beyond] += np.linalg.norm(out, axis=-1)[:, None, None] * matmul(turn, foot)
         return image, jacobian
 
     def _invert(self, goal: np.ndarray) -> np.ndarray:
@@ -296,7 +297,8 @@ class LensMap:
             size = np.linalg.norm(error * self._focal, axis=1)
             if (size <= TOLERANCE / 4).all():
                 break
-            step = np.linalg.solve(jacobian, error[..., None])[..., 0]
+            (a, b), (c, d) = np.moveaxis(jacobian, 0, -1)
+            step = np.stack((d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]), -1) / _det(jacobian)[:, None]
             start = points
             for _ in range(_HALVINGS):
                 points = start - step
@@ -325,13 +327,21 @@ class LensMap:
         radii = self.radius * np.concatenate((np.linspace(0, 1, 64), np.geomspace(1.0 + 1e-3, _REACH, 32)))
         points = radii[:, None, None] * directions
         image, jacobian = self._continued(points)
-        if not (np.linalg.det(jacobian) > 0).all():
+        if not (_det(jacobian) > 0).all():
             raise ConfigError("distortion folds over beyond the image, where it is continued; check the coefficients' order and signs")
         halves = directions[: _ANGLES // 2 : 2]
         second = [self._continued(points + step * v)[0] - 2 * image + self._continued(points - step * v)[0] for v in halves]
         bend = np.max(np.linalg.norm(np.array(second) * self._focal, axis=-1)) / step**2
-        least = np.min(np.linalg.svd(jacobian * self._focal[:, None], compute_uv=False))
+        # The smaller singular value of a 2 x 2 matrix, from the squares' sum and the product of both.
+        scaled = jacobian * self._focal[:, None]
+        half, area = (scaled**2).sum(axis=(-2, -1)) / 2, np.abs(_det(scaled))
+        least = np.min(area / np.sqrt(half + np.sqrt(np.maximum(half**2 - area**2, 0))))
         return float(_BOUND_MARGIN * bend), float(_BOUND_MARGIN / least)
+
+
+def _det(matrix: np.ndarray) -> np.ndarray:
+    """Determinants of 2 x 2 matrices (..., 2, 2)."""
+    return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
 
 
 @functools.lru_cache(maxsize=64)
@@ -343,7 +353,7 @@ def _limit(lens: Lens) -> tuple[float, bool]:
     radii = most * np.linspace(0, 1, _RADII) ** 2
     for _ in range(4):
         _, jacobian = lens.linearize(radii[:, None, None] * directions)
-        bad = np.nonzero((np.linalg.det(jacobian) <= 0).any(axis=1))[0]
+        bad = np.nonzero((_det(jacobian) <= 0).any(axis=1))[0]
         if not len(bad):
             return float(most), False
         radii = np.linspace(radii[max(bad[0] - 1, 0)], radii[bad[0]], 64)

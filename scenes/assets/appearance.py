@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
 from synpick_warp.scenes.assets.exr import EXR_MAGIC, decode_exr
+from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
 """Largest image file [bytes]: 128 MiB."""
@@ -44,13 +45,13 @@ class FileMaterial:
 def srgb_to_linear(value: Any) -> np.ndarray:
     """Decode sRGB in 0..1 to linear light in 0..1, any shape."""
     value = np.asarray(value, dtype=np.float64)
-    return np.where(value <= _SRGB_TOE, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return np.where(value <= _SRGB_TOE, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).round(DECIMALS)
 
 
 def linear_to_srgb(value: Any) -> np.ndarray:
     """Encode linear light, clipped to 0..1, as sRGB in 0..1, any shape."""
     value = np.clip(np.asarray(value, dtype=np.float64), 0.0, 1.0)
-    return np.where(value <= _LINEAR_TOE, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
+    return np.where(value <= _LINEAR_TOE, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055).round(DECIMALS)
 
 
 def as_color(channels: np.ndarray) -> tuple[float, float, float]:

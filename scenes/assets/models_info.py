@@ -15,6 +15,7 @@ import numpy as np
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.linear_algebra import det, dot, matmul, norm
 
 MAX_OBJ_ID = 2**31 - 1
 """Largest obj_id: data sets keep them in 32 bits."""
@@ -155,7 +156,7 @@ def check_against_mesh(info: ModelInfo, vertices: np.ndarray, diameter: float) -
 def compare_sizes(info: ModelInfo, low: np.ndarray, size: np.ndarray, diameter: float) -> tuple[ModelInfo, list[str]]:
     """The part of `check_against_mesh` that needs the mesh's bounding box (least coordinates and size, 3 each) and diameter [m] only."""
     said = []
-    diagonal = float(np.linalg.norm(size))
+    diagonal = float(norm(size))
     if info.diameter is not None and any(_near(info.diameter / _MILLIMETRE, own, _TOLERANCE) for own in (diameter, diagonal)):
         given, own = f"{info.diameter / _MILLIMETRE:.4g}", f"{diameter / _MILLIMETRE:.4g} mm"
         said.append(f"diameter {given}, where its mesh has {own}: lengths in metres; they are converted")
@@ -222,8 +223,8 @@ def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) ->
     from trimesh.transformations import rotation_matrix
 
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    extent = (vertices @ directions.T).max(axis=0)
+    directions /= norm(directions)[:, None]
+    extent = matmul(vertices, directions.T).max(axis=0)
     moves = [(f"symmetries_discrete[{index}]", [np.reshape(row, (4, 4))]) for index, row in enumerate(info.symmetries_discrete)]
     moves += [
         (f"symmetries_continuous[{index}]", [rotation_matrix(turn * 2.0 * np.pi / _TURNS, axis, offset) for turn in range(1, _TURNS)])
@@ -233,7 +234,7 @@ def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) ->
     for name, matrices in moves:
         off = 0.0
         for matrix in matrices:
-            moved = (vertices @ (directions @ matrix[:3, :3]).T).max(axis=0) + directions @ matrix[:3, 3]
+            moved = matmul(vertices, matmul(directions, matrix[:3, :3]).T).max(axis=0) + dot(directions, matrix[:3, 3])
             off = max(off, float(np.abs(moved - extent).max()))
         if off > _ASYMMETRY * diameter:
             said.append(f"{name}, which moves its surface by {off / _MILLIMETRE:.3g} mm; it is used as given, correct or remove it")
@@ -297,8 +298,8 @@ def _rigid(value: list[float], place: str) -> tuple[float, ...]:
 
 def is_rigid(matrix: np.ndarray) -> bool:
     """Whether a 4 x 4 matrix is a rotation and a translation."""
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
+    turn = matrix[:3, :3]
+    off = max(np.abs(matmul(turn, turn.T) - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(det(turn) - 1.0))
     return bool(off <= ROTATION_TOLERANCE)
 
 
@@ -310,7 +311,7 @@ def _is_identity(matrix: tuple[float, ...]) -> bool:
 def _axis(value: _Axis, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Normalize the axis of a continuous symmetry, and convert the offset to metres."""
     axis, offset = np.array(value.axis, dtype=np.float64), np.array(value.offset, dtype=np.float64) * _MILLIMETRE
-    length = float(np.linalg.norm(axis))
+    length = float(norm(axis))
     if length == 0.0:
         raise CatalogError(f"{place}.axis is zero; needed: a direction")
     axis = axis / length

@@ -10,6 +10,7 @@ from synpick_warp.scenes.assets.meshes import connected_parts, is_watertight, me
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from synpick_warp.system.linear_algebra import DECIMALS
 
 # Pieces below this fraction of the total volume are slivers that only cost contacts.
 _MIN_PIECE = 1e-4
@@ -135,5 +136,5 @@ def _buried_fraction(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) 
         la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
         volume = np.einsum("fi,fi->f", a, np.cross(b, c))
         dots = (np.einsum("fi,fi->f", x, y) * z for x, y, z in ((a, b, lc), (b, c, la), (c, a, lb)))
-        buried.append(np.arctan2(volume, la * lb * lc + sum(dots)).sum() / (2.0 * np.pi) > 0.5)
+        buried.append(round(float(np.arctan2(volume, la * lb * lc + sum(dots)).sum() / (2.0 * np.pi)), DECIMALS) > 0.5)
     return float(np.mean(buried))

@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
 from synpick_warp.scenes.types import ConvexPiece, HullSize
+from synpick_warp.system.linear_algebra import dot
 
 # Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
@@ -89,10 +90,10 @@ def mass_properties(pieces: Sequence[ConvexPiece]) -> MassProperties:
     """
     origin = np.concatenate([piece.vertices for piece in pieces]).mean(axis=0, dtype=np.float64)
     corners = np.concatenate([(piece.vertices - origin)[piece.faces] for piece in pieces])
-    volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    volumes = dot(corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
     sums = corners.sum(axis=1)
     volume = volumes.sum()
-    center = volumes @ sums / (4.0 * volume)
+    center = dot(sums.T, volumes) / (4.0 * volume)
     second = np.einsum("f,fki,fkj->ij", volumes, corners, corners) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
     covariance = second / (20.0 * volume) - np.outer(center, center)
     covariance = (covariance + covariance.T) / 2.0

@@ -7,6 +7,7 @@ planar up to rounding, between which it finds several contacts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece
+from synpick_warp.system.linear_algebra import DECIMALS, det, dot, eigh, matmul, norm
 
 # Smallest allowed `max_vertices`: a polyhedron of six facets has at most 8 vertices.
 MIN_VERTICES = 8
@@ -23,24 +25,29 @@ MIN_VERTICES = 8
 _FINE_VERTICES = 256
 # Decimation ends when no vertex adds at least this volume, relative to the full hull's: for the fine hull, and for the fallback.
 _FINE_GAIN, _COARSE_GAIN = 1e-5, 1e-4
-# Exponent of the height in `_gain`. With 1, pieces of the YCB-Video objects reach up to 4.8 mm beyond the full hulls; with 1.25 4.2 mm.
-_HEIGHT_EXPONENT = 1.25
 # Minimum `_gain` of a half-space, for a full hull of unit volume and unit radius: that of a half-space that cuts off 0.01 % of the volume
 # at a height of 1 % of the radius.
-_MIN_GAIN = 1e-4 * 0.01**_HEIGHT_EXPONENT
-# Radius of a cluster of normals [rad]: 3 degrees. The physics engine's contact manifold samples the vertices of a facet in directions
+_MIN_GAIN = 1e-4 * 0.01**1.25
+
+
+def _cosine(degrees: float) -> float:
+    """Cosine of an angle between normals, rounded as DECIMALS asks."""
+    return round(float(np.cos(np.radians(degrees))), DECIMALS)
+
+
+# Radius of a cluster of normals: 3 degrees. The physics engine's contact manifold samples the vertices of a facet in directions
 # tilted by 2 degrees from the contact normal, so that it treats facets at a smaller angle as one.
-_CLUSTER_ANGLE = np.radians(3.0)
-# Minimum angle between the normals of two facets [rad].
-_MIN_FACET_ANGLE = np.radians(4.0)
+_CLUSTER_COSINE = _cosine(3.0)
+# Minimum angle between the normals of two facets: 4 degrees.
+_FACET_COSINE = _cosine(4.0)
 # The selection starts from the six sides of an oriented box. A facet whose normal lies within this angle of a side's normal replaces the
-# side [rad]; below 35 degrees, the six half-spaces always enclose a bounded polyhedron.
-_FRAME_ANGLE = np.radians(30.0)
+# side; below 35 degrees, the six half-spaces always enclose a bounded polyhedron.
+_FRAME_COSINE = _cosine(30.0)
 # Area assigned to a principal axis in the choice of the box's second axis, relative to the largest facet's: smaller than that of any facet
 # that should be preferred.
 _PRINCIPAL_WEIGHT = 1e-3
-# The mean gap of a half-space is averaged over triangles whose normals lie within this angle of its own [rad].
-_FIT_ANGLE = np.radians(20.0)
+# The mean gap of a half-space is averaged over triangles whose normals lie within 20 degrees of its own.
+_FIT_COSINE = _cosine(20.0)
 # Extra half-spaces selected before backward elimination. Both values are tried, and the smaller polyhedron is kept: that of round discs is
 # smaller with 0, that of rounded tetrahedra with 6, since every side of the box can then be replaced.
 _SPARE = (0, 6)
@@ -55,8 +62,8 @@ _WELD = 1e-6
 _EMPTY = 1e-9
 # An intersection with a vertex farther than this from the inner point counts as unbounded [standard deviations].
 _FAR = 1e4
-# Maximum angle between the normals of coplanar triangles [rad].
-_COPLANAR_ANGLE = 1e-3
+# Minimum cosine between the normals of coplanar triangles: 1e-3 rad.
+_COPLANAR_COSINE = 1.0 - 1e-6 / 2.0
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class _Facets:
     offset: np.ndarray
     """Offset d of the supporting plane (facet)."""
     gap: np.ndarray
-    """Mean distance between the plane and the hull's triangles within _FIT_ANGLE, 0 if there are none (facet)."""
+    """Mean distance between the plane and the hull's triangles within _FIT_COSINE, 0 if there are none (facet)."""
     axes: np.ndarray
     """Principal axes of the hull's vertices in columns, each as long as their standard deviation along it (3, 3)."""
 
@@ -78,7 +85,7 @@ class _Facets:
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     """Approximate the convex hull of points by an intersection of half-spaces, of the hull's volume.
 
-    A hull of no more vertices, whose facets already differ by _MIN_FACET_ANGLE, is kept. Otherwise its triangles are clustered by their
+    A hull of no more vertices, whose facets already differ by 4 degrees, is kept. Otherwise its triangles are clustered by their
     normals, and each cluster gives a half-space. Those that cut off most are selected greedily, and moved inward, by at most the mean gap
     between each and the hull, until the polyhedron has the hull's volume. Last, the polyhedron is scaled about its centroid to exactly this
     volume, by little unless `max_vertices` is small; this also moves flat sides. Turned points give a turned result, except for the
@@ -99,7 +106,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
     # The unit of length of all that follows, "radius": half the diagonal of the bounding box.
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, radius = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, float(np.finfo(np.float32).tiny))
+    middle, radius = (low + high) / 2.0, max(float(norm(high - low)) / 2.0, float(np.finfo(np.float32).tiny))
     full = _hull_of((points - middle) / radius)
     if len(full.vertices) <= max_vertices and _has_distinct_facets(full):
         return hull_piece(points[full.vertices])
@@ -125,18 +132,18 @@ def _hull_of(points: np.ndarray) -> ConvexHull:
 
 
 def _has_distinct_facets(hull: ConvexHull) -> bool:
-    """Whether neighboring triangles of a hull are coplanar, or differ by _MIN_FACET_ANGLE."""
+    """Whether neighboring triangles of a hull are coplanar, or differ by 4 degrees."""
     normals = hull.equations[:, :3]
-    angle = np.linalg.norm(normals[:, None] - normals[hull.neighbors], axis=2)
-    return bool(((angle < _COPLANAR_ANGLE) | (angle > _MIN_FACET_ANGLE)).all())
+    cosine = dot(normals[:, None], normals[hull.neighbors])
+    return bool(((cosine > _COPLANAR_COSINE) | (cosine < _FACET_COSINE)).all())
 
 
 def _centroid(hull: ConvexHull) -> np.ndarray:
     """Centroid of a hull: mean of the tetrahedra between its triangles and an inner point, weighted by volume."""
     inner = hull.points[hull.vertices].mean(axis=0)
     corners = hull.points[hull.simplices] - inner
-    volume = np.abs(np.linalg.det(corners))
-    return inner + volume @ corners.sum(axis=1) / (4.0 * volume.sum())
+    volume = np.abs(det(corners))
+    return inner + dot(corners.sum(axis=1).T, volume) / (4.0 * volume.sum())
 
 
 def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> np.ndarray:
@@ -153,10 +160,13 @@ def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> np.nda
 
 
 def _gain(larger: ConvexHull, smaller: ConvexHull, normal: np.ndarray, offset: float) -> float:
-    """Gain of a half-space that reduces one polyhedron to another: the volume it cuts off, times a power of the height of what it cuts off,
-    so that it also removes spikes of little volume."""
-    height = float((larger.points @ normal).max() - offset)
-    return max(0.0, larger.volume - smaller.volume) * max(0.0, height) ** _HEIGHT_EXPONENT
+    """Gain of a half-space that reduces one polyhedron to another: the volume it cuts off, times the height of what it cuts off to the 5/4,
+    so that it also removes spikes of little volume.
+
+    With an exponent of 1, pieces of the YCB-Video objects reach up to 4.8 mm beyond the full hulls; with 1.25 4.2 mm.
+    """
+    height = max(0.0, float(dot(larger.points, normal).max() - offset))
+    return max(0.0, larger.volume - smaller.volume) * height * math.sqrt(math.sqrt(height))
 
 
 def _select(facets: _Facets, chosen: list[int], max_facets: int, min_gain: float) -> list[int]:
@@ -225,7 +235,7 @@ def _fit_volume(facets: _Facets, chosen: Sequence[int], polyhedron: ConvexHull, 
             except QhullError:  # moved so far that it is empty
                 moved[shift] = None
         hull = moved[shift]
-        return -float(np.cbrt(volume)) if hull is None else float(np.cbrt(hull.volume) - np.cbrt(volume))
+        return (0.0 if hull is None else _cube_root(hull.volume)) - _cube_root(volume)
 
     if excess(0.0) <= 0.0:
         shift = 0.0
@@ -235,31 +245,36 @@ def _fit_volume(facets: _Facets, chosen: Sequence[int], polyhedron: ConvexHull, 
         shift = root_scalar(excess, method="brentq", bracket=(0.0, 1.0), xtol=_FIT_TOLERANCE).root
     polyhedron = moved.get(shift) or _intersect(facets, chosen, shift)
     center = _centroid(polyhedron)
-    return center + (polyhedron.points[polyhedron.vertices] - center) * np.cbrt(volume / polyhedron.volume)
+    return center + (polyhedron.points[polyhedron.vertices] - center) * _cube_root(volume / polyhedron.volume)
+
+
+def _cube_root(value: float) -> float:
+    """Cube root, rounded as DECIMALS asks."""
+    return round(float(np.cbrt(value)), DECIMALS)
 
 
 def _cluster(hull: ConvexHull, center: np.ndarray) -> tuple[_Facets, list[int]]:
     """Cluster a hull's triangles by normals; returns the half-spaces, and the indices of six that enclose a bounded polyhedron."""
     corners, normals = hull.points[hull.simplices] - center, hull.equations[:, :3]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
-    near = normals @ normals.T > np.cos(_CLUSTER_ANGLE)
+    area = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])) / 2.0
+    near = matmul(normals, normals.T) > _CLUSTER_COSINE
     free, means = np.ones(len(normals), bool), []
     while free.any():
-        weight = np.where(free, near @ (area * free), -1.0)
+        weight = np.where(free, np.where(near, area * free, 0.0).sum(axis=1), -1.0)
         members = near[int(weight.argmax())] & free
         free &= ~members
-        mean = area[members] @ normals[members]
-        means.append((float(area[members].sum()), mean / np.linalg.norm(mean)))
+        mean = (area[members, None] * normals[members]).sum(axis=0)
+        means.append((float(area[members].sum()), mean / norm(mean)))
     # Larger clusters first: those too near to one of them are left out.
     distinct: list[tuple[float, np.ndarray]] = []
     for size, mean in sorted(means, key=lambda cluster: -cluster[0]):
-        if all(mean @ other < np.cos(_MIN_FACET_ANGLE) for _, other in distinct):
+        if all(dot(mean, other) < _FACET_COSINE for _, other in distinct):
             distinct.append((size, mean))
     axes = _principal_axes(hull.points[hull.vertices])
     normal, frame = _add_frame(np.array([size for size, _ in distinct]), np.stack([mean for _, mean in distinct]), axes)
-    offset = (normal @ (hull.points[hull.vertices] - center).T).max(axis=1)
-    cosine = normals @ normal.T
-    weight = np.where(cosine > np.cos(_FIT_ANGLE), area[:, None] * cosine, 0.0)
+    offset = matmul(normal, (hull.points[hull.vertices] - center).T).max(axis=1)
+    cosine = matmul(normals, normal.T)
+    weight = np.where(cosine > _FIT_COSINE, area[:, None] * cosine, 0.0)
     mean_offset = np.einsum("tf,fi,ti->f", weight, normal, corners.mean(axis=1)) / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
     gap = np.where(weight.sum(axis=0) > 0.0, offset - mean_offset, 0.0)
     return _Facets(normal, offset, gap, axes), frame
@@ -267,8 +282,9 @@ def _cluster(hull: ConvexHull, center: np.ndarray) -> tuple[_Facets, list[int]]:
 
 def _principal_axes(points: np.ndarray) -> np.ndarray:
     """Principal axes of points (N, 3) in columns, each as long as the standard deviation along it (3, 3)."""
-    _, deviations, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    return axes.T * deviations / np.sqrt(len(points))
+    offsets = points - points.mean(axis=0)
+    variances, axes = eigh(matmul(offsets.T, offsets) / len(points))
+    return axes[:, ::-1] * np.sqrt(variances[::-1])
 
 
 def _add_frame(area: np.ndarray, normal: np.ndarray, principal: np.ndarray) -> tuple[np.ndarray, list[int]]:
@@ -278,15 +294,15 @@ def _add_frame(area: np.ndarray, normal: np.ndarray, principal: np.ndarray) -> t
     times sine of the angle to the first; principal axes (3, 3) compete with a small area, and win where all other facets are tiny.
     """
     first = normal[int(area.argmax())]
-    vectors = np.concatenate([normal, (principal / np.linalg.norm(principal, axis=0)).T])
-    across = vectors - np.outer(vectors @ first, first)
+    vectors = np.concatenate([normal, (principal / norm(principal.T)).T])
+    across = vectors - np.outer(dot(vectors, first), first)
     weight = np.append(area, np.full(3, _PRINCIPAL_WEIGHT * area.max()))
-    second = across[int((weight * np.linalg.norm(across, axis=1)).argmax())]
-    second = second / np.linalg.norm(second)
+    second = across[int((weight * norm(across)).argmax())]
+    second = second / norm(second)
     axes = np.stack([first, second, np.cross(first, second)])
     frame, added = [], []
     for axis in np.concatenate([axes, -axes]):
-        score = area * (normal @ axis - np.cos(_FRAME_ANGLE))
+        score = area * (dot(normal, axis) - _FRAME_COSINE)
         if score.max() > 0.0:
             frame.append(int(score.argmax()))
         else:
@@ -303,8 +319,8 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
     Raises:
         QhullError: It is empty or unbounded.
     """
-    normal, offset = facets.normal[chosen] @ facets.axes, facets.offset[chosen] - shift * facets.gap[chosen]
-    length = np.linalg.norm(normal, axis=1)
+    normal, offset = matmul(facets.normal[chosen], facets.axes), facets.offset[chosen] - shift * facets.gap[chosen]
+    length = norm(normal)
     normal, offset = normal / length[:, None], offset / length
     # The centroid lies inside of the supporting planes, but not of all planes that were moved inward.
     inner = np.zeros(3) if shift == 0.0 else _chebyshev_center(normal, offset)
@@ -316,7 +332,7 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
     vertices = intersection.intersections.round(_DECIMALS) + 0.0  # without negative zeros
     vertices = vertices[np.lexsort(vertices.T[::-1])]
     vertices = vertices[np.append(True, (vertices[1:] != vertices[:-1]).any(axis=1))]
-    return ConvexHull(vertices @ facets.axes.T)
+    return ConvexHull(matmul(vertices, facets.axes.T))
 
 
 def _chebyshev_center(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -343,8 +359,8 @@ def _decimate(candidates: np.ndarray, max_vertices: int, min_gain: float) -> Con
     hull = _hull_of(candidates[chosen])
     while len(chosen) < max_vertices:
         corners = hull.points[hull.simplices]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
-        gains = np.maximum(candidates @ hull.equations[:, :3].T + hull.equations[:, 3], 0.0) @ areas / 3.0
+        areas = norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])) / 2.0
+        gains = dot(np.maximum(matmul(candidates, hull.equations[:, :3].T) + hull.equations[:, 3], 0.0), areas) / 3.0
         best = int(gains.argmax())
         if gains[best] < min_gain or best in chosen:
             break
@@ -355,11 +371,11 @@ def _decimate(candidates: np.ndarray, max_vertices: int, min_gain: float) -> Con
 
 def _spanning_points(points: np.ndarray) -> list[int]:
     """Indices of four points that span a tetrahedron: each the farthest from the mean, from the first point, the line, the plane so far."""
-    start = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
-    far = int(np.linalg.norm(points - points[start], axis=1).argmax())
+    start = int(norm(points - points.mean(axis=0)).argmax())
+    far = int(norm(points - points[start]).argmax())
     line = points[far] - points[start]
-    wide = int(np.linalg.norm(np.cross(points - points[start], line), axis=1).argmax())
-    high = int(np.abs((points - points[start]) @ np.cross(line, points[wide] - points[start])).argmax())
+    wide = int(norm(np.cross(points - points[start], line)).argmax())
+    high = int(np.abs(dot(points - points[start], np.cross(line, points[wide] - points[start]))).argmax())
     return [start, far, wide, high]
 
 
@@ -374,8 +390,8 @@ def hull_piece(points: np.ndarray) -> ConvexPiece:
     faces = hull.simplices.copy()
     corners = hull.points[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    start = int(np.linalg.norm(doubled, axis=1).argmax())
-    if doubled[start] @ hull.equations[start, :3] < 0.0:
+    start = int(norm(doubled).argmax())
+    if dot(doubled[start], hull.equations[start, :3]) < 0.0:
         faces[start] = faces[start, ::-1]
     oriented, waiting = {start}, [start]
     while waiting:

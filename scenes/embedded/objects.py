@@ -14,6 +14,7 @@ from synpick_warp.scenes.embedded import goods, parts, tools, vessels
 from synpick_warp.scenes.embedded.packs import Shape
 from synpick_warp.scenes.modelling import Patch, make_mesh, rotation
 from synpick_warp.scenes.types import Material, RawObject
+from synpick_warp.system.linear_algebra import matmul
 
 Matrix = tuple[float, ...]
 
@@ -24,10 +25,10 @@ def _rotations(*steps: tuple[str, float]) -> tuple[Matrix, ...]:
     for axis, angle in steps:
         step = rotation(axis, angle)
         for known in list(group):
-            new = step @ known
+            new = matmul(step, known)
             while not any(np.allclose(new, member) for member in group):
                 group.append(new)
-                new = step @ new
+                new = matmul(step, new)
     matrices = []
     for member in group[1:]:
         matrix = np.eye(4)

@@ -8,6 +8,7 @@ import numpy as np
 
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.system.linear_algebra import dot
 
 HEIGHT = 128
 """Rows of an embedded map; it has twice as many columns."""
@@ -42,7 +43,7 @@ def _overcast(view: np.ndarray) -> np.ndarray:
 def _low_sun(view: np.ndarray) -> np.ndarray:
     """A clear sky, blue above and pale at the horizon, and a low warm sun."""
     up = np.clip(view[..., 2:], 0, 1)
-    near = view @ _direction(35.0, 22.0)
+    near = dot(view, _direction(35.0, 22.0))
     sky = _color((0.22, 0.42, 0.90)) * up**0.5 + _color((0.95, 0.88, 0.76)) * (1 - up) ** 4 * 0.8
     glow = _color((1.0, 0.72, 0.40)) * (1.6 * np.exp((near - 1) * 18) + 0.25 * np.exp((near - 1) * 3))[..., None]
     sun = _color((1.0, 0.82, 0.58)) * (900 * np.exp((near - 1) * 2600))[..., None]
@@ -82,7 +83,7 @@ def _mixed_lamps(view: np.ndarray) -> np.ndarray:
     """A warm lamp on one side, a cold panel on the other, a greenish fluorescent tube overhead."""
     room = _room(view, (0.20, 0.19, 0.19), (0.13, 0.12, 0.11))
     for azimuth, elevation, width, color in ((200.0, 38.0, 260.0, (46.0, 27.0, 11.0)), (320.0, 30.0, 420.0, (30.0, 16.0, 6.0))):
-        room += _color(color) * np.exp((view @ _direction(azimuth, elevation) - 1) * width)[..., None]
+        room += _color(color) * np.exp((dot(view, _direction(azimuth, elevation)) - 1) * width)[..., None]
     room += _color((5.5, 7.4, 10.8)) * _panel(view, (1.25, 0.6), (0.5, 0.5), 0.08)
     return room + _color((6.6, 7.8, 6.2)) * _panel(view, (-0.2, -0.4), (0.06, 1.1), 0.04)
 

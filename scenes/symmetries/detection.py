@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
 from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, matmul, norm, rotation, solve
 
 MAX_FOLD = 36
 """Largest fold that is looked for; an axis with all folds up to it is continuous."""
@@ -22,8 +22,8 @@ _MOMENTS = 0.15
 """Relative difference between the covariances of a surface and its rotated self up to which the rotation is a candidate."""
 _MARGIN = 0.03
 """Mean distance that a candidate may have beyond the tolerance, in diameters: its axis is up to 4° off."""
-_NEIGHBOURHOOD = np.cos(np.radians(9.0))
-_PARALLEL = np.cos(np.radians(5.0))
+_NEIGHBOURHOOD = np.cos(np.radians(9.0)).round(DECIMALS)
+_PARALLEL = np.cos(np.radians(5.0)).round(DECIMALS)
 _SAME = 15.0
 """Angle up to which two rotations of a group are one [°], or 0.4 of the angle of the largest fold; in the icosahedron's, 44° is least."""
 _STEPS, _ROUGH, _FINE = 8, 600, 6_000
@@ -59,22 +59,43 @@ class Symmetries:
 def turn_matrix(axis: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray:
     """Rotation by an angle [rad] about an axis through a point, as a 4 x 4 matrix."""
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(angle * axis).as_matrix()
-    matrix[:3, 3] = point - matrix[:3, :3] @ point
+    matrix[:3, :3] = rotation(axis, angle)
+    matrix[:3, 3] = point - dot(matrix[:3, :3], point)
     return matrix
+
+
+def _axis_angle(matrix: np.ndarray) -> tuple[np.ndarray, float]:
+    """Unit axis and angle [rad], 0 to pi, of a rotation matrix (3, 3); of the identity, no axis but zeros."""
+    # Of two forms of an axis: its matrix's antisymmetric part vanishes at half turns, a column of the symmetric part at none.
+    twice = np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]])
+    cosine = (np.trace(matrix) - 1.0) / 2.0
+    if cosine > 0.0:
+        axis = twice
+    else:
+        symmetric = (matrix + matrix.T) / 2.0 - cosine * np.eye(3)
+        column = symmetric[:, int(np.argmax(np.diag(symmetric)))]
+        axis = column * (-1.0 if dot(column, twice) < 0.0 else 1.0)
+    length = norm(axis)
+    return axis / (length or 1.0), round(float(np.arctan2(norm(twice) / 2.0, cosine)), DECIMALS)
+
+
+def _least_norm(matrix: np.ndarray, right: np.ndarray, rcond: float) -> np.ndarray:
+    """Least-squares solution of least norm (n) of a linear system (n, n), without singular values below `rcond` of the largest."""
+    squares, vectors = eigh(matmul(matrix.T, matrix))
+    share = dot(vectors.T, dot(matrix.T, right))
+    return dot(vectors, np.where(squares > rcond**2 * squares[-1], share / np.maximum(squares, 1e-30), 0.0))
 
 
 def find_axes(matrices: np.ndarray) -> list[Turn]:
     """Axes of discrete symmetries (N, 4, 4), each with its largest fold, without distances; larger folds first."""
     found: list[Turn] = []
     for matrix in matrices:
-        vector = Rotation.from_matrix(matrix[:3, :3]).as_rotvec()
-        angle = float(np.linalg.norm(vector))
+        axis, angle = _axis_angle(matrix[:3, :3])
         if angle < 1e-3:
             continue
-        axis = _upward(vector / angle)
-        turn = Turn(axis, np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-6) @ matrix[:3, 3], max(round(2.0 * np.pi / angle), 2), 0.0)
-        beside = next((index for index, other in enumerate(found) if abs(other.axis @ axis) > np.cos(np.radians(2.0))), None)
+        axis = _upward(axis)
+        turn = Turn(axis, _least_norm(np.eye(3) - matrix[:3, :3], matrix[:3, 3], 1e-6), max(round(2.0 * np.pi / angle), 2), 0.0)
+        beside = next((index for index, other in enumerate(found) if abs(dot(other.axis, axis)) > np.cos(np.radians(2.0))), None)
         if beside is None:
             found.append(turn)
         elif turn.fold > found[beside].fold:
@@ -105,7 +126,7 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
     continuous = sorted((turn for turn in turns if turn.fold == 0), key=lambda turn: turn.deviation)[:1]
     if continuous:
         first = continuous[0]
-        others = [turn for turn in turns if turn.fold == 0 and abs(turn.axis @ first.axis) < _PARALLEL]
+        others = [turn for turn in turns if turn.fold == 0 and abs(dot(turn.axis, first.axis)) < _PARALLEL]
         if others:
             return Symmetries(np.zeros((0, 4, 4)), np.zeros(0), _ball(surface, tolerance) or (first,), None)
         flips = sorted((_flip(surface, first, turn) for turn in turns if turn.fold == 2), key=lambda turn: turn.deviation)
@@ -124,7 +145,7 @@ def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[li
     seen: list[tuple[np.ndarray, int]] = []
 
     def is_known(axis: np.ndarray, fold: int) -> bool:
-        return any(abs(axis @ other) > _PARALLEL and of in (0, fold) for other, of in seen)
+        return any(abs(dot(axis, other)) > _PARALLEL and of in (0, fold) for other, of in seen)
 
     for _, axis, fold in sorted(_candidates(surface, diameter, tolerance), key=lambda candidate: candidate[0]):
         if is_known(axis, fold):
@@ -157,20 +178,20 @@ def _candidates(surface: Surface, diameter: float, tolerance: float) -> list[tup
     """
     index = np.arange(_GRID) + 0.5
     height, turn = index / _GRID, np.pi * (1.0 + np.sqrt(5.0)) * index
-    grid = np.column_stack([np.sqrt(1.0 - height**2) * np.cos(turn), np.sqrt(1.0 - height**2) * np.sin(turn), height])
-    features = np.concatenate([np.linalg.eigh(surface.covariance)[1].T, np.eye(3), surface.facets])
+    grid = np.column_stack([np.sqrt(1.0 - height**2)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1).round(DECIMALS), height])
+    features = np.concatenate([eigh(surface.covariance)[1].T, np.eye(3), surface.facets])
     result = []
     polygons = [fold for fold in range(2, MAX_FOLD + 1) if fold not in _GRID_FOLDS]
     for axes, folds, margin in ((features, polygons, 0.4 * _MARGIN), (np.concatenate([features, grid]), _GRID_FOLDS, _MARGIN)):
         for fold in folds:
-            rotations = Rotation.from_rotvec(2.0 * np.pi / fold * axes).as_matrix()
-            changes = np.linalg.norm(rotations @ surface.covariance @ rotations.transpose(0, 2, 1) - surface.covariance, axis=(1, 2))
-            kept = changes <= _MOMENTS * np.linalg.norm(surface.covariance)
+            rotations = rotation(axes, 2.0 * np.pi / fold)
+            changes = matmul(matmul(rotations, surface.covariance), rotations.transpose(0, 2, 1)) - surface.covariance
+            kept = norm(changes.reshape(-1, 9)) <= _MOMENTS * norm(surface.covariance.reshape(9))
             if not kept.any():
                 continue
             near, offs = axes[kept], surface.mean_distances(rotations[kept])
             # Least of its neighbourhood: the others would be refined to the same axis.
-            beside = np.where(np.abs(near @ near.T) > _NEIGHBOURHOOD, offs[None], np.inf).min(axis=1)
+            beside = np.where(np.abs(matmul(near, near.T)) > _NEIGHBOURHOOD, offs[None], np.inf).min(axis=1)
             rows = np.flatnonzero((offs <= beside) & (offs <= tolerance + margin * diameter))
             result += [(float(offs[row]), near[row], fold) for row in rows]
     return result
@@ -183,28 +204,25 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
     points, own = surface.points[rows], surface.normals[rows]
     matrix = turn_matrix(axis, point, 2.0 * np.pi / fold)
     for _ in range(_STEPS):
-        moved = points @ matrix[:3, :3].T + matrix[:3, 3]
+        moved = matmul(points, matrix[:3, :3].T) + matrix[:3, 3]
         distance, index = surface.tree.query(moved)
         normals = surface.normals[index]
-        weight = ((own @ matrix[:3, :3].T * normals).sum(axis=1) > 0.3) / (1.0 + (distance / (2.0 * np.median(distance) + 1e-12)) ** 2)
+        weight = (dot(matmul(own, matrix[:3, :3].T), normals) > 0.3) / (1.0 + (distance / (2.0 * np.median(distance) + 1e-12)) ** 2)
         rows_of = np.concatenate([np.cross(moved - center, normals), normals], axis=1)
-        gain = rows_of.T @ (weight[:, None] * rows_of)
-        right = rows_of.T @ (weight * np.einsum("ni,ni->n", normals, surface.points[index] - moved))
-        step = np.linalg.solve(gain + 1e-6 * np.diag(np.diag(gain)) + 1e-12 * np.trace(gain) * np.eye(6), right)
-        update = np.eye(4)
-        update[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
-        update[:3, 3] = center + step[3:] - update[:3, :3] @ center
-        matrix = update @ matrix
+        gain = matmul(rows_of.T, weight[:, None] * rows_of)
+        right = dot(rows_of.T, weight * dot(normals, surface.points[index] - moved))
+        step = solve(gain + 1e-6 * np.diag(np.diag(gain)) + 1e-12 * np.trace(gain) * np.eye(6), right)
+        angle = norm(step[:3])
+        update = turn_matrix(step[:3] / (angle or 1.0), center, angle)
+        update[:3, 3] += step[3:]
+        matrix = matmul(update, matrix)
         if np.abs(step).max() < 1e-6:
             break
-    rotation = Rotation.from_matrix(matrix[:3, :3])
-    vector = rotation.as_rotvec()
-    length = np.linalg.norm(vector)
+    vector, length = _axis_angle(matrix[:3, :3])
     if length > 0.1:
-        axis = vector / length * (1.0 if vector @ axis > 0.0 else -1.0)
-    shift = matrix[:3, :3] @ center + matrix[:3, 3] - center
-    point = center + np.linalg.pinv(np.eye(3) - matrix[:3, :3], rcond=1e-3) @ (shift - axis * (axis @ shift))
-    return axis, point
+        axis = vector * (1.0 if dot(vector, axis) > 0.0 else -1.0)
+    shift = dot(matrix[:3, :3], center) + matrix[:3, 3] - center
+    return axis, center + _least_norm(np.eye(3) - matrix[:3, :3], shift - axis * dot(axis, shift), 1e-3)
 
 
 def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:
@@ -225,7 +243,7 @@ def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
     if abs(turn.axis[near]) > np.cos(np.radians(3.0)):
         options.insert(0, np.sign(turn.axis[near]) * np.eye(3)[near])
     for axis in options:
-        for point in (np.zeros(3), turn.point - axis * (axis @ turn.point)):
+        for point in (np.zeros(3), turn.point - axis * dot(axis, turn.point)):
             limit = turn.deviation + 0.05 * tolerance
             found = _turn(surface, axis, point, turn.fold, limit)
             if found.deviation <= limit:
@@ -251,9 +269,9 @@ def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
 def _flip(surface: Surface, main: Turn, turn: Turn) -> Turn:
     """Half turn about an axis that is made exactly perpendicular to a continuous one; of all of these, the one nearest to x or y."""
     beside = np.eye(3)[int(np.argmin(np.abs(main.axis)))]
-    axis = beside - main.axis * (main.axis @ beside)
-    point = main.point + main.axis * (main.axis @ (turn.point - main.point))
-    return _turn(surface, axis / np.linalg.norm(axis), point, 2)
+    axis = beside - main.axis * dot(main.axis, beside)
+    point = main.point + main.axis * dot(main.axis, turn.point - main.point)
+    return _turn(surface, axis / norm(axis), point, 2)
 
 
 def _ball(surface: Surface, tolerance: float) -> tuple[Turn, ...]:
@@ -277,21 +295,21 @@ def _close(surface: Surface, turns: list[Turn], tolerance: float) -> tuple[np.nd
         if larger is None:
             continue
         middle = _common_point([*used, turn], surface.center)
-        distances = np.array([surface.deviation(_about(rotation, middle), tolerance) for rotation in larger])
+        distances = np.array([surface.deviation(_about(each, middle), tolerance) for each in larger])
         if distances.max() <= tolerance:
             group, offs, center = larger, distances, middle
             used.append(turn)
-    matrices, offs = np.array([_about(rotation, center) for rotation in group[1:]]).reshape(-1, 4, 4), offs[1:]
+    matrices, offs = np.array([_about(each, center) for each in group[1:]]).reshape(-1, 4, 4), offs[1:]
     if len(offs):
         worst = int(np.argmax(offs))
         offs[worst] = surface.deviation(matrices[worst])
     return matrices, offs
 
 
-def _about(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
+def _about(turned: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Rotation about a point as a 4 x 4 matrix."""
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation, center - rotation @ center
+    matrix[:3, :3], matrix[:3, 3] = turned, center - dot(turned, center)
     return matrix
 
 
@@ -299,5 +317,5 @@ def _common_point(turns: list[Turn], center: np.ndarray) -> np.ndarray:
     """Point closest to all axes (least squares), and along a common direction closest to the centroid."""
     across = [np.eye(3) - np.outer(turn.axis, turn.axis) for turn in turns]
     weak = 1e-9 * np.eye(3)
-    point = np.linalg.solve(sum(across) + weak, sum(one @ turn.point for one, turn in zip(across, turns, strict=True)) + weak @ center)
+    point = solve(sum(across) + weak, sum(dot(one, turn.point) for one, turn in zip(across, turns, strict=True)) + dot(weak, center))
     return point if len(turns) > 1 else turns[0].point

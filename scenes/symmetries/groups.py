@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+
+from synpick_warp.system.linear_algebra import DECIMALS, matmul, nearest_rotation
 
 MAX_ELEMENTS = 144
 """Largest group: dihedral ones have two elements for each fold; the rotations of the icosahedron are 60."""
@@ -15,7 +16,7 @@ def find_element(elements: np.ndarray, rotation: np.ndarray, within: float = _EQ
     """Index of the element (N, 3, 3) that a rotation equals within an angle [°]; -1: none."""
     traces = np.einsum("nij,ij->n", elements, rotation)
     best = int(np.argmax(traces))
-    return best if np.sqrt(max(1.0 + traces[best], 0.0)) / 2.0 >= np.cos(np.radians(within / 2.0)) else -1
+    return best if np.sqrt(max(1.0 + traces[best], 0.0)) / 2.0 >= np.cos(np.radians(within / 2.0)).round(DECIMALS) else -1
 
 
 def close_transforms(matrices: list[np.ndarray]) -> list[np.ndarray] | None:
@@ -25,7 +26,7 @@ def close_transforms(matrices: list[np.ndarray]) -> list[np.ndarray] | None:
     at = 1
     while at < len(elements):
         for matrix in matrices:
-            product = elements[at] @ matrix
+            product = matmul(elements[at], matrix)
             if find_element(np.array(elements)[:, :3, :3], product[:3, :3]) < 0:
                 elements.append(product)
                 if len(elements) > MAX_ELEMENTS:
@@ -44,7 +45,7 @@ def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
     at = 0
     while at < len(elements):
         for generator in generators:
-            product = elements[at] @ generator
+            product = matmul(elements[at], generator)
             if find_element(elements, product, within) < 0:
                 elements = np.concatenate([elements, product[None]])
                 if len(elements) > MAX_ELEMENTS:
@@ -56,14 +57,15 @@ def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
 def make_exact(elements: np.ndarray, within: float) -> np.ndarray | None:
     """Exact group closest to rotations (N, 3, 3) that are a group up to an angle [°]; None if there is none.
 
-    Element a becomes the mean over all b of (a b) b⁻¹, which converges quadratically (Grove, Karcher and Ruh, 1974).
+    Element a becomes the mean over all b of (a b) b⁻¹ (Grove, Karcher and Ruh, 1974), which converges quadratically, and then the
+    rotation next to it.
     """
     count = len(elements)
-    table = np.array([[find_element(elements, a @ b, within) for b in elements] for a in elements])
+    table = np.array([[find_element(elements, matmul(a, b), within) for b in elements] for a in elements])
     if (table < 0).any() or any(len(set(row)) < count for row in table):
         return None
     for _ in range(8):
-        elements = Rotation.from_matrix(np.einsum("abij,bkj->aik", elements[table], elements) / count).as_matrix()
+        elements = nearest_rotation(np.einsum("abij,bkj->aik", elements[table], elements) / count)
     return elements
 
 

@@ -14,6 +14,7 @@ from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh
 from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_axes, find_symmetries, turn_matrix
 from synpick_warp.scenes.symmetries.groups import MAX_ELEMENTS, close_transforms
 from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.system.linear_algebra import dot, norm
 
 _MAX_SHOWN = 4
 """Most axes of discrete symmetries that a line names."""
@@ -70,15 +71,15 @@ def _matrix(values: Sequence[float], moved: np.ndarray, center: np.ndarray) -> n
     if len(values) != 16:
         return turn_matrix(*_axis(values, values[4:], moved, center), 2.0 * np.pi / values[3])
     matrix = np.reshape(values, (4, 4))
-    matrix[:3, 3] += moved - matrix[:3, :3] @ moved
+    matrix[:3, 3] += moved - dot(matrix[:3, :3], moved)
     return matrix
 
 
 def _axis(values: Sequence[float], offset: Sequence[float], moved: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unit axis, and a point on it in the frame of the moved mesh; without an offset, that of the centroid next to the origin."""
     axis = np.array(values[:3], np.float64)
-    axis /= np.linalg.norm(axis)
-    return axis, np.array(offset) + moved if len(offset) else center - axis * (axis @ center)
+    axis /= norm(axis)
+    return axis, np.array(offset) + moved if len(offset) else center - axis * dot(axis, center)
 
 
 def _with(info: ModelInfo, matrices: Sequence[np.ndarray] | np.ndarray, axes: Sequence[tuple[np.ndarray, np.ndarray]]) -> ModelInfo:

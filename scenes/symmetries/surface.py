@@ -7,6 +7,7 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from synpick_warp.scenes.assets.meshes import merge_positions
+from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul, norm
 
 _DENSE = 60_000
 """Number of sample points to which distances are measured."""
@@ -32,7 +33,7 @@ class Surface:
         positions, faces = merge_positions(vertices.astype(np.float64), faces)
         corners = positions[faces]
         crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        areas = np.linalg.norm(crosses, axis=1) / 2.0
+        areas = norm(crosses) / 2.0
         corners, crosses, areas = (each[areas > 0.0] for each in (corners, crosses, areas))
         random = np.random.default_rng(0)
         rows = np.searchsorted(np.cumsum(areas), (np.arange(_DENSE) + random.random(_DENSE)) * areas.sum() / _DENSE).clip(
@@ -44,10 +45,10 @@ class Surface:
         self.points = np.einsum("nc,nci->ni", self.weights, corners[rows])
         self.normals = crosses[rows] / (2.0 * areas[rows, None])
         self.area = float(areas.sum())
-        self.center = areas @ corners.mean(axis=1) / self.area
+        self.center = dot(corners.mean(axis=1).T, areas) / self.area
         """Centroid of the surface, through which each axis of symmetry passes."""
         offsets = self.points - self.center
-        self.covariance = offsets.T @ offsets / _DENSE
+        self.covariance = matmul(offsets.T, offsets) / _DENSE
         used = np.unique(faces)
         picked = [random.permutation(_DENSE)[:_QUERIES], random.permutation(used)[:_QUERIES]]
         self.queries = np.concatenate([self.points[picked[0]], positions[picked[1]]])
@@ -62,7 +63,7 @@ class Surface:
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Distances (N) of points to the surface [m]."""
         distance, index = self.tree.query(points, _NEIGHBOURS)
-        along = np.einsum("nki,nki->nk", points[:, None] - self.points[index], self.normals[index])
+        along = dot(points[:, None] - self.points[index], self.normals[index])
         aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
         return np.hypot(along, np.maximum(aside - self.gap, 0.0)).min(axis=1)
 
@@ -104,19 +105,18 @@ class Surface:
         index = self.tree.query(points, _TRIANGLES)[1]
         corners = self.corners[self.rows[index]].reshape(-1, 3, 3)
         again = np.repeat(points, _TRIANGLES, axis=0)
-        return np.linalg.norm(closest_point(corners, again) - again, axis=1).reshape(-1, _TRIANGLES).min(axis=1)
+        return norm(closest_point(corners, again) - again).round(DECIMALS).reshape(-1, _TRIANGLES).min(axis=1)
 
     def mean_distances(self, rotations: np.ndarray) -> np.ndarray:
         """Mean distances (N) of a coarse sample to another one, when rotated about the centroid by (N, 3, 3) [m]."""
-        moved = (self.coarse - self.center) @ rotations.transpose(0, 2, 1) + self.center
+        moved = matmul(self.coarse - self.center, rotations.transpose(0, 2, 1)) + self.center
         return self.thin.query(moved.reshape(-1, 3))[0].reshape(len(rotations), -1).mean(axis=1)
 
 
 def _both_ways(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3), moved by a rigid 4 x 4 matrix and by its inverse."""
     rotation, translation = matrix[:3, :3], matrix[:3, 3]
-    # Products of so few columns are slower by the threads of BLAS.
-    return np.einsum("ni,ji->nj", points, rotation) + translation, np.einsum("ni,ij->nj", points - translation, rotation)
+    return matmul(points, rotation.T) + translation, matmul(points - translation, rotation)
 
 
 def _facet_normals(crosses: np.ndarray, areas: np.ndarray, count: int = 16) -> np.ndarray:
@@ -126,6 +126,6 @@ def _facet_normals(crosses: np.ndarray, areas: np.ndarray, count: int = 16) -> n
     cells, index = np.unique(np.round(normals * 20.0), axis=0, return_inverse=True)
     total = np.zeros((len(cells), 3))
     np.add.at(total, index.reshape(-1), normals * areas[:, None])
-    length = np.linalg.norm(total, axis=1)
-    order = np.argsort(-length)[:count]
+    length = norm(total)
+    order = np.argsort(-length, kind="stable")[:count]
     return total[order][length[order] > 0.01 * areas.sum()] / length[order][length[order] > 0.01 * areas.sum()][:, None]

@@ -27,6 +27,7 @@ from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import CORNERS
+from synpick_warp.system.linear_algebra import norm
 
 # Height of what has no walls, so that whatever is beside it is outside [m].
 FAR = 1e30
@@ -155,7 +156,7 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, counts: Counts, dev
         radius=column([entry.radius for entry in entries], float),
         mass=column([entry.mass for entry in entries], float),
         area=column([_extents(entry)[1] * _extents(entry)[2] for entry in entries], float),
-        diagonal=column([float(np.linalg.norm(_extents(entry))) for entry in entries], float),
+        diagonal=column([float(norm(_extents(entry))) for entry in entries], float),
         compound=column([int(len(entry.pieces) > 1) for entry in entries], int),
         variant=wp.array(built.variant, dtype=int, device=device),
         **count_columns(counts, catalog, device),

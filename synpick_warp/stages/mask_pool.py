@@ -18,6 +18,7 @@ from synpick_warp.kernels.render.visibility.camera import BOX_MARGIN, NEAR_PLANE
 from synpick_warp.scenes.cameras import CAMERA_KEYS
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.views.masks import most_words
 
 SHARE = 32
@@ -68,7 +69,7 @@ class MaskBounds:
             cameras: Matrix and pose of each view's camera, by CAMERA_KEYS (B, ...).
         """
         matrix, rotation, translation = (cameras[key] for key in CAMERA_KEYS)
-        x, y, z = np.moveaxis(pose[..., :3] @ rotation.swapaxes(1, 2) + translation[:, None], -1, 0)
+        x, y, z = np.moveaxis(matmul(pose[..., :3], rotation.swapaxes(1, 2)) + translation[:, None], -1, 0)
         radius = self.radius[index]
         near = np.maximum(z - radius, NEAR_PLANE)
         far = np.maximum(z + radius, near)

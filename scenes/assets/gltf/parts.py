@@ -46,6 +46,7 @@ from synpick_warp.scenes.assets.gltf.document import (
     read_uri,
 )
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes, plain_color
+from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
 # Factors may exceed 0..1 by rounding.
 _FACTOR_TOLERANCE = 1e-3
@@ -108,7 +109,7 @@ class _Reader:
         placed: dict[int, np.ndarray] = {}
         while stack:
             number, parent = stack.pop()
-            placed[number] = parent @ _node_matrix(self.gltf.nodes[number])
+            placed[number] = matmul(parent, _node_matrix(self.gltf.nodes[number]))
             stack += [(child, placed[number]) for child in reversed(self.gltf.nodes[number].children)]
         return placed
 
@@ -129,7 +130,7 @@ class _Reader:
             inverse = self.values(skin.inverseBindMatrices, "inverseBindMatrices", (16,))
             if len(inverse) < len(matrices):
                 raise CatalogError(f"{self.path}: {len(inverse)} inverse bind matrices for {len(matrices)} joints; export it again")
-            matrices = matrices @ inverse[: len(matrices)].reshape(-1, 4, 4).transpose(0, 2, 1)
+            matrices = matmul(matrices, inverse[: len(matrices)].reshape(-1, 4, 4).transpose(0, 2, 1))
         if np.ptp(matrices, axis=0).max() <= _RIGID * np.abs(matrices).max():
             return _transform(part, matrices[0])
         total = weights.sum(axis=1)
@@ -266,7 +267,7 @@ class _Reader:
         if image is not None:
             diffuse = diffuse * srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
         # The quadratic equation of KHR_materials_pbrSpecularGlossiness, appendix "Best practices".
-        bright, shiny = (float(np.sqrt(np.dot(color**2, (0.299, 0.587, 0.114)))) for color in (diffuse, specular))
+        bright, shiny = (float(np.sqrt(dot(color**2, np.array((0.299, 0.587, 0.114))))) for color in (diffuse, specular))
         linear = bright * (1.0 - float(specular.max())) / (1.0 - _DIELECTRIC) + shiny - 2.0 * _DIELECTRIC
         root = np.sqrt(max(linear**2 - 4.0 * _DIELECTRIC * (_DIELECTRIC - shiny), 0.0))
         metallic = 0.0 if shiny < _DIELECTRIC else float(np.clip((root - linear) / (2.0 * _DIELECTRIC), 0.0, 1.0))
@@ -368,8 +369,8 @@ def _transform_uv(uv: np.ndarray, info: TextureInfo) -> np.ndarray:
     """Texture coordinates after KHR_texture_transform, with v turned up."""
     transform = info.extensions.transform if info.extensions else None
     if transform is not None:
-        cosine, sine = np.cos(transform.rotation), np.sin(transform.rotation)
-        uv = uv * transform.scale @ np.array([[cosine, -sine], [sine, cosine]]) + transform.offset
+        cosine, sine = np.round([np.cos(transform.rotation), np.sin(transform.rotation)], DECIMALS)
+        uv = matmul(uv * transform.scale, np.array([[cosine, -sine], [sine, cosine]])) + transform.offset
     return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
 
 
@@ -384,8 +385,8 @@ def _node_matrix(node: Node) -> np.ndarray:
 
 def _transform(part: MeshPart, transform: np.ndarray) -> MeshPart:
     """Transform a part by a 4 x 4 matrix; a reflection flips the triangles' orientation."""
-    vertices = part.vertices @ transform[:3, :3].T + transform[:3, 3]
-    determinant = np.linalg.det(transform[:3, :3])
-    normals = None if part.normals is None or determinant == 0.0 else part.normals @ np.linalg.inv(transform[:3, :3])
+    vertices = matmul(part.vertices, transform[:3, :3].T) + transform[:3, 3]
+    determinant = det(transform[:3, :3])
+    normals = None if part.normals is None or determinant == 0.0 else matmul(part.normals, cofactors(transform[:3, :3]).T / determinant)
     faces = part.faces if determinant > 0.0 else part.faces[:, ::-1]
     return replace(part, vertices=vertices, faces=faces, normals=normals)

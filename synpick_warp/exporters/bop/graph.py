@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.exporters.writing.rle import Masks, Runs
+from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.views.frames import TickBatch
 
 GRAPH_FILE = "scene_graph.json"
@@ -65,7 +66,7 @@ def find_occlusions(masks: Sequence[Masks]) -> list[tuple[int, int, int]]:
     """
     shown, begin, end = _list_runs([mask.visible for mask in masks], masks)
     hidden, start, past = _list_runs([mask.amodal for mask in masks], masks)
-    order = np.argsort(begin)
+    order = np.argsort(begin, kind="stable")
     shown, begin, end = shown[order], begin[order], end[order]
     first, last = np.searchsorted(end, start, "right"), np.searchsorted(begin, past, "left")
     counts = last - first
@@ -103,7 +104,7 @@ def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> li
         if other != WITHOUT_LABEL:
             reach[one, other] = 1.0
     for _ in range(nodes.bit_length()):
-        reach = np.minimum(reach @ reach, 1.0)
+        reach = np.minimum(matmul(reach, reach), 1.0)
     mutual = (reach * reach.T).astype(bool)
     heads = np.unique(mutual.argmax(axis=1)) if nodes else np.zeros(0, np.int64)
     # Number of components that have to be taken before each, itself included; 0: it is taken.

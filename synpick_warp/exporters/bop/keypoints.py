@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
+from synpick_warp.system.linear_algebra import matmul
 
 MILLIMETERS = 1000.0
 """Millimetres per metre."""
@@ -92,10 +93,10 @@ def _project(
     entry: dict[str, Any], matrix: np.ndarray, lens: LensMap | None, depth: np.ndarray, scale: float, positions: np.ndarray
 ) -> dict[str, Any]:
     """Project an instance's keypoints into the image: COCO's (x, y, visibility) for each; 0, 0, 0 outside of the image."""
-    points = positions @ np.reshape(entry["cam_R_m2c"], (3, 3)).T + entry["cam_t_m2c"]
+    points = matmul(positions, np.reshape(entry["cam_R_m2c"], (3, 3)).T) + entry["cam_t_m2c"]
     z = points[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = points @ matrix.T
+        pixels = matmul(points, matrix.T)
         pixels = pixels[:, :2] / pixels[:, 2:]
         if lens is not None:
             pixels = lens.project(points[:, :2] / np.where(z > 0.0, z, np.inf)[:, None])

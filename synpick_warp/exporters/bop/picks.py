@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.calibration.lens import read_lens
+from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.views.picks import COLUMNS, PickBatch, make_rows, row_type, sort_rows
 
 PICKS = "picks"
@@ -58,11 +59,11 @@ def _list_picks(rows: np.ndarray, camera: dict[str, Any], size: tuple[int, int])
     trials = np.bincount(which)
     success = np.bincount(which, rows["success"]) / trials
     rotation = np.reshape(np.array(camera["cam_R_w2c"], np.float64), (3, 3))
-    point = _MM * rows["point"][first].astype(np.float64) @ rotation.T + camera["cam_t_w2c"]
-    normal = rows["normal"][first].astype(np.float64) @ rotation.T
+    point = matmul(_MM * rows["point"][first].astype(np.float64), rotation.T) + camera["cam_t_w2c"]
+    normal = matmul(rows["normal"][first].astype(np.float64), rotation.T)
     lens, flat = read_lens(camera, size), point[:, :2] / point[:, 2:]
     matrix = np.reshape(np.array(camera["cam_K"], np.float64), (3, 3))
-    pixel = flat @ matrix[:2, :2].T + matrix[:2, 2] if lens is None else lens.project(flat)
+    pixel = matmul(flat, matrix[:2, :2].T) + matrix[:2, 2] if lens is None else lens.project(flat)
     seal, wrench = rows["seal"][first].astype(np.float64), rows["wrench"][first].astype(np.float64)
     columns = {
         "pixel": np.round(pixel, _DIGITS - 3),

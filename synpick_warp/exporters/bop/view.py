@@ -23,6 +23,7 @@ from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, find_runs, split_listed_runs, unpack_run_boundaries
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
+from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.views.bins import bin_record
 from synpick_warp.views.frames import FrameBatch
 from synpick_warp.views.layer_codec import encode_layer
@@ -318,8 +319,8 @@ def make_gt_entries(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, 
     rotation = np.reshape(camera["cam_R_w2c"], (3, 3))
     translation = np.asarray(camera["cam_t_w2c"])
     pose = truth.pose.astype(np.float64)
-    model = (rotation @ rotation_matrices(pose[:, 3:])).reshape(-1, 9)
-    position = MILLIMETERS * pose[:, :3] @ rotation.T + translation
+    model = matmul(rotation, rotation_matrices(pose[:, 3:])).reshape(-1, 9)
+    position = matmul(MILLIMETERS * pose[:, :3], rotation.T) + translation
     rows = zip(*(array.tolist() for array in (model, position, truth.object_id, truth.instance_id)), strict=True)
     return [dict(zip(("cam_R_m2c", "cam_t_m2c", "obj_id", "instance_id"), row, strict=True)) for row in rows]
 

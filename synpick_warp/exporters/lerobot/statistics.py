@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.system.linear_algebra import dot
+
 QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 """LeRobot's names and values."""
 _WHITE = 255.0
@@ -51,7 +53,7 @@ def describe_levels(levels: np.ndarray, frames: int) -> Statistics:
     """Statistics of a video's channels, from 0 to 1 and of shape (3, 1, 1), from their histograms (3, 256); quantiles are levels."""
     values = np.arange(levels.shape[1]) / _WHITE
     weights = levels / levels.sum(axis=1, keepdims=True)
-    mean = weights @ values
+    mean = dot(weights, values)
     reached = np.cumsum(levels, axis=1)
     channels = {
         "min": values[np.argmax(levels > 0, axis=1)],

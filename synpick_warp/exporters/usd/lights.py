@@ -12,6 +12,7 @@ from synpick_warp.exporters.usd.types import StageLight
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun, sun_fraction
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.system.linear_algebra import dot
 
 
 def light_file(index: int) -> str:
@@ -38,7 +39,7 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
         azimuth, polar = np.degrees(np.arctan2(y, x)), np.degrees(np.arccos(np.clip(z, -1.0, 1.0)))
         white = white + max(z, 0.0) * irradiance
         sun = (float(irradiance[0]), float(irradiance[1]), float(irradiance[2]))
-    factor = exposure * WHITE_VALUE * np.pi / max(float(white @ LUMINANCE), 1e-9)
+    factor = exposure * WHITE_VALUE * np.pi / max(float(dot(white, LUMINANCE)), 1e-9)
     angle = float(2.0 * np.degrees(np.arctan(radius_tangent)))
     return StageLight(light.name, light_file(index), float(factor), float(azimuth), float(polar), sun, angle)
 

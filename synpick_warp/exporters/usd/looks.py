@@ -16,6 +16,7 @@ from synpick_warp.exporters.usd.parts import add_property, add_surface
 from synpick_warp.exporters.usd.types import AssetSurface, drawn_texture, texture_file
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.types import Material
+from synpick_warp.system.linear_algebra import DECIMALS, dot
 
 WHITE = (1.0, 1.0, 1.0)
 _PARTS = {"Tote": LookPart.BIN, "Bin": LookPart.BIN, "Table": LookPart.TABLE, "Floor": LookPart.BACKGROUND}
@@ -57,7 +58,7 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
         texture, repeats = texture_file(drawn_texture(part, look["texture"])), 1.0 / look["texture_width"]
         color = look.get("color", WHITE)
     if texture is None:
-        color = as_color(linear_to_srgb(gain * hue_rotation(look.get("hue", 0.0)) @ srgb_to_linear(color)))
+        color = as_color(linear_to_srgb(gain * dot(hue_rotation(look.get("hue", 0.0)), srgb_to_linear(color))))
         gain = 1.0
     elif "hue" in look:
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
@@ -67,6 +68,6 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
 
 def hue_rotation(degrees: float) -> np.ndarray:
     """Rotation (3, 3) of linear colours about the grey axis, as the renderer's."""
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees)) / np.sqrt(3.0)
+    cosine, sine = np.round([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)) / np.sqrt(3.0)], DECIMALS)
     cross = np.array([[0.0, -sine, sine], [sine, 0.0, -sine], [-sine, sine, 0.0]])
     return cosine * np.eye(3) + (1.0 - cosine) / 3.0 + cross

@@ -22,6 +22,7 @@ from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.system.linear_algebra import det, eigh
 
 CLASS = "class"
 """Taxonomy of semantic class labels."""
@@ -185,9 +186,9 @@ def add_body(prim: Usd.Prim, mass: float, center: np.ndarray, inertia: np.ndarra
         kinematic: Whether its motion is prescribed.
     """
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(kinematic)
-    moments, axes = np.linalg.eigh(inertia)
+    moments, axes = eigh(inertia)
     # The eigenvectors (columns) rotate the principal axes to the prim's; eigh may return a reflection.
-    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    axes[:, 0] *= np.sign(det(axes))
     rotation = Gf.Matrix3d(*axes.T.ravel().tolist()).ExtractRotation().GetQuat()
     body = UsdPhysics.MassAPI.Apply(prim)
     body.CreateMassAttr(mass)

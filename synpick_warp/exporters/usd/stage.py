@@ -19,6 +19,7 @@ from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera
+from synpick_warp.system.linear_algebra import dot
 
 APERTURE = 0.36
 """Horizontal aperture (film width) in tenths of a metre, USD's unit for lenses: 36 mm. Only its ratio to the focal length matters."""
@@ -200,7 +201,7 @@ def _add_camera(stage: Usd.Stage, name: str, camera: Camera, shaft: np.ndarray) 
     for frame, (turn, move) in enumerate(zip(rotation, translation, strict=True)):
         pose = np.eye(4)
         pose[:3, :3] = turn.T * [1.0, -1.0, -1.0]
-        pose[:3, 3] = -turn.T @ move
+        pose[:3, 3] = -dot(turn.T, move)
         value = Gf.Matrix4d(*pose.T.ravel().tolist())  # USD multiplies row vectors.
         if frame == 0:
             place.Set(value)

@@ -15,6 +15,7 @@ from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.sun import draw_sun_disc
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.looks import draw_parameters
+from synpick_warp.system.linear_algebra import DECIMALS, dot
 
 SUN_CLEARANCE = 25.0
 """Lamps keep this angle from a set's sun [°], which takes in what is bright about it; nearer ones go to the opposite azimuth."""
@@ -51,14 +52,14 @@ def add_lamps(light: EnvironmentMap, name: str, looks: Looks, seed: int, variant
     _, drawn = draw_parameters(looks, seed, variant, [(LookPart.LAMP, index) for index in range(MAX_LAMPS)])
     directions, solid_angles = map_directions(light.radiance.shape[0])
     upward = np.maximum(directions[..., 2], 0.0) * solid_angles
-    ambient = float((light.radiance * upward[..., None]).sum(axis=(0, 1)) @ LUMINANCE)
+    ambient = float(dot((light.radiance * upward[..., None]).sum(axis=(0, 1)), LUMINANCE))
     radiance = light.radiance.astype(np.float64)
     for values in drawn[: int(np.rint(drawn[0, Look.COUNT, 0])), :, 0].astype(np.float64):
         direction = lamp_direction(values[Look.AZIMUTH], values[Look.ELEVATION])
-        if light.sun is not None and direction @ light.sun.direction > np.cos(np.radians(SUN_CLEARANCE)):
+        if light.sun is not None and dot(direction, light.sun.direction) > np.cos(np.radians(SUN_CLEARANCE)).round(DECIMALS):
             direction = direction * (-1.0, -1.0, 1.0)
         irradiance = ambient * values[Look.STRENGTH] / direction[2] * black_body_color(values[Look.TEMPERATURE])
-        tangent = float(np.tan(np.radians(values[Look.RADIUS])))
+        tangent = round(float(np.tan(np.radians(values[Look.RADIUS]))), DECIMALS)
         radiance += draw_sun_disc(np.zeros(radiance.shape[:2], bool), direction, irradiance, tangent)
     return replace(light, name=name, radiance=radiance.astype(np.float32))
 
@@ -66,7 +67,7 @@ def add_lamps(light: EnvironmentMap, name: str, looks: Looks, seed: int, variant
 def lamp_direction(azimuth: float, elevation: float) -> np.ndarray:
     """Unit direction (3) of an azimuth and an elevation [°]."""
     turn, height = np.radians(azimuth), np.radians(elevation)
-    return np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)])
+    return np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]).round(DECIMALS)
 
 
 def black_body_color(temperature: float) -> np.ndarray:
@@ -77,5 +78,5 @@ def black_body_color(temperature: float) -> np.ndarray:
     inverse = 1000.0 / temperature
     x = np.polyval(next(row for end, row in _LOCUS_X if temperature <= end), inverse)
     y = np.polyval(next(row for end, row in _LOCUS_Y if temperature <= end), x)
-    color = np.maximum(_RGB_OF_XYZ @ (x / y, 1.0, (1.0 - x - y) / y), 0.0)
-    return color / (color @ LUMINANCE)
+    color = np.maximum(dot(_RGB_OF_XYZ, np.array((x / y, 1.0, (1.0 - x - y) / y))), 0.0)
+    return color / dot(color, LUMINANCE)

@@ -18,6 +18,7 @@ from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VA
 from synpick_warp.scenes.lamps import Lamp, extract_lamps, sample_disc
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.system.linear_algebra import dot, matmul
 from synpick_warp.system.processes.threads import map_in_threads
 
 PREFILTER_ROWS = 32
@@ -88,7 +89,7 @@ def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
         alpha2 = ((level + 1.0) / int(PREFILTER_LEVELS)) ** 4
         # All columns of a row have the same lobe, rotated: one lobe per row, correlated along the columns by the Fourier transform.
         axes = directions[:, 0]
-        cosine = axes @ incoming.T
+        cosine = matmul(axes, incoming.T)
         half2 = (1.0 + cosine) / 2.0
         lobe = np.where(cosine > 0.0, cosine * alpha2 / (half2 * (alpha2 - 1.0) + 1.0) ** 2, 0.0) * solid_angles.reshape(-1)
         lobe = (lobe / lobe.sum(axis=1, keepdims=True)).reshape(rows, rows, 2 * rows)
@@ -132,7 +133,7 @@ def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None, max
     # What unoccluded surfaces face: the table hides the map below the horizon.
     unoccluded = lampless if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, lampless)
     coefficients = np.einsum("ijk,ijc->kc", sh_basis(directions) * solid_angles[..., None], unoccluded) * COSINE_LOBE[:, None]
-    white = max(float(upward_irradiance @ LUMINANCE) / np.pi, 1e-9)
+    white = max(float(dot(upward_irradiance, LUMINANCE)) / np.pi, 1e-9)
     return EnvironmentTables(
         radiance=radiance.astype(np.float32),
         lampless=lampless.astype(np.float32),
@@ -166,7 +167,7 @@ def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarr
     if table:
         # The texels next to the horizon reach below it.
         importance[height < -np.pi / rows] = 0.0
-    luminance = radiance.astype(np.float64) @ LUMINANCE
+    luminance = dot(radiance.astype(np.float64), LUMINANCE)
     # Mean of the linear interpolation over a texel: 1/8, 3/4, 1/8.
     luminance = 0.75 * luminance + 0.125 * (np.roll(luminance, 1, axis=1) + np.roll(luminance, -1, axis=1))
     padded = np.pad(luminance, ((1, 1), (0, 0)), mode="edge")

@@ -34,6 +34,7 @@ from synpick_warp.stages.render.light_tables import (
     sh_basis,
 )
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
+from synpick_warp.system.linear_algebra import dot, matmul
 from synpick_warp.system.processes.threads import map_in_threads
 
 
@@ -204,7 +205,7 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
     """Frobenius norm of the interpolated normal's gradient along each triangle (F) float32 [rad/m]."""
     edges, turns = (np.diff(values[mesh.faces].astype(np.float64), axis=1) for values in (mesh.vertices, mesh.normals))
     # A gradient G takes edges E, as columns, to the turns G E of the normal along them: |G|² is the trace of (EᵀE)⁻¹ (GE)ᵀ(GE).
-    gram, turned = (rows @ rows.transpose(0, 2, 1) for rows in (edges, turns))
+    gram, turned = (matmul(rows, rows.transpose(0, 2, 1)) for rows in (edges, turns))
     adjugate = gram[:, ::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])
     squared, area = np.einsum("fij,fij->f", adjugate, turned), np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     return (np.sqrt(np.maximum(squared, 0.0)) / np.where(area > 0.0, area, np.inf)).astype(np.float32)
@@ -315,8 +316,8 @@ def build_lights(
 
 def lamp_shares(tables: list[EnvironmentTables]) -> np.ndarray:
     """Share of each lamp in the irradiance of an open surface that faces up (map, lamp, 1), 0 where a map has fewer lamps."""
-    upward = (sh_basis(np.array([0.0, 0.0, 1.0])) @ np.stack([table.irradiance for table in tables])) @ LUMINANCE
-    lamps = lamp_table(tables, "irradiance", 3) @ LUMINANCE * lamp_table(tables, "direction", 3)[..., 2]
+    upward = dot(np.einsum("k,mkc->mc", sh_basis(np.array([0.0, 0.0, 1.0])), np.stack([table.irradiance for table in tables])), LUMINANCE)
+    lamps = dot(lamp_table(tables, "irradiance", 3), LUMINANCE) * lamp_table(tables, "direction", 3)[..., 2]
     return (lamps / np.maximum(upward + lamps.sum(axis=1), 1e-9)[:, None])[..., None]
 
 

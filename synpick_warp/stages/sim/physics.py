@@ -116,7 +116,9 @@ class Physics:
         self._graphs: dict[wp.Stream | None, list[wp.Graph]] = {}
         self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         fingers = np.arange(worlds) * built.layout.bodies_per_world
-        self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
+        self._finger_joint = wp.array(
+            np.argsort(self.model.joint_child.numpy(), kind="stable")[fingers], dtype=wp.int32, device=self.device
+        )
 
     def set_yaw(self, yaw: wp.array) -> None:
         """Set the yaw of each gripper shaft and its cup about the vertical through the wrist; x, y and z stay the world's axes.

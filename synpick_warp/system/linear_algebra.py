@@ -1,0 +1,93 @@
+"""Linear algebra with the same bits on every processor.
+
+BLAS and LAPACK, behind NumPy's `@`, `linalg` and norms of whole arrays, choose their kernels by the processor, and these round differently.
+Here sums have a fixed order: `einsum` without `optimize` calls no BLAS. NumPy's and the C library's transcendental functions differ by SIMD
+level, too; where their results decide, they are rounded first (DECIMALS).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+DECIMALS = 12
+"""Decimal places of transcendental functions that decide or are written: far from both their own errors and any tolerance here."""
+_NEWTON = 8
+"""Steps of Newton's iteration; it converges quadratically, of what is a rotation up to a tenth in four."""
+_SWEEPS = 60
+"""Most sweeps of Jacobi's method; it converges quadratically, in fewer than ten."""
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Inner product over the last axis (..., n); of a matrix (m, n) and a vector (n) the product (m)."""
+    return np.einsum("...i,...i->...", a, b)
+
+
+def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Matrix product of stacks of matrices (..., m, n) and (..., n, k)."""
+    return np.einsum("...ij,...jk->...ik", a, np.ascontiguousarray(b))
+
+
+def norm(vector: np.ndarray) -> np.ndarray:
+    """Euclidean norm over the last axis."""
+    return np.sqrt(np.einsum("...i,...i->...", vector, vector))
+
+
+def det(matrix: np.ndarray) -> np.ndarray:
+    """Determinant of 3 x 3 matrices (..., 3, 3): the triple product of their rows."""
+    return dot(matrix[..., 0, :], np.cross(matrix[..., 1, :], matrix[..., 2, :]))
+
+
+def cofactors(matrix: np.ndarray) -> np.ndarray:
+    """Cofactors of 3 x 3 matrices (..., 3, 3): transposed, the inverse times the determinant."""
+    return np.stack([np.cross(matrix[..., row - 2, :], matrix[..., row - 1, :]) for row in range(3)], axis=-2)
+
+
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """Rotations (..., 3, 3) closest to matrices near them: the polar factor, by Newton's iteration (Higham, 1986)."""
+    for _ in range(_NEWTON):
+        matrix = (matrix + cofactors(matrix) / det(matrix)[..., None, None]) / 2.0
+    return matrix
+
+
+def solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solution (n) of a linear system (n, n), by Gaussian elimination with partial pivoting."""
+    rows = np.column_stack([matrix, right])
+    for at in range(len(rows)):
+        pivot = at + int(np.abs(rows[at:, at]).argmax())
+        rows[[at, pivot]] = rows[[pivot, at]]
+        rows[at] /= rows[at, at]
+        others = np.arange(len(rows)) != at
+        rows[others] -= rows[others, at, None] * rows[at]
+    return rows[:, -1]
+
+
+def eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues in ascending order and eigenvectors in columns of a symmetric matrix, by Jacobi's method (Golub and Van Loan, 8.5)."""
+    matrix, vectors = np.array(matrix, np.float64), np.eye(len(matrix))
+    pairs = [(p, q) for p in range(len(matrix)) for q in range(p + 1, len(matrix))]
+    for _ in range(_SWEEPS):
+        # Entries that no longer change the diagonal count as zero.
+        large = [(p, q) for p, q in pairs if abs(matrix[p, q]) > np.finfo(float).eps * np.sqrt(abs(matrix[p, p] * matrix[q, q]))]
+        if not large:
+            break
+        for p, q in large:
+            if matrix[p, q] == 0.0:
+                continue
+            slope = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+            tangent = (1.0 if slope >= 0.0 else -1.0) / (abs(slope) + np.sqrt(slope * slope + 1.0))
+            cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
+            turn = np.eye(len(matrix))
+            turn[p, p] = turn[q, q] = cosine
+            turn[p, q], turn[q, p] = tangent * cosine, -tangent * cosine
+            matrix, vectors = matmul(turn.T, matmul(matrix, turn)), matmul(vectors, turn)
+            matrix[p, q] = matrix[q, p] = 0.0
+    order = np.argsort(np.diag(matrix), kind="stable")
+    return np.diag(matrix)[order], vectors[:, order]
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by an angle [rad] (Rodrigues), which is rounded so that its sine and cosine are."""
+    wave = np.round([np.cos(angle), np.sin(angle)], DECIMALS)
+    cosine, sine = wave / np.sqrt(wave[0] ** 2 + wave[1] ** 2)
+    cross = np.cross(np.eye(3), axis[..., None, :])
+    return cosine * np.eye(3) + sine * cross + (1.0 - cosine) * axis[..., :, None] * axis[..., None, :]
