@@ -102,7 +102,7 @@ def _shift_window(bright: np.ndarray, center: np.ndarray) -> np.ndarray:
     directions, solid_angles = map_directions(len(bright))
     result = bright
     for _ in range(SHIFTS):
-        inside = (dot(directions, center) > round(float(np.cos(LAMP_RADIUS)), DECIMALS)) & (directions[..., 2] > 0.0)
+        inside = (dot(directions, center) > np.cos(LAMP_RADIUS).round(DECIMALS)) & (directions[..., 2] > 0.0)
         excess = np.where(inside, bright, 0.0)
         if not excess.any():
             break

@@ -63,11 +63,8 @@ def sun_fraction(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
     directions, solid_angles = map_directions(radiance.shape[0])
     luminance = dot(radiance, LUMINANCE)
     threshold = SUN_CONTRAST * (luminance * solid_angles).sum() / (4.0 * np.pi)
-    near = (
-        (dot(directions, direction) > round(float(np.cos(SUN_SEARCH_RADIUS)), DECIMALS))
-        & (directions[..., 2] > 0.0)
-        & (luminance > threshold)
-    )
+    near = dot(directions, direction) > np.cos(SUN_SEARCH_RADIUS).round(DECIMALS)
+    near &= (directions[..., 2] > 0.0) & (luminance > threshold)
     return np.where(near, 1.0 - threshold / np.maximum(luminance, 1e-12), 0.0)
 
 

@@ -86,7 +86,7 @@ def eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by an angle [rad] (Rodrigues), which is rounded so that its sine and cosine are."""
+    """Rotation matrices (..., 3, 3) about unit axes (..., 3) by an angle [rad] (Rodrigues), whose sine and cosine are rounded."""
     wave = np.round([np.cos(angle), np.sin(angle)], DECIMALS)
     cosine, sine = wave / np.sqrt(wave[0] ** 2 + wave[1] ** 2)
     cross = np.cross(np.eye(3), axis[..., None, :])
