@@ -25,6 +25,10 @@ from synpick_warp.scenes.embedded.parts import MILLIMETER
 from synpick_warp.scenes.types import Shape
 
 
+# Decimal places of modelled pieces [m]; further ones depend on the processor.
+_DIGITS = 9
+
+
 def main() -> None:
     """Compute the collision shapes of all embedded objects, and write their file."""
     objects = load_config("synpick").objects
@@ -51,7 +55,7 @@ def modelled_shape(name: str, recipe: ShapeRecipe) -> Shape:
     pieces = PIECES[name]()
     points = np.concatenate(pieces)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return tuple(simplify_hull(MILLIMETER * (piece - middle), recipe.piece_vertices) for piece in pieces)
+    return tuple(simplify_hull((MILLIMETER * (piece - middle)).round(_DIGITS), recipe.piece_vertices) for piece in pieces)
 
 
 if __name__ == "__main__":
