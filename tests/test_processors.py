@@ -21,7 +21,7 @@ from synpick_warp.system import linear_algebra
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("scenes", "configs", "synpick_warp/stages", "synpick_warp/exporters")
 """Where files and decisions are made."""
-ESTIMATION = ROOT / "synpick_warp/stages/pose"
+OTHER_ROOMS = {ROOT / "synpick_warp/stages/pose", ROOT / "scenes/bin_meshes"}
 BLAS = {"dot", "inner", "vdot", "tensordot", "matmul", "convolve", "correlate", "cov", "corrcoef", "polyfit"}
 OTHERS = {"from_rotvec", "from_euler", "from_matrix", "as_rotvec", "as_euler"}
 """Methods of SciPy's rotations with sines, cosines or a singular value decomposition."""
@@ -65,18 +65,14 @@ def machine_dependent(path: Path) -> Iterator[str]:
         elif isinstance(called, ast.Attribute):
             given = {keyword.arg for keyword in node.keywords}
             of_numpy = isinstance(called.value, ast.Name) and called.value.id == "np"
-            whole_norm = called.attr == "norm" and "axis" not in given
-            if (
-                (of_numpy and called.attr in BLAS)
-                or called.attr in OTHERS
-                or whole_norm
-                or (called.attr == "argsort" and "kind" not in given)
-            ):
+            tied = called.attr == "argsort" and "kind" not in given
+            whole = called.attr == "norm" and "axis" not in given and ast.unparse(called.value) == "np.linalg"
+            if tied or whole or called.attr in OTHERS or (of_numpy and called.attr in BLAS):
                 yield f"{path}:{node.lineno}: {called.attr}"
 
 
 def test_what_is_written_is_computed_without_blas():
-    paths = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py")) if ESTIMATION not in path.parents]
+    paths = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py")) if not OTHER_ROOMS & {*path.parents}]
     assert [fault for path in paths for fault in machine_dependent(path)] == []
 
 

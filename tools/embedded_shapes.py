@@ -24,7 +24,6 @@ from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
 from synpick_warp.scenes.embedded.parts import MILLIMETER
 from synpick_warp.scenes.types import Shape
 
-
 # Decimal places of modelled pieces [m]; further ones depend on the processor.
 _DIGITS = 9
 
