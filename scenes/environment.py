@@ -46,5 +46,17 @@ _cached_directions = functools.cache(_compute_directions)
 
 def resize_map(radiance: np.ndarray, rows: int) -> np.ndarray:
     """Resample a map to `rows` rows and twice as many columns: by area where it shrinks, so that energy is kept; float64."""
-    method = cv2.INTER_AREA if rows <= radiance.shape[0] else cv2.INTER_LINEAR
-    return cv2.resize(radiance.astype(np.float32), (2 * rows, rows), interpolation=method).astype(np.float64)
+    if rows <= radiance.shape[0]:
+        return cv2.resize(radiance.astype(np.float32), (2 * rows, rows), interpolation=cv2.INTER_AREA).astype(np.float64)
+    return _interpolate(_interpolate(radiance.astype(np.float64), rows, 0), 2 * rows, 1)
+
+
+def _interpolate(values: np.ndarray, count: int, axis: int) -> np.ndarray:
+    """Linear interpolation along an axis, from centre to centre; OpenCV's, by Intel's IPP, depends on the processor."""
+    at = ((np.arange(count) + 0.5) * (values.shape[axis] / count) - 0.5).clip(0, values.shape[axis] - 1)
+    low = at.astype(int)
+    high, share = (
+        np.minimum(low + 1, values.shape[axis] - 1),
+        (at - low).reshape([-1 if each == axis else 1 for each in range(values.ndim)]),
+    )
+    return values.take(low, axis) * (1.0 - share) + values.take(high, axis) * share

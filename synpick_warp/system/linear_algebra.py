@@ -7,6 +7,8 @@ level, too; where their results decide, they are rounded first (DECIMALS).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 DECIMALS = 12
@@ -17,7 +19,7 @@ _SWEEPS = 60
 """Most sweeps of Jacobi's method; it converges quadratically, in fewer than ten."""
 
 
-def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def dot(a: np.ndarray, b: np.ndarray) -> Any:
     """Inner product over the last axis (..., n); of a matrix (m, n) and a vector (n) the product (m)."""
     return np.einsum("...i,...i->...", a, b)
 
@@ -27,12 +29,12 @@ def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...ij,...jk->...ik", a, np.ascontiguousarray(b))
 
 
-def norm(vector: np.ndarray) -> np.ndarray:
+def norm(vector: np.ndarray) -> Any:
     """Euclidean norm over the last axis."""
     return np.sqrt(np.einsum("...i,...i->...", vector, vector))
 
 
-def det(matrix: np.ndarray) -> np.ndarray:
+def det(matrix: np.ndarray) -> Any:
     """Determinant of 3 x 3 matrices (..., 3, 3): the triple product of their rows."""
     return dot(matrix[..., 0, :], np.cross(matrix[..., 1, :], matrix[..., 2, :]))
 
@@ -85,7 +87,7 @@ def eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.diag(matrix)[order], vectors[:, order]
 
 
-def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+def rotation(axis: np.ndarray, angle: float | np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) about unit axes (..., 3) by an angle [rad] (Rodrigues), whose sine and cosine are rounded."""
     wave = np.round([np.cos(angle), np.sin(angle)], DECIMALS)
     cosine, sine = wave / np.sqrt(wave[0] ** 2 + wave[1] ** 2)
