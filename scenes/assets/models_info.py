@@ -233,7 +233,7 @@ def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) ->
     said = []
     for name, matrices in moves:
         off = 0.0
-        for matrix in matrices:
+        for matrix in map(np.asarray, matrices):
             moved = matmul(vertices, matmul(directions, matrix[:3, :3]).T).max(axis=0) + dot(directions, matrix[:3, 3])
             off = max(off, float(np.abs(moved - extent).max()))
         if off > _ASYMMETRY * diameter:

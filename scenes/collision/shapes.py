@@ -28,7 +28,7 @@ MAX_CACHE_FILE = 2**26
 """Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""
 # Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to simplification.py or decomposition.py that gives other
 # shapes for the same input.
-_RECIPE = 3
+_RECIPE = 4
 DECOMPOSITION_MEMORY = 2**33
 """Memory limit of a decomposition [bytes]: 8 GiB; the remeshing of a scan with two million triangles takes a few."""
 HULL_LIMITS = Limits(120.0, 2**32)
