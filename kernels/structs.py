@@ -124,6 +124,8 @@ class BinData:
     """(bin): origin of the bin's frame in the world, without offset, where it stands on the table [m]."""
     shift: wp.vec2
     """Half widths of the uniform distribution of the bin's offset in x and y [m]."""
+    turn: wp.array[float]
+    """(bin): angle about z of the bin's frame in the world, without rotation [rad]."""
     yaw: float
     """Half width of the rotation about z [rad]."""
     reach: wp.array[wp.vec2]
@@ -139,7 +141,7 @@ class BinData:
     first_compartment: wp.array[int]
     """(bin + 1): index of the bin's first compartment; the last entry is their number."""
     center: wp.array[wp.vec2]
-    """(compartment): centre [m]."""
+    """(compartment): centre of the opening [m]."""
     half: wp.array[wp.vec2]
     """(compartment): half length and width of the opening [m]."""
     waypoint: wp.array2d[wp.vec3]

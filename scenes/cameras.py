@@ -86,7 +86,7 @@ def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarra
 def is_in_way(place: Sequence[float] | np.ndarray, sizes: BinSizes, gripper: Gripper, pick: Pick) -> bool:
     """Whether a position lies in the gripper's swept volume during picks from a bin, where a camera sees only the shaft."""
     top = sizes.origin[2] + max(pick.appear_height, pick.lift_height) + gripper.cup_length + gripper.finger_length
-    aside = np.abs(np.subtract(place[:2], sizes.origin[:2])) - np.divide(sizes.opening, 2.0)
+    aside = np.abs(sizes.to_frame(tuple(place))[:2]) - np.divide(sizes.opening, 2.0)
     return place[2] < top and bool((aside < gripper.finger_width / 2.0).all())
 
 

@@ -115,9 +115,9 @@ def _count_beside(one: Bin, reach: float) -> float:
     """
     planes = [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in one.pieces]
     shapes, sides = 0, 0
-    for center, mouth, *parts in zip(one.sizes.centers, one.sizes.mouths, *(one.sizes.waypoints(k, reach) for k in _SHARES), strict=True):
-        places, half = np.concatenate(parts), np.array(mouth) / 2.0
-        sides += len(places) + int((half - np.abs(places[:, :2] - center) <= reach).sum())
+    for floor, *parts in zip(one.sizes.floors, *(one.sizes.waypoints(k, reach) for k in _SHARES), strict=True):
+        places, half = np.concatenate(parts), np.array(floor[2:4]) / 2.0
+        sides += len(places) + int((half - np.abs(places[:, :2] - floor[:2]) <= reach).sum())
         shapes += sum(int(((matmul(places, each[:, :3].T) + each[:, 3]).max(axis=1) <= reach).sum()) for each in planes)
     return _FIXTURES * shapes / sides
 

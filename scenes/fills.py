@@ -55,7 +55,7 @@ def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, 
     if arrangement.drop != LAYERED:
         return float(dot(most, 2.0 * radius + arrangement.clearance))
     pitch = float(2.0 * radius[most > 0].max(initial=0.0) + arrangement.clearance)
-    cells = sum(max(1, int(length / pitch)) * max(1, int(width / pitch)) for length, width in sizes.mouths)
+    cells = sum(max(1, int(length / pitch)) * max(1, int(width / pitch)) for *_, length, width in sizes.openings)
     return pitch * math.ceil(int(most.sum()) / cells)
 
 

@@ -32,19 +32,30 @@ AXES = ("z", "-z", "y", "-y", "x", "-x")
 FLOOR, FILE = "floor", "file"
 PLACES = (FLOOR, FILE)
 """Where the frame of a bin's mesh lies."""
+MESH, BOX = "mesh", "box"
+COLLISIONS = (MESH, BOX)
+"""What a bin's mesh collides as."""
 
 
 @dataclass(frozen=True)
 class MeasuredBin:
-    """What the mesh of a bin measures in the bin's frame: origin below the middle of the opening, on the lowest inner point, z up."""
+    """What the mesh of a bin measures in the bin's frame: origin below the middle of the opening, on the lowest inner point, z up, x and y
+    along its sides."""
 
     REQUIRED: ClassVar = ("box", "opening", "height", "compartments", "checksum")
     box: tuple[float, float, float, float, float, float] = setting((0.0,) * 6, "m", "Lower and upper corner of the mesh.")
-    opening: tuple[float, float] = setting((0.0, 0.0), "m", "Length and width of the inside.", above=0.0)
+    opening: tuple[float, float] = setting((0.0, 0.0), "m", "Length and width of the inside at the rim.", above=0.0)
+    floor: tuple[float, float] | None = setting(
+        None, "m", "Length and width of the floor from wall to wall; as the opening unless it is given.", above=0.0
+    )
     height: float = setting(0.0, "m", "Height of the rim, over which the inside would spill.", above=0.0)
     origin: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "m", "Origin of the bin's frame in the world.")
+    yaw: float | None = setting(None, "°", "Angle about z of the bin's frame in the world; 0 unless it is given.")
     compartments: tuple[tuple[float, float, float, float, float, float, float], ...] = setting(
-        (), "m", "Each compartment: centre x, y, length, width; and its floor, z = a x + b y + c."
+        (), "m", "Floor of each compartment: centre x, y, length, width; and its height, z = a x + b y + c."
+    )
+    openings: tuple[tuple[float, float, float, float], ...] | None = setting(
+        None, "m", "Opening of each compartment: centre x, y, length, width; as the floors unless it is given."
     )
     checksum: str = setting("", "", "SHA-256 of the mesh and its material.")
 
@@ -67,6 +78,12 @@ class BinRow(Tote):
         "Where the mesh lies: floor (unless it is given: its lowest inner point is the world's z = 0, below the middle of its opening), or "
         "file (as modelled: the mesh's origin is the world's; bins after the first stand on the table of the first).",
         choices=PLACES,
+    )
+    collision: str | None = setting(
+        None,
+        "",
+        "What the mesh collides as: mesh (unless it is given), or box (a closed one between its floors and openings, for baskets of wire).",
+        choices=COLLISIONS,
     )
     measured: MeasuredBin | None = setting(None, "", "What the mesh measures; the program writes this table.")
 
@@ -101,7 +118,7 @@ class Bins:
 
 _SIZES = ("outer_size", "floor_size", "rim_size", "wall", "compartments", "divider_height")
 """Keys of a [[bin]] table that its mesh stands for."""
-_OF_FILE = ("unit", "up", "place", "measured")
+_OF_FILE = ("unit", "up", "place", "collision", "measured")
 """Keys that say how a mesh is read, or what it is."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,6 +12,7 @@ from synpick_warp.configs.cell.bins import NONE, OWN, PALLET, TOTE, BinRow, Bins
 Sides = tuple[float, float]
 """Length (along x) and width (along y) [m]."""
 Point = tuple[float, float, float]
+Rectangle = tuple[float, float, float, float]
 Floor = tuple[float, float, float, float, float, float, float]
 DIVIDER = 0.01
 """Thickness of dividers [m]: more than an object at physics.max_speed moves in one step."""
@@ -55,8 +57,8 @@ class BinSizes:
         """Sizes of a row of [[bin]]; one with a file must be measured."""
         if (found := row.measured) is not None:
             x, y = (2 * max(abs(found.box[axis]), abs(found.box[axis + 3])) for axis in (0, 1))
-            sides = found.opening
-            return cls(row.name, "bin", row, (x, y), sides, sides, found.height, found.box[2], weight=row.weight, measured=found)
+            floor = found.floor or found.opening
+            return cls(row.name, "bin", row, (x, y), floor, found.opening, found.height, found.box[2], weight=row.weight, measured=found)
         sizes = cls.of_tote(row, row.name, "bin")
         return replace(sizes, weight=row.weight, compartments=row.compartments, divider_height=row.divider_height)
 
@@ -71,21 +73,36 @@ class BinSizes:
         return self.measured.origin if self.measured else (0.0, 0.0, 0.0)
 
     @property
+    def turn(self) -> float:
+        """Angle about z of its frame in the world, without that which an episode draws [rad]."""
+        return math.radians(self.measured.yaw or 0.0) if self.measured else 0.0
+
+    @property
     def ground(self) -> float:
         """z of its underside in the world, if it is the first bin: that of the table."""
         return self.origin[2] + self.base
 
+    def to_world(self, point: Point) -> Point:
+        """Point of its frame in the world, without shift, if it is the first bin."""
+        cosine, sine = math.cos(self.turn), math.sin(self.turn)
+        (x, y, z), at = point, self.origin
+        return at[0] + cosine * x - sine * y, at[1] + sine * x + cosine * y, at[2] + z
+
+    def to_frame(self, point: Sequence[float]) -> Point:
+        """Point of the world in its frame; the inverse of `to_world`."""
+        cosine, sine = math.cos(self.turn), math.sin(self.turn)
+        x, y, z = (value - begin for value, begin in zip(point, self.origin, strict=True))
+        return cosine * x + sine * y, cosine * y - sine * x, z
+
     @property
     def corners(self) -> list[Point]:
         """Corners of the outer box in the world (8)."""
-        (length, width), (x, y, z) = self.outer, self.origin
-        return list(itertools.product((x - length / 2, x + length / 2), (y - width / 2, y + width / 2), (z + self.base, z + self.height)))
+        length, width = (side / 2 for side in self.outer)
+        return [self.to_world(one) for one in itertools.product((-length, length), (-width, width), (self.base, self.height))]
 
     @property
-    def centers(self) -> list[Sides]:
-        """Centre of each compartment, column by column."""
-        if self.measured:
-            return [one[:2] for one in self.measured.compartments]
+    def _centers(self) -> list[Sides]:
+        """Centre of each compartment of a box, column by column."""
         columns, rows = (
             [-side / 2 + cell / 2 + index * (cell + DIVIDER) for index in range(count)] if count > 1 else [0.0]
             for side, cell, count in zip(self.floor, self.cell, self.compartments, strict=True)
@@ -101,21 +118,21 @@ class BinSizes:
         return length, width
 
     @property
-    def mouth(self) -> Sides:
-        """Opening of a compartment, of the smallest if they differ: over its floor, where there are several."""
+    def openings(self) -> Sequence[Rectangle]:
+        """Opening of each compartment: centre x, y, length and width; over its floor, where a box has several."""
         if self.measured:
-            return min((one[2:4] for one in self.measured.compartments), key=min)
-        return self.opening if self.compartments == (1, 1) else self.cell
+            return self.measured.openings or [one[:4] for one in self.measured.compartments]
+        return [(*center, *(self.opening if self.compartments == (1, 1) else self.cell)) for center in self._centers]
 
     @property
-    def mouths(self) -> list[Sides]:
-        """Opening of each compartment."""
-        return [one[2:4] for one in self.measured.compartments] if self.measured else [self.mouth] * len(self.centers)
+    def mouth(self) -> Sides:
+        """Length and width of the smallest opening."""
+        return min((one[2:] for one in self.openings), key=min)
 
     @property
     def floors(self) -> Sequence[Floor]:
         """Inner floor of each compartment: centre x, y, length and width; and its height z = a x + b y + c."""
-        return self.measured.compartments if self.measured else [(*center, *self.cell, 0.0, 0.0, 0.0) for center in self.centers]
+        return self.measured.compartments if self.measured else [(*center, *self.cell, 0.0, 0.0, 0.0) for center in self._centers]
 
     def waypoints(self, corner: float, height: float) -> list[list[Point]]:
         """Points near the four corners of each compartment.
@@ -133,9 +150,9 @@ class BinSizes:
     @property
     def inner_corners(self) -> list[Point]:
         """Corners of the inner floor and of the rim in the world (8)."""
-        levels, at = ((self.floor, 0.0), (self.opening, self.height)), self.origin
+        levels = ((self.floor, 0.0), (self.opening, self.height))
         signs = list(itertools.product((-1, 1), repeat=2))
-        return [(at[0] + x * length / 2, at[1] + y * width / 2, at[2] + z) for (length, width), z in levels for x, y in signs]
+        return [self.to_world((x * length / 2, y * width / 2, z)) for (length, width), z in levels for x, y in signs]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 
 from synpick_warp.configs.cell.bins import BinRow
 from synpick_warp.configs.cell.cameras import Jitter, Pose
+from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import COMPLIANCE, FLOW, Gripper
 from synpick_warp.configs.check import is_table
 from synpick_warp.configs.episodes.objects import MESH
@@ -112,8 +113,12 @@ def _bin(row: BinRow) -> tuple[float, dict[str, Any], dict[str, Any]]:
     """Volume of the inside of a bin [m³], its settings, and examples of others."""
     if row.measured:
         height = row.measured.height
-        inside = sum(length * width * (height - a * x - b * y - c) for x, y, length, width, a, b, c in row.measured.compartments)
-        return inside, {name: getattr(row, name) for name in ("name", "file", "unit", "up")}, {"color": row.color}
+        inside = sum(
+            (length * width + opening[2] * opening[3]) / 2.0 * (height - a * x - b * y - c)
+            for (x, y, length, width, a, b, c), opening in zip(row.measured.compartments, BinSizes.of_row(row).openings, strict=True)
+        )
+        given = {name: value for name in ("name", "file", "unit", "up", "collision") if (value := getattr(row, name)) is not None}
+        return inside, given, {"color": row.color}
     height = row.outer_size[2] - row.wall
     inside = height * sum(side[0] * side[1] for side in (row.floor_size, row.rim_size)) / 2.0
     shape = {name: getattr(row, name) for name in ("name", "outer_size", "floor_size", "rim_size", "wall", "color")}

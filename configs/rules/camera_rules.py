@@ -374,7 +374,7 @@ def _cone(row: CameraRow) -> float:
 
 def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:
     """Whether a point lies in the walls of a bin: in its outer box, but not above the floor between the walls of the opening."""
-    x, y, z = (a - b for a, b in zip(at, sizes.origin, strict=True))
+    x, y, z = sizes.to_frame(at)
     inside = [abs(value) < size / 2 for value, size in zip((x, y), sizes.outer, strict=True)]
     share = z / sizes.height
     free = [abs(v) < (f + (r - f) * share) / 2 for v, f, r in zip((x, y), sizes.floor, sizes.opening, strict=True)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import re
 from collections import Counter
@@ -10,8 +11,8 @@ from collections.abc import Iterator, Sequence
 
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.cell.gripper import find_gripper_conflicts
-from synpick_warp.configs.dataset.modes import bake_modes, may_pick
+from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
+from synpick_warp.configs.dataset.modes import bake_modes, may_pick, possible_modes
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.configs.episodes.fills import most_objects
 from synpick_warp.configs.episodes.objects import EMBEDDED
@@ -28,6 +29,7 @@ from synpick_warp.configs.schema import (
     Config,
     DepthSensor,
     Effects,
+    Move,
     ObjectRow,
     Physics,
     Pick,
@@ -58,8 +60,9 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     if all(row.measured or not row.file for row in config.bin):
         yield from find_camera_conflicts(config)
         yield from _pick(config.pick, bins)
+        yield from _move(config.move, config.gripper, bins if "move" in possible_modes(config.bake, config.splits) else ())
     yield from _times(config.settle, config.physics)
-    mouths = [mouth for one in bins if one.shell for mouth in one.mouths]
+    mouths = [opening[2:] for one in bins if one.shell for opening in one.openings]
     yield from find_gripper_conflicts(config.gripper, config.suction, mouths)
     yield from _layers(config.render.layers)
     yield from _ranges(config.effects, config.depth_sensor)
@@ -160,6 +163,20 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
         yield "pick.floor", f"at most the floor of the {bins[0].noun}, {bins[0].origin[2]:g}: what is below it is removed [m]"
     if pick.lift_height < height:
         yield "pick.lift_height", f"at least the inner height of the {bins[0].noun}, {height:g}: attached objects must leave it [m]"
+
+
+def _move(move: Move, gripper: Gripper, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
+    """Yield a height to which the gripper does not come down, as the walls lean."""
+    radius = max((math.hypot(*place) for place in gripper.cups), default=0.0) + gripper.cup_width / 2
+    for sizes in bins:
+        for floor, opening in zip(sizes.floors, sizes.openings, strict=True) if sizes.measured else ():
+            depth = sizes.height - floor[6]
+            sides = zip(floor[2:4], opening[2:], strict=True)
+            missing = [(2 * radius - low) / (high - low) for low, high in sides if low < min(high, 2 * radius)]
+            if (least := depth * max(missing, default=0.0)) > move.height:
+                rule = f"from which on the gripper, {2 * radius:.3g} m wide, fits between the walls of bin {sizes.name}"
+                yield "move.height", f"at least {least:.3g}, {rule} [m]"
+                return
 
 
 def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:

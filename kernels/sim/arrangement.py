@@ -322,7 +322,7 @@ def sample_bins_kernel(
     """Sample the bin of starting episodes and its pose.
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.BIN): the first bin whose share exceeds u_0, offset
-    from its place s (2 u_1 - 1), s (2 u_2 - 1) for half widths s, yaw = a (2 u_3 - 1). Launched over world.
+    from its place s (2 u_1 - 1), s (2 u_2 - 1) for half widths s, yaw = ψ + a (2 u_3 - 1) for its turn ψ. Launched over world.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -335,7 +335,7 @@ def sample_bins_kernel(
     x = 2.0 * bins.shift[0] * uniform(key, 1) - bins.shift[0]
     y = 2.0 * bins.shift[1] * uniform(key, 2) - bins.shift[1]
     origin = bins.origin[chosen]
-    angle = 2.0 * bins.yaw * uniform(key, 3) - bins.yaw
+    angle = bins.turn[chosen] + (2.0 * bins.yaw * uniform(key, 3) - bins.yaw)
     bin_out[world] = chosen
     bin_pose_out[world] = wp.transform(origin + wp.vec3(x, y, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
 

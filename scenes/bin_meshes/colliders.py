@@ -7,7 +7,9 @@ polygon is extruded into the solid: floors downward, walls outward, as deep as t
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import merge_positions
+from synpick_warp.scenes.bin_meshes.compartments import Compartment, enclose
 from synpick_warp.scenes.bin_meshes.inside import Surface, subdivide
 from synpick_warp.scenes.collision.simplification import hull_piece
 from synpick_warp.scenes.tote import FLOOR_DEPTH, MIN_WALL
@@ -89,6 +92,39 @@ def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: Surface) ->
             raise CatalogError(
                 f"the faces of its inside need {len(pieces)} convex collision shapes; allowed: {MAX_PIECES}; simplify the mesh"
             )
+
+
+def make_box(surface: Surface, compartments: Sequence[Compartment], opening: np.ndarray) -> tuple[ConvexPiece, ...]:
+    """Build a closed box: floors, walls between floors and opening, whose corners at the rim are given (2, 2), and dividers."""
+    low, high = np.stack([enclose([one.span]) for one in compartments], axis=1)
+    inner = enclose([one.span for one in compartments])
+    outer = opening + np.array([[-MIN_WALL], [MIN_WALL]])
+    deep = surface.floor - FLOOR_DEPTH
+    pieces = []
+    for end, axis in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        profile = [(inner[end, axis], deep), (inner[end, axis], surface.floor), (opening[end, axis], surface.rim)]
+        pieces.append(_prism([*profile, (outer[end, axis], surface.rim), (outer[end, axis], deep)], axis, outer[:, 1 - axis]))
+    for index, (a, b, c) in enumerate(one.plane for one in compartments):
+        ends = np.where(low[index] <= inner[0], outer[0], low[index]), np.where(high[index] >= inner[1], outer[1], high[index])
+        ground = [(x, y, a * x + b * y + c) for x, y in itertools.product(*zip(*ends, strict=True))]
+        pieces.append(hull_piece(np.array([*ground, *((x, y, deep) for x, y, _ in ground)])))
+    for first, second in itertools.permutations(range(len(compartments)), 2):
+        for axis in (0, 1):
+            overlap = min(high[[first, second], 1 - axis]) - max(low[[first, second], 1 - axis])
+            between = low[:, axis] < low[second, axis]
+            if overlap <= 0.0 or high[first, axis] > low[second, axis] or (between & (low[:, axis] > high[first, axis])).any():
+                continue
+            tops, level = [enclose([compartments[k].opening]) for k in (first, second)], compartments[first].level
+            edges, across = (tops[0][1, axis], tops[1][0, axis]), enclose([compartments[k].opening for k in (first, second)])[:, 1 - axis]
+            profile = [(high[first, axis], deep), (high[first, axis], surface.floor), (edges[0], level), (edges[1], level)]
+            profile += [(low[second, axis], surface.floor), (low[second, axis], deep)]
+            pieces.append(_prism(profile, axis, across))
+    return tuple(pieces)
+
+
+def _prism(profile: Sequence[tuple[float, float]], axis: int, ends: Sequence[float] | np.ndarray) -> ConvexPiece:
+    """Convex hull of a profile (position along an axis, z) between two ends along the other axis."""
+    return hull_piece(np.array([(at, end, z) if axis == 0 else (end, at, z) for at, z in profile for end in ends]))
 
 
 def _visible_faces(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> _Faces:

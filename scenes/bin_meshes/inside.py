@@ -1,7 +1,8 @@
 """The inside of a bin's mesh: depression filling (priority-flood, Barnes et al. 2014) of its height field.
 
 The height field is what is seen from above. Poured full, the bin holds what is in its depressions: they are its inside, and the rim is
-where it would spill. Holes of the floor and of the walls do not matter, since nothing flows below the surface.
+where it would spill. Holes of the floor and of the walls do not matter, since nothing flows below the surface. Where it is floor and
+where wall: `scenes.bin_meshes.compartments`.
 """
 
 from __future__ import annotations
@@ -20,25 +21,22 @@ BORDER = 2
 """Cells around the mesh."""
 MIN_DEPTH = 0.01
 """Least depth of an inside [m]: less is a groove or a tray's edge, from which objects roll."""
-MIN_SIDE = 0.03
-"""Least length and width of a compartment [m], as of those that are given by sizes."""
-DIVIDER_SHARE = 0.25
-"""Least height of a divider above the floors that it parts, as a fraction of the inside's depth: lower ones are ribs."""
 POOL_SHARE = 0.1
 """Least volume of a depression, as a fraction of the largest: smaller ones are grooves of a flange."""
 HOLE = 0.015
 """Width of a hole that collision shapes may close [m]."""
 BATCH = 1 << 14
 """Triangles that are bisected at a time."""
-LEVELS = 48
-"""Levels at which dividers are looked for."""
+WIRES = 0.06
+"""Largest gap between the wires of a basket [m]: wider gaps are holes."""
+OPEN_SHARE = 0.5
+"""Fraction of a floor that is holes wider than WIRES, from which on the bin has none and its contents lie on the table."""
+STEEPEST_FLOOR, LEANING = np.cos(np.radians(30.0)), np.sin(np.radians(0.5))
+"""z of a unit normal at the slope from which on a surface is a wall, near the angle of friction of parts, and of an upright one."""
 LIMIT_CELLS = 128
 """Cells of the field of limits along each side."""
 BELOW_FLOOR = 0.01
 """How far an object's origin is below the floor when it has left the bin [m]."""
-
-Rectangle = tuple[float, float, float, float]
-"""Centre x, y, length and width [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +61,20 @@ class Surface:
     """Largest height of the mesh over each cell (nx, ny); where there is no mesh, that of its underside."""
     inside: np.ndarray
     """Cells of the inside (nx, ny) bool."""
+    ground: np.ndarray
+    """As `height`, with gaps between wires closed (nx, ny)."""
+    solid: np.ndarray
+    """Cells over which there is mesh (nx, ny) bool."""
+    wall: np.ndarray
+    """Cells whose highest point lies on a leaning wall (nx, ny) bool."""
+    walls: np.ndarray
+    """Triangles of walls, leaning or upright (F, 3, 3)."""
     rim: float
     """Height of the rim."""
     floor: float
-    """Height of the lowest inner point."""
+    """Height of the lowest inner point; of the underside if there is no floor."""
+    has_floor: bool
+    """Whether its contents lie on the mesh."""
 
     def index(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Cells of points (..., 2 or 3), the nearest for points beside the grid."""
@@ -147,9 +155,10 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
     shape = tuple(np.ceil((high - low)[:2] / cell).astype(int) + 1 + 2 * BORDER)
     start = (low + high)[:2] / 2.0 - np.array(shape) * cell / 2.0
     points, owner = spread_points(corners, 0.9 * cell)
-    height = np.full(shape, low[2])
+    height, solid = np.full(shape, low[2]), np.zeros(shape, bool)
     x, y = np.floor((points[:, :2] - start) / cell).astype(int).T
     np.maximum.at(height, (x, y), points[:, 2])
+    solid[x, y] = True
     level = _flood(height)
     labels, pools = ndimage.label(level > height + 1e-9)
     if pools == 0:
@@ -161,12 +170,30 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
     if not len(kept):
         return None
     inside = np.isin(labels, kept)
-    # Walls raise the cells at the edges of the floor, where a slope is lowest: points of upper sides on these count, too.
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    upper = (normal[:, 2] > 0.5 * np.linalg.norm(normal, axis=1))[owner]
-    floor = float(height[inside].min())
-    near = upper & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
-    return Surface(start, cell, height, inside, float(level[inside].max()), float(points[near, 2].min(initial=floor)))
+    steepness = normal[:, 2] / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
+    steep = np.abs(steepness) < STEEPEST_FLOOR
+    top, wall = points[:, 2] > height[x, y] - 1e-7, np.zeros(shape, bool)
+    for faces, value in ((steep & (np.abs(steepness) > LEANING), True), (~steep, False)):
+        wall[x[top & faces[owner]], y[top & faces[owner]]] = value
+    ground = _close_gaps(height, solid, inside, cell)
+    floor = float(height[inside & solid].min(initial=np.inf))
+    low_cells = inside & (ground < floor + MIN_DEPTH)
+    has_floor = (low_cells & ~solid & (ground <= low[2])).sum() <= OPEN_SHARE * low_cells.sum()
+    if not has_floor:
+        floor = float(low[2])
+    # Walls raise the cells at the edges of the floor, where a slope is lowest: points of upper sides on these count, too.
+    near = (steepness > 0.5)[owner] & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
+    floor = float(points[near, 2].min(initial=floor))
+    rim = float(level[inside].max())
+    return Surface(start, cell, height, inside, ground, solid, wall, corners[steep], rim, floor, bool(has_floor))
+
+
+def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell: float) -> np.ndarray:
+    """Height field in whose cells without mesh gaps narrower than WIRES, and than half of the inside, are closed (nx, ny)."""
+    narrowest = int(np.ptp(np.argwhere(inside), axis=0).min()) + 1
+    size = min(round(WIRES / cell), narrowest // 2) // 2 * 2 + 1
+    return np.where(solid, height, ndimage.grey_closing(height, size, mode="nearest"))
 
 
 def _flood(height: np.ndarray) -> np.ndarray:
@@ -185,65 +212,6 @@ def _flood(height: np.ndarray) -> np.ndarray:
                 level[i, j] = max(here, float(height[i, j]))
                 heapq.heappush(queue, (level[i, j], i, j))
     return level
-
-
-def find_compartments(surface: Surface) -> list[Rectangle]:
-    """Largest rectangle in each compartment of a surface, by x and y; empty: none is of MIN_SIDE.
-
-    Compartments are the components of the inside below a level, the one with most of them, or else the highest.
-    """
-    depth = surface.rim - surface.floor
-    best: list[Rectangle] = []
-    for level in np.linspace(surface.rim, surface.floor, LEVELS, endpoint=False):
-        below = surface.inside & (surface.height < level - 1e-6)
-        labels, count = ndimage.label(below)
-        if count <= len(best):
-            continue
-        deepest = ndimage.minimum(surface.height, labels, np.arange(1, count + 1))
-        deep = np.flatnonzero(level - deepest >= DIVIDER_SHARE * depth) + 1
-        found = [_largest_rectangle(surface, labels == label) for label in deep] if len(deep) > len(best) else []
-        found = [one for one in found if min(one[2:]) >= MIN_SIDE]
-        best = found if len(found) > len(best) else best
-    return sorted(best)
-
-
-def _largest_rectangle(surface: Surface, cells: np.ndarray) -> Rectangle:
-    """Largest axis-aligned rectangle within cells (nx, ny) [m]."""
-    best, found = 0, (0, 0, 0, 0)
-    used = np.flatnonzero(cells.any(axis=1))
-    for first in range(int(used[0]), int(used[-1]) + 1):
-        free = np.logical_and.accumulate(cells[first : used[-1] + 1], axis=0)
-        free = free[: int(free.any(axis=1).sum())]
-        # Length of the run of free cells that ends at each cell.
-        order = np.arange(1, free.shape[1] + 1)
-        runs = order - np.maximum.accumulate(np.where(free, 0, order), axis=1)
-        sizes = runs * np.arange(1, len(free) + 1)[:, None]
-        if sizes.size and sizes.max() > best:
-            count, end = np.unravel_index(sizes.argmax(), sizes.shape)
-            best, found = int(sizes.max()), (first, first + int(count) + 1, int(end) + 1 - int(runs[count, end]), int(end) + 1)
-    x0, x1, y0, y1 = found
-    corners = surface.low + np.array([(x0, y0), (x1, y1)]) * surface.cell
-    center, sides = corners.mean(axis=0), corners[1] - corners[0]
-    return float(center[0]), float(center[1]), float(sides[0]), float(sides[1])
-
-
-def fit_floor(surface: Surface, rectangle: Rectangle) -> tuple[float, float, float]:
-    """Plane z = a x + b y + c over the floor in a rectangle: a fit by least squares, raised so that none of it lies below the floor.
-
-    The floor is what is nearer to the lowest point than to the rim, in the inner part of the rectangle.
-    """
-    x, y, length, width = rectangle
-    cells = np.argwhere(surface.inside)
-    points, heights = surface.centers(cells), surface.height[tuple(cells.T)]
-    near = (np.abs(points - (x, y)) <= 0.4 * np.array((length, width))).all(axis=1)
-    points, heights = points[near], heights[near]
-    low = heights <= (heights.min() + surface.rim) / 2.0
-    points, heights = points[low], heights[low]
-    terms = np.column_stack([points, np.ones(len(points))])
-    plane = np.linalg.lstsq(terms, heights, rcond=None)[0]
-    # Single cells on ribs or at walls do not count.
-    above = float(np.quantile(heights - terms @ plane, 0.95))
-    return float(plane[0]), float(plane[1]), float(plane[2] + max(above, 0.0))
 
 
 def make_limits(surface: Surface, origin: np.ndarray) -> HeightField:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,24 +11,26 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.cell.bins import AXES, FILE, BinRow, MeasuredBin
+from synpick_warp.configs.cell.bins import AXES, BOX, FILE, BinRow, MeasuredBin
 from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError, ConfigError, SynpickError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL
 from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh
-from synpick_warp.scenes.bin_meshes.colliders import make_colliders
-from synpick_warp.scenes.bin_meshes.inside import (
-    MIN_DEPTH,
+from synpick_warp.scenes.bin_meshes.colliders import make_box, make_colliders
+from synpick_warp.scenes.bin_meshes.compartments import (
     MIN_SIDE,
-    HeightField,
-    Surface,
+    Compartment,
+    Rectangle,
+    enclose,
     find_compartments,
-    find_inside,
-    fit_floor,
-    make_limits,
+    find_holes,
+    find_opening,
+    find_turn,
+    turned,
 )
+from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, HeightField, Surface, find_inside, make_limits
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -41,6 +44,8 @@ COARSE = 64
 """Cells of the height field where only its direction is in question."""
 DIGITS = 6
 """Decimals of measured lengths [m]."""
+MAX_LISTED = 6
+"""Most compartments whose floors a line names."""
 RAY_STEP = 5e-3
 """Distance of the rays by which collision shapes are compared with the mesh [m]."""
 AGREEMENT, MAX_DIFFERENT = 3e-3, 0.01
@@ -105,37 +110,59 @@ def _model(row: BinRow) -> BinModel:
     if len(mesh.faces) > MAX_FACES:
         raise CatalogError(f"{path} has {len(mesh.faces):,} triangles; allowed: {MAX_FACES:,}; decimate the mesh")
     _check_sides(mesh, path, unit)
-    mesh = _turn(mesh, up)
+    mesh = _rotate(mesh, lambda vectors: vectors @ _rotation(up).astype(np.float32).T)
+    yaw = find_turn(mesh.vertices[mesh.faces].astype(np.float64))
+    mesh = _rotate(mesh, lambda vectors: turned(vectors.astype(np.float64), -yaw).astype(np.float32)) if yaw else mesh
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     surface = find_inside(corners)
     places = find_compartments(surface) if surface else []
     if surface is None or not places:
         raise CatalogError(f"{path} has no inside {_explain(corners, up)}")
-    cells = np.argwhere(surface.inside)
-    low, high = (surface.low + end * surface.cell for end in (cells.min(axis=0), cells.max(axis=0) + 1))
+    low, high = find_opening(surface, places)
     origin = np.array([*((low + high) / 2.0), surface.floor])
-    pieces = make_colliders(mesh.vertices, mesh.faces, surface)
+    holes, leans = find_holes(surface), any(one.leans for one in places)
+    pieces = _make_pieces(row, mesh, corners, surface, places, holes)
+    measured = MeasuredBin(
+        box=_rounded(np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]) - np.tile(origin, 2)),
+        opening=_rounded(high - low),
+        height=round(surface.rim - float(origin[2]), DIGITS),
+        origin=_rounded(turned(origin[None], yaw)[0]) if row.place == FILE else (0.0, 0.0, 0.0),
+        yaw=yaw or None,
+        compartments=tuple(_rounded((*_shifted(one.floor, origin), *_moved(one.plane, origin))) for one in places),
+        openings=tuple(_rounded(_shifted(one.opening, origin)) for one in places) if leans else None,
+        floor=_rounded(np.ptp(enclose([one.span for one in places]), axis=0)) if leans else None,
+        checksum="",
+    )
+    mesh = replace(mesh, vertices=(mesh.vertices - origin).astype(np.float32))
+    measured = replace(measured, checksum=_checksum(mesh, material))
+    pieces = tuple(ConvexPiece((piece.vertices - origin).astype(np.float32), piece.faces) for piece in pieces)
+    lines += [_describe(measured, places, unit, len(pieces)), *_describe_holes(surface, holes, row)]
+    limits = make_limits(surface, origin)
+    return BinModel(mesh, material, pieces, limits, measured, tuple(f"bin {row.name}: {line}" for line in lines))
+
+
+def _make_pieces(
+    row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: Surface, places: list[Compartment], holes: np.ndarray
+) -> tuple[ConvexPiece, ...]:
+    """Collision shapes of a bin: those of its mesh, which must agree with it, or a closed box.
+
+    Raises:
+        CatalogError: The mesh needs too many, or they differ from it.
+    """
+    if row.collision == BOX:
+        return make_box(surface, places, find_opening(surface, places))
+    advice = f', or set collision = "{BOX}", which closes its holes' if len(holes) else ""
+    try:
+        pieces = make_colliders(mesh.vertices, mesh.faces, surface)
+    except CatalogError as error:
+        raise CatalogError(f"{row.file}: {error}{advice}") from error
     share = _disagreement(corners, pieces, surface)
     if share > MAX_DIFFERENT:
         raise CatalogError(
-            f"{path}: collision shapes and mesh differ by more than {1e3 * AGREEMENT:g} mm over {share:.0%} of the opening; "
-            "close the gaps of the mesh, or simplify it"
+            f"{row.file}: collision shapes and mesh differ by more than {1e3 * AGREEMENT:g} mm over {share:.0%} of the opening; "
+            f"close the gaps of the mesh, or simplify it{advice}"
         )
-    floors = [(*(np.array(one[:2]) - origin[:2]), *one[2:], *_moved(fit_floor(surface, one), origin)) for one in places]
-    box = np.concatenate([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))]) - np.tile(origin, 2)
-    mesh = replace(mesh, vertices=(mesh.vertices - origin).astype(np.float32))
-    measured = MeasuredBin(
-        box=_rounded(box),
-        opening=_rounded(high - low),
-        height=round(surface.rim - float(origin[2]), DIGITS),
-        origin=_rounded(origin) if row.place == FILE else (0.0, 0.0, 0.0),
-        compartments=tuple(_rounded(one) for one in floors),
-        checksum=_checksum(mesh, material),
-    )
-    pieces = tuple(ConvexPiece((piece.vertices - origin).astype(np.float32), piece.faces) for piece in pieces)
-    lines.append(_describe(measured, unit, len(pieces)))
-    limits = make_limits(surface, origin)
-    return BinModel(mesh, material, pieces, limits, measured, tuple(f"bin {row.name}: {line}" for line in lines))
+    return pieces
 
 
 def _check_sides(mesh: TriangleMesh, path: Path, unit: str) -> None:
@@ -149,10 +176,9 @@ def _check_sides(mesh: TriangleMesh, path: Path, unit: str) -> None:
     raise CatalogError(f"{path} is {shown} m, unit {unit}; allowed: a longest side of {SIDES[0]:g} to {SIDES[1]:g} m{advice}")
 
 
-def _turn(mesh: TriangleMesh, up: str) -> TriangleMesh:
-    """Mesh whose axis `up` becomes z."""
-    turn = _rotation(up).astype(np.float32)
-    return replace(mesh, vertices=mesh.vertices @ turn.T, normals=mesh.normals @ turn.T)
+def _rotate(mesh: TriangleMesh, rotate: Callable[[np.ndarray], np.ndarray]) -> TriangleMesh:
+    """Mesh whose vertices and normals are rotated."""
+    return replace(mesh, vertices=rotate(mesh.vertices), normals=rotate(mesh.normals))
 
 
 def _rotation(up: str) -> np.ndarray:
@@ -179,6 +205,12 @@ def _explain(corners: np.ndarray, up: str) -> str:
     return f'{rule}; did you mean up = "{best}"?' if best else f"{rule}; a bin needs an open top"
 
 
+def _shifted(rectangle: Rectangle, origin: np.ndarray) -> tuple[float, ...]:
+    """Rectangle in the frame at `origin`."""
+    x, y, *sides = rectangle
+    return x - origin[0], y - origin[1], *sides
+
+
 def _moved(plane: tuple[float, float, float], origin: np.ndarray) -> tuple[float, float, float]:
     """Plane z = a x + b y + c in the frame at `origin`."""
     a, b, c = plane
@@ -198,14 +230,31 @@ def _checksum(mesh: TriangleMesh, material: FileMaterial) -> str:
     return state.hexdigest()
 
 
-def _describe(measured: MeasuredBin, unit: str, pieces: int) -> str:
+def _describe(measured: MeasuredBin, places: list[Compartment], unit: str, pieces: int) -> str:
     """Line on what was measured."""
-    box = np.array(measured.box)
-    outer = " x ".join(f"{1e3 * side:.4g}" for side in box[3:] - box[:3])
-    inner = " x ".join(f"{1e3 * side:.4g}" for side in (*measured.opening, measured.height))
-    count = len(measured.compartments)
-    rooms = f"{count} compartments, " if count > 1 else ""
-    return f"{outer} mm, unit {unit}; inside {inner} mm, {rooms}{pieces} collision shapes"
+    box, count = np.array(measured.box), len(places)
+    rooms = "floor " if count == 1 else f"{count} compartments with floors of "
+    rooms += ", ".join(_millimetres(one.span[2:]) for one in places[:MAX_LISTED]) + (" and more" if count > MAX_LISTED else "")
+    turn = f", turned by {measured.yaw:.4g}°" if measured.yaw else ""
+    inner = f"{rooms} mm, opening {_millimetres(measured.opening)} mm, depth {_millimetres((measured.height,))} mm"
+    return f"{_millimetres(box[3:] - box[:3])} mm, unit {unit}{turn}; {inner}, {pieces} collision shapes"
+
+
+def _describe_holes(surface: Surface, holes: np.ndarray, row: BinRow) -> list[str]:
+    """Line on a missing floor, or on holes that parts fall through, if there are any."""
+    if row.collision == BOX:
+        return ["it collides as a closed box; nothing falls through its holes"] if len(holes) else []
+    if not surface.has_floor:
+        return ["it has no floor: parts will lie on the table"]
+    if not len(holes):
+        return []
+    largest, count = _millimetres(np.round(max(holes.tolist(), key=min), 3)), "a hole" if len(holes) == 1 else f"{len(holes)} holes"
+    return [f'it has {count} of up to {largest} mm: parts that fall through will lie on the table, unless collision = "{BOX}"']
+
+
+def _millimetres(sides: Iterable[float]) -> str:
+    """Lengths [m] as text, such as "412 x 262" for millimetres."""
+    return " x ".join(f"{1e3 * side:.4g}" for side in sides)
 
 
 def _disagreement(corners: np.ndarray, pieces: tuple[ConvexPiece, ...], surface: Surface) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -132,8 +133,8 @@ def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np
     """Bounding box of the points that an action may name, over all bins and their poses: lower and upper corner (3) float32 [m], world."""
     sides = []
     for one in sizes:
-        half = np.array(one.opening) / 2
-        reach = np.full(2, np.hypot(*half)) if bins.yaw > 0 else half
+        half, cosine, sine = np.array(one.opening) / 2, abs(math.cos(one.turn)), abs(math.sin(one.turn))
+        reach = np.full(2, np.hypot(*half)) if bins.yaw > 0 else cosine * half + sine * half[::-1]
         sides.append(np.abs(one.origin[:2]) + reach + np.abs(bins.shift))
     across = np.max(sides, axis=0)
     ground = min(one.origin[2] for one in sizes)

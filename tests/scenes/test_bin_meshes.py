@@ -20,7 +20,7 @@ from synpick_warp.scenes.bin_meshes.inside import LIMIT_CELLS
 from synpick_warp.scenes.bin_meshes.reading import measure_bins, read_bin
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.collision.simplification import hull_piece
-from tests.worlds.bin_meshes import block, bowl, low_front, round_bin, sheet_bin, sloped_bin, stepped_bin, tote, wall_of_floor
+from tests.worlds.bin_meshes import block, bowl, heights, low_front, round_bin, sheet_bin, sloped_bin, stepped_bin, tote, wall_of_floor
 
 TURN = trimesh.transformations.rotation_matrix
 UPRIGHT = {"z": ((1, 0, 0), 0), "-z": ((1, 0, 0), np.pi), "y": ((1, 0, 0), -np.pi / 2), "x": ((0, 1, 0), np.pi / 2)}
@@ -81,21 +81,6 @@ def test_shapes_fill_the_solid_behind_the_inside_and_nothing_of_it(tmp_path, mes
         assert filled(found.pieces, np.column_stack([points, top - depth])).mean() > 0.995
     for rise in (2e-3, 0.02, 0.05):
         assert filled(found.pieces, np.column_stack([points, top + rise])).mean() < 0.005
-
-
-def heights(mesh, points: np.ndarray) -> np.ndarray:
-    """Largest height of a mesh over points (N, 2), by barycentric coordinates of all triangles."""
-    corners = mesh.vertices[mesh.faces].astype(float)
-    a, b, c = corners[:, 0, :2], corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]
-    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
-    corners, a, b, c, area = (each[np.abs(area) > 1e-10] for each in (corners, a, b, c, area))
-    result = np.full(len(points), -1.0)
-    for part in np.array_split(np.arange(len(points)), 40):
-        d = points[part][:, None] - a
-        u, v = (d[..., 0] * c[:, 1] - d[..., 1] * c[:, 0]) / area, (d[..., 1] * b[:, 0] - d[..., 0] * b[:, 1]) / area
-        z = corners[:, 0, 2] + u * (corners[:, 1, 2] - corners[:, 0, 2]) + v * (corners[:, 2, 2] - corners[:, 0, 2])
-        result[part] = np.where((u >= 0) & (v >= 0) & (u + v <= 1), z, -1.0).max(axis=1)
-    return result
 
 
 def test_dividers_and_walls_hold_what_touches_them(tmp_path):
@@ -194,7 +179,7 @@ def test_a_measured_bin_is_written_read_and_told_apart_by_its_content(tmp_path):
     config = measured(read(tmp_path))
     assert measure_bins(config.bin) == {}
     (sizes,) = config.cell.bins
-    assert (sizes.height, sizes.ground, len(sizes.centers)) == (pytest.approx(0.2, abs=1e-4), pytest.approx(-0.004, abs=1e-4), 2)
+    assert (sizes.height, sizes.ground, len(sizes.floors)) == (pytest.approx(0.2, abs=1e-4), pytest.approx(-0.004, abs=1e-4), 2)
     (tmp_path / "own.toml").write_text(config_to_toml(config))
     (tmp_path / "bins" / "kanban.stl").rename(tmp_path / "moved.stl")
     again = load_config(str(tmp_path / "own.toml"))

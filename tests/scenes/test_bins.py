@@ -72,7 +72,7 @@ def test_compartments_are_equal_and_dividers_fill_what_is_between_them(tmp_path)
     assert all(convex(piece) for piece in kanban.pieces)
     sizes, dividers = kanban.sizes, kanban.pieces[len(flat.pieces) :]
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (5000, 2)) * sizes.floor
-    apart = np.abs(points[:, None] - np.array(sizes.centers)) - np.array(sizes.cell) / 2
+    apart = np.abs(points[:, None] - np.array(sizes.openings)[:, :2]) - np.array(sizes.cell) / 2
     free = (apart < -1e-4).all(axis=2).any(axis=1)
     between = (apart > 1e-4).any(axis=2).all(axis=1)
     filled = np.any([inside(piece, np.column_stack([points, np.full(len(points), 0.05)])) for piece in dividers], axis=0)

@@ -360,21 +360,21 @@ def test_in_layers_objects_fall_from_cells_of_their_compartments(seed, compartme
     arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     count, pitch = int(most.sum()), np.float32(2 * radius.max()) + np.float32(0.004)
-    halves = np.array(sizes.mouths) / 2
+    centers, halves = np.hsplit(np.array(sizes.openings) * (1, 1, 0.5, 0.5), 2)
     for world in range(4):
         entries, slots = (array.numpy()[world, :count] for array in (worlds.state.catalog_index, worlds.state.body_slot))
         place, each = worlds.coordinates()[world, slots, :3].astype(np.float64), radius[entries]
         episode = seed % 1000 + world
         places = rng.stream_key(SEED, episode, 0, Stream.COMPARTMENT)
         chosen = rng.uniform_index(places, np.arange(count), len(halves))
-        layer, middle, cell = arrangement.layer_places(chosen, pitch, np.array(sizes.centers), halves)
+        layer, middle, cell = arrangement.layer_places(chosen, pitch, centers, halves)
         key, index = rng.stream_key(SEED, episode, 0, Stream.DROP), np.arange(count)
         sides = np.stack([2 * rng.uniform(key, 5 * index + axis) - 1 for axis in (0, 1)], axis=1)
         across = middle + sides * spread * np.maximum(0.0, cell - each[:, None])
         np.testing.assert_allclose(place, np.column_stack([across, sizes.height + each + layer * pitch]), atol=2e-6)
         gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - each[:, None] - each[None]
         assert gaps[~np.eye(count, dtype=bool)].min() > -1e-6
-        assert (np.abs(place[:, :2] - np.array(sizes.centers)[chosen]) <= halves[chosen] - each[:, None] + 1e-6).all()
+        assert (np.abs(place[:, :2] - centers[chosen]) <= halves[chosen] - each[:, None] + 1e-6).all()
         assert place[:, 2].max() < sizes.height + each.max() + pitch * (count - 1) / 2
 
 

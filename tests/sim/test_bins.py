@@ -149,7 +149,7 @@ def test_objects_fall_over_their_compartments_and_rounds_take_them_in_turn(devic
     worlds = started(device, bins=(sizes,))
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     place = worlds.coordinates()[:, :, :2]
-    apart = np.abs(place[:, :, None] - np.array(sizes.centers)) - (np.array(sizes.cell) / 2 - 0.05)
+    apart = np.abs(place[:, :, None] - np.array(sizes.openings)[:, :2]) - (np.array(sizes.cell) / 2 - 0.05)
     there = (apart < 1e-6).all(axis=3)
     assert (there.sum(axis=2) == 1).all()
     key = np.array([rng.stream_key(SEED, world, world % 3, Stream.COMPARTMENT) for world in range(WORLDS)])

@@ -20,7 +20,7 @@ from synpick_warp.cli.commands.pictures import draw_cell
 from synpick_warp.cli.folders import check_output_file
 from synpick_warp.cli.options import parse_resolution
 from synpick_warp.configs.calibration.files import MAX_SIDE, MODELS, read_calibration
-from synpick_warp.configs.cell.bins import AXES, BinRow
+from synpick_warp.configs.cell.bins import AXES, BOX, COLLISIONS, BinRow
 from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import lens_map
@@ -74,6 +74,10 @@ DensityOption = Annotated[
     ),
 ]
 MassOption = Annotated[float | None, Parameter(help="Mass of each part [kg], in place of --density (object_rows.mass).")]
+BinCollisionOption = Annotated[
+    str | None,
+    Parameter(help=f"What the bin's mesh collides as: mesh, or {BOX} for a basket of wire: a closed box (default: mesh; bin.collision)."),
+]
 
 
 def new_cell(
@@ -91,6 +95,7 @@ def new_cell(
     bin_: BinOption = "0.6x0.4x0.2",
     bin_unit: BinUnitOption = None,
     bin_up: BinUpOption = None,
+    bin_collision: BinCollisionOption = None,
     part: Annotated[
         list[Path] | None,
         Parameter(
@@ -117,7 +122,7 @@ def new_cell(
     _check_folder(folder, place)
     _check_parts(parts := part or [], {"--unit": unit, "--density": density, "--mass": mass})
     weights = _parse_density(density), _check_mass(mass, density)
-    shape = _read_bin(bin_, bin_unit, bin_up)
+    shape = _read_bin(bin_, bin_unit, bin_up, bin_collision)
     from synpick_warp.apps.viz.cell.poses import pose_for
     from synpick_warp.cli.display import make_console, make_progress
 
@@ -126,15 +131,14 @@ def new_cell(
         for file in copied:
             _copy(file, stage / PARTS)
         models = os.path.realpath(parts[0]) if parts and not copied else PARTS if parts else ""
-        rows = _read_cameras(calibration or [], resolution, lens or "", stage)
-        sizes, shape = BinSizes.of_row(shape), _copy_bin(shape, stage)
+        rows, sizes = _read_cameras(calibration or [], resolution, lens or "", stage), BinSizes.of_row(shape)
         cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, min(max(_LEAST, round(_PERCEPTION * height / width)), MAX_SIDE))
-        cell = NewCell(cameras, shape, models, unit or AUTO_UNIT, *weights, perception=perception)
+        cell = NewCell(cameras, _copy_bin(shape, stage), models, unit or AUTO_UNIT, *weights, perception=perception)
         _fill(cell, folder, stage, progress, calibration or [], f"{place.name}/{CELL}")
-    print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}")
-    print(f"bake it: synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA")
+    bake = f"synpick-warp bake --config {shlex.quote(escape(str(folder / CELL)))} --out DATA"
+    print(f"cell: {escape(str(folder / CELL))}, picture: {escape(str(folder / PICTURE))}\nbake it: {bake}")
     return 0
 
 
@@ -238,7 +242,7 @@ def _copy(file: Path, folder: Path) -> None:
     (folder / file.name).write_bytes(_content(file))
 
 
-def _read_bin(text: str, unit: str | None, up: str | None) -> BinRow:
+def _read_bin(text: str, unit: str | None, up: str | None, collision: str | None) -> BinRow:
     """Bin of a size, or of a mesh file, which is measured.
 
     Raises:
@@ -248,19 +252,20 @@ def _read_bin(text: str, unit: str | None, up: str | None) -> BinRow:
     from synpick_warp.scenes.bin_meshes.reading import read_bin
 
     is_mesh = Path(text).suffix.lower() in SUFFIXES
-    for name, value, allowed in (("--bin-unit", unit, tuple(UNITS)), ("--bin-up", up, AXES)):
+    options = (("--bin-unit", unit, tuple(UNITS)), ("--bin-up", up, AXES), ("--bin-collision", collision, COLLISIONS))
+    for name, value, allowed in options:
         if value is not None and not is_mesh:
             raise ConfigError(f"{name} is given without a mesh file; allowed: beside --bin FILE, which ends in {', '.join(SUFFIXES)}")
         if value is not None and value not in allowed:
             raise ConfigError(f"{name} is {format_value(value)}; allowed: {', '.join(allowed)}{suggest(value, list(allowed))}")
     if not is_mesh:
         return bin_of_size(_parse_size(text))
-    row = BinRow(name="bin", file=os.path.abspath(text), unit=unit or "m", up=up or "z")
+    row = BinRow(name="bin", file=os.path.abspath(text), unit=unit or "m", up=up or "z", collision=collision)
     try:
         return replace(row, measured=read_bin(row).measured)
     except ConfigError as error:
         said = str(error).removeprefix(f"bin {row.name}: ").replace(os.path.abspath(text), text)
-        raise ConfigError(re.sub(r'\b(unit|up) = "', r'--bin-\1 "', said)) from None
+        raise ConfigError(re.sub(r'\b(unit|up|collision) = "', r'--bin-\1 "', said)) from None
 
 
 def _copy_bin(row: BinRow, stage: Path) -> BinRow:

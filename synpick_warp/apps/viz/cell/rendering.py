@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -111,11 +112,13 @@ class CellScene:
         poses[..., 6] = 1.0
         which = [*range(len(self.sizes)), 0]
         for world, index in enumerate(which):
-            place[world, 0, :3] = (*self.sizes[index].origin[:2], self.sizes[0].ground - self.sizes[index].base)
-            laid = self.laid[index]
+            sizes, laid = self.sizes[index], self.laid[index]
+            lift = self.sizes[0].ground - sizes.ground
+            turn = (0.0, 0.0, math.sin(sizes.turn / 2.0), math.cos(sizes.turn / 2.0))
+            place[world, 0] = (*np.add(sizes.to_world((0.0, 0.0, 0.0)), (0.0, 0.0, lift)), *turn)
             for slot, (entry, position) in enumerate(zip(laid.indices, laid.positions, strict=True)):
-                entries[world, slot], poses[world, slot, :3] = entry, position
-                poses[world, slot, :3] += place[world, 0, :3]
+                entries[world, slot] = entry
+                poses[world, slot] = (*np.add(sizes.to_world(position), (0.0, 0.0, lift)), *turn)
         visible = np.ones((worlds, len(FIXTURES)), np.int32)
         visible[:, 0] = [self.sizes[index].is_visible for index in which]
         visible[-1, 1:] = 0
@@ -154,10 +157,14 @@ def scaled_down(camera: Camera, most: int = _PIXELS) -> Camera:
 def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
     """Lay as many objects on a bin's floor as there is room for, row by row, in their order; of its compartments in the largest.
 
-    On a slope, they touch the floor where that is highest below them.
+    On a slope, they touch the floor where that is highest below them. If the floor has room for none, the first that fits between the
+    walls lies as high as these are wide enough.
     """
     laid = Laid([], [])
-    left, front, length, width, a, b, c = max(sizes.floors, key=lambda floor: floor[2] * floor[3])
+    (left, front, length, width, a, b, c), opening = max(
+        zip(sizes.floors, sizes.openings, strict=True), key=lambda room: room[0][2] * room[0][3]
+    )
+    floor_sides, middle = np.array((length, width)), (left, front)
     left, front = left - length / 2, front - width / 2
     x, y, depth = _GAP, _GAP, 0.0
     for index, raw in enumerate(objects):
@@ -171,6 +178,15 @@ def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
         floor = c + max(a * (left + x), a * (left + x + float(size[0]))) + max(b * (front + y), b * (front + y + float(size[1])))
         laid.positions.append((left + x - float(low[0]), front + y - float(low[1]), floor - float(low[2])))
         x, depth = x + float(size[0]) + _GAP, max(depth, float(size[1]))
+    for index, raw in enumerate(objects if not laid.indices else ()):
+        low, high = raw.mesh.vertices.min(axis=0).astype(float), raw.mesh.vertices.max(axis=0).astype(float)
+        spare = np.array(opening[2:]) - floor_sides
+        share = float((((high - low)[:2] + 2.0 * _GAP - floor_sides) / np.maximum(spare, 1e-9)).max())
+        if share < 1.0:
+            center = np.array((*middle, c)) + share * np.array((*np.subtract(opening[:2], middle), sizes.height - c))
+            laid.indices.append(index)
+            laid.positions.append((*(center[:2] - (low + high)[:2] / 2.0).tolist(), float(center[2] - low[2])))
+            break
     return laid
 
 

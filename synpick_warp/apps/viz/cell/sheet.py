@@ -174,6 +174,8 @@ def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
     lines += [f"  {'floor' if sizes.shell else 'area'} {_millimetres(sizes.floor)} mm"]
     if sizes.shell:
         lines += [f"  opening {_millimetres(sizes.opening)} mm, {1e3 * sizes.height:.0f} mm up"]
+    if sizes.turn:
+        lines += [f"  turned by {math.degrees(sizes.turn):.4g} deg"]
     shift, yaw = bins.shift, bins.yaw
     if any(shift) or yaw:
         lines += [f"  moves by up to {_millimetres(shift)} mm, {yaw:g} deg"]
