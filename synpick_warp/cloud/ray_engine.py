@@ -125,9 +125,11 @@ def _await(ray: Any, calls: list[Any], crew: Crew, progress: Progress, chunks: C
             for call in ended:
                 try:
                     found = ray.get(call)
-                except (ray.exceptions.TaskCancelledError, KeyboardInterrupt):
-                    continue
                 except ray.exceptions.RayError as error:
+                    if stop.number:  # It was cancelled.
+                        continue
+                    if isinstance(error, ray.exceptions.RayTaskError):  # A fault of ours, with its traceback.
+                        raise
                     raise DeviceError(f"a worker died {RETRIES + 1} times ({_describe(error)}); the same command resumes") from error
                 if isinstance(found, str):
                     raise DeviceError(found)
