@@ -99,8 +99,8 @@ def describe_cameras(picks: bool, rig: Rig, bins: Sequence[BinSizes], gripper: G
             lines.append(
                 f"camera {camera.name} stands over the {noun}, in the gripper's way, and sees only its shaft in picks; move it aside or up"
             )
-        points = np.array([np.mean(each.corners, axis=0) for each in bins]) @ camera.rotation.T + camera.translation
-        pixels = (points @ camera.matrix.T)[:, :2] / np.where(points[:, 2:] > 0.0, points[:, 2:], np.nan)
+        points = matmul(np.array([np.mean(each.corners, axis=0) for each in bins]), camera.rotation.T) + camera.translation
+        pixels = matmul(points, camera.matrix.T)[:, :2] / np.where(points[:, 2:] > 0.0, points[:, 2:], np.nan)
         seen = ((pixels >= 0.0) & (pixels <= (camera.width, camera.height))).all(axis=1)
         if camera.fixed_to == WORLD and row.pose.look_at is None and not seen.any():
             advice = "if its pose leads from the world to the camera, invert it"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Bake, Config, Objects
+from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.catalog import load_catalog
 
 
@@ -31,8 +34,21 @@ def _has_one_world(case: Path, out: Path) -> None:
     assert load_config(str(case)).bake.worlds == 1
 
 
+def _is_refused_with_a_line(case: Path, out: Path) -> None:
+    """Whatever an earlier bake left in the cache, an object whose decomposition takes too long has no other shape instead."""
+    (out / "models").mkdir()
+    trimesh.creation.torus(40.0, 10.0).export(out / "models" / "ring.ply")
+    config = load_config(str(case))
+    config = replace(config, bake=replace(config.bake, models=str(out / "models")))
+    for _ in range(2):
+        with pytest.raises(CatalogError, match=r"ring: .* took longer than 0\.2 s of processor time .*; decimate"):
+            load_catalog(config, out / "cache", lambda line: None)
+        assert not (out / "cache").exists()
+
+
 SIDES = (0.04, 0.03, 0.02)
 ROWS = {
+    "cells/decomposition_limit.toml": _is_refused_with_a_line,
     "parts/gltf_skin": _one_part(SIDES),
     "parts/models_info_padded_key": _one_part((0.03, 0.03, 0.05), 1),
     "parts/other_formats_silent": _one_part(

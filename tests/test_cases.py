@@ -16,9 +16,7 @@ Check = Callable[[Path, Path], None]
 """Takes the path of an input and an empty folder for output; asserts."""
 ROWS: dict[str, Check] = {**bin_cases.ROWS, **camera_cases.ROWS, **mesh_cases.ROWS, **pick_cases.ROWS}
 """By path below CASES."""
-PENDING = {
-    "cells/decomposition_limit.toml",
-}
+PENDING: set[str] = set()
 
 
 @pytest.mark.parametrize("case", ROWS)

@@ -139,7 +139,11 @@ class Objects:
     pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
     concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
     decomposition_time: float = setting(
-        300.0, "s", "Time limit of a convex decomposition; an object that takes longer gets its convex hull.", above=0.0, high=86400.0
+        1800.0,
+        "s",
+        "Limit of processor time of a convex decomposition; an object that takes longer is an error.",
+        above=0.0,
+        high=86400.0,
     )
     concave_ratio: float = setting(
         0.6,

@@ -7,6 +7,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from trimesh.triangles import closest_point
 
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
+from synpick_warp.system.linear_algebra import matmul
 
 # Points of the hull whose distance is measured, points of the surface by which the nearest triangles are found, and how many of these.
 _POINTS, _DENSE, _NEAREST = 10_000, 60_000, 8
@@ -56,7 +57,7 @@ def relative_depth(vertices: np.ndarray, faces: np.ndarray) -> float:
     repeated = np.repeat(points, _NEAREST, axis=0)
     distance = np.linalg.norm(closest_point(corners[near], repeated) - repeated, axis=1).reshape(-1, _NEAREST).min(axis=1)
     normals = hull.equations[:: -(-len(hull.equations) // _DIRECTIONS), :3]
-    thickness = np.ptp(positions[hull.vertices] @ normals.T, axis=0).min()
+    thickness = np.ptp(matmul(positions[hull.vertices], normals.T), axis=0).min()
     return round(2.0 * float(distance.max()) / float(thickness), _DIGITS)
 
 

@@ -32,7 +32,7 @@ _RECIPE = 4
 DECOMPOSITION_MEMORY = 2**33
 """Memory limit of a decomposition [bytes]: 8 GiB; the remeshing of a scan with two million triangles takes a few."""
 HULL_LIMITS = Limits(120.0, 2**32)
-"""Limits of the simplification of a convex hull: 120 s and 4 GiB; a scan with two million vertices takes seconds."""
+"""Limits of the simplification of a convex hull: 120 s of processor time and 4 GiB; a scan with two million vertices takes seconds."""
 _REMEDY = "repair the mesh, or set concave = false"
 _LATE = "decimate the mesh, raise objects.decomposition_time, or set concave = false"
 
@@ -54,7 +54,8 @@ def collision_shapes(
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
     Those of the embedded objects come with the program (`embedded_shapes`). Others are computed in isolated processes (`run_isolated`).
-    What CoACD crashes on, cannot decompose or does not finish in time gets its convex hull instead, and a line says so.
+    What CoACD crashes on or cannot decompose gets its convex hull instead, and a line says so. If time or memory of this machine does not
+    suffice, that is an error: elsewhere, or under other load, the same settings would give another shape.
 
     Args:
         names: Names of the objects, for progress and errors.
@@ -62,16 +63,19 @@ def collision_shapes(
         recipes: One recipe per name.
         cache_dir: Folder of the cache; created if missing. If it cannot be written, that is reported and shapes are computed each time.
         report: Called with each line of progress.
-        seconds: Time limit of a decomposition [s].
+        seconds: Limit of a decomposition's processor time [s].
 
     Returns:
         The shape of each mesh, or an error if it has none because it has no volume.
+
+    Raises:
+        CatalogError: Time or memory does not suffice for objects, all of which are named.
     """
     jobs = [
         _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
     ]
     shapes: list[Shape | CatalogError | None] = [embedded_shape(job.mesh, job.recipe) or _load(job.file) for job in jobs]
-    save = _Saver(report)
+    save, stopped = _Saver(report), []
     slow = {index: job for index, job in enumerate(jobs) if shapes[index] is None and job.recipe.concave}
     for index, result in _decompose_all(slow, seconds, report):
         job = jobs[index]
@@ -79,15 +83,20 @@ def collision_shapes(
             report(f"{job.name}: {len(result)} convex pieces")
             shapes[index] = save(job.file, result)
             continue
-        report(f"{job.name}: its convex decomposition {result.reason}; its convex hull is used instead: {_remedy(result)}")
-        # A hull for lack of time is cached by that time, all others are not: the next bake may have another library, or more memory.
-        jobs[index] = replace(job, file=_late_file(job.file, seconds) if result.timed_out else Path(os.devnull))
-        shapes[index] = _load(jobs[index].file)
+        if result.by_machine:
+            stopped.append(f"{job.name}: its convex decomposition {result.reason}")
+            continue
+        report(f"{job.name}: its convex decomposition {result.reason}; its convex hull is used instead: {_REMEDY}")
+        jobs[index] = replace(job, file=Path(os.devnull))  # The next bake may have another library.
+    if stopped:
+        raise CatalogError(f"{'; '.join(stopped)}; {_LATE}")
     missing = [index for index, shape in enumerate(shapes) if shape is None]
     calls = [(jobs[index].mesh.vertices, jobs[index].recipe.hull_vertices) for index in missing]
     for index, result in zip(missing, run_isolated(simplify_hull, calls, HULL_LIMITS), strict=True):
         if isinstance(result, ConvexPiece):
             shapes[index] = save(jobs[index].file, (result,))
+        elif isinstance(result, Failure) and result.by_machine:
+            raise CatalogError(f"{jobs[index].name}: its convex hull {result.reason}; decimate the mesh")
         else:
             said = f"its convex hull {result.reason}; repair the mesh" if isinstance(result, Failure) else str(result)
             shapes[index] = CatalogError(f"{jobs[index].name}: {said}")
@@ -105,32 +114,16 @@ class _Job:
 
 
 def _decompose_all(jobs: Mapping[int, _Job], seconds: float, report: Callable[[str], None]) -> Iterator[tuple[int, Shape | Failure]]:
-    """Decompose objects; yields the pieces of each as soon as it and all before it are done, or why there are none.
-
-    A decomposition that an earlier call stopped at the same time limit, as the cache records, fails at once.
-    """
-    late = [index for index, job in jobs.items() if _load(_late_file(job.file, seconds))]
-    yield from ((index, Failure(f"took longer than {seconds:g} s before", timed_out=True)) for index in late)
-    fresh = {index: job for index, job in jobs.items() if index not in late}
-    if fresh:
-        listed = ", ".join(job.name for job in fresh.values())
-        report(f"decomposing {len(fresh)} concave objects, once, mostly within a minute, at most {seconds:g} s each: {listed}")
-    results = run_isolated(decompose, [(job.mesh, job.recipe) for job in fresh.values()], Limits(seconds, DECOMPOSITION_MEMORY))
-    for index, result in zip(fresh, results, strict=True):
+    """Decompose objects; yields the pieces of each as soon as it and all before it are done, or why there are none."""
+    if jobs:
+        listed = ", ".join(job.name for job in jobs.values())
+        report(f"decomposing {len(jobs)} concave objects, once, mostly in a minute, by {seconds:g} s of processor time at most: {listed}")
+    results = run_isolated(decompose, [(job.mesh, job.recipe) for job in jobs.values()], Limits(seconds, DECOMPOSITION_MEMORY))
+    for index, result in zip(jobs, results, strict=True):
         if isinstance(result, SynpickError):
             yield index, Failure(f"failed ({result})")
         else:
             yield index, result or Failure("found no convex pieces")
-
-
-def _remedy(failure: Failure) -> str:
-    """Advice for messages about an object that was not decomposed."""
-    return _LATE if failure.timed_out else _REMEDY
-
-
-def _late_file(file: Path, seconds: float) -> Path:
-    """Cache file of the convex hull of an object whose decomposition did not end within a time [s]."""
-    return file.with_stem(f"{file.stem}-{seconds:g}s")
 
 
 class _Saver:

@@ -205,7 +205,7 @@ def test_a_script_without_main_guard_can_decompose(tmp_path):
     assert (result.returncode, result.stdout, result.stderr) == (0, "[1, 1]\n", "")
 
 
-def fall_back(tmp_path, monkeypatch, result, seconds=300.0):
+def fall_back(tmp_path, monkeypatch, result):
     """Collision shape of a mug, and the progress lines, where the decomposition returns or raises `result`."""
 
     def run(function, calls, limits):
@@ -213,7 +213,7 @@ def fall_back(tmp_path, monkeypatch, result, seconds=300.0):
 
     monkeypatch.setattr(collision, "run_isolated", run)
     lines: list[str] = []
-    (shape,) = collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append, seconds)
+    (shape,) = collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append)
     return shape, lines
 
 
@@ -234,14 +234,12 @@ def test_what_cannot_be_decomposed_gets_its_hull_with_a_line_and_is_tried_again(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_decomposition_that_takes_too_long_is_not_tried_again_within_the_same_time(tmp_path, monkeypatch):
-    (hull,), lines = fall_back(tmp_path, monkeypatch, Failure("took longer than 300 s and was stopped", timed_out=True))
-    assert "raise objects.decomposition_time" in lines[-1]
-    (again,), lines = fall_back(tmp_path, monkeypatch, "not asked")
-    assert np.array_equal(again.vertices, hull.vertices)
-    assert lines == ["mug: its convex decomposition took longer than 300 s before; its convex hull is used instead: " + collision._LATE]
-    shape, _ = fall_back(tmp_path, monkeypatch, (hull, hull), seconds=600.0)
-    assert len(shape) == 2
+@pytest.mark.parametrize("reason", ["took longer than 300 s of processor time and was stopped", "was killed, probably for lack of memory"])
+def test_a_decomposition_for_which_the_machine_does_not_suffice_is_an_error_and_leaves_no_file(tmp_path, monkeypatch, reason):
+    for _ in range(2):
+        with pytest.raises(CatalogError, match=f"^mug: its convex decomposition {reason}; .*raise objects.decomposition_time"):
+            fall_back(tmp_path, monkeypatch, Failure(reason, by_machine=True))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_hull_that_cannot_be_computed_is_the_error_of_its_object(tmp_path):

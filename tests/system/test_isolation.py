@@ -40,10 +40,8 @@ def noise() -> int:
     ("function", "arguments", "said"),
     [
         (crash, (signal.SIGSEGV,), "crashed (SIGSEGV)"),
-        (crash, (signal.SIGKILL,), "was killed, probably for lack of memory"),
         (os.abort, (), "crashed (SIGABRT)"),
         (os._exit, (3,), "ended with status 3"),
-        (bytearray, (2**32,), "needs more than 1 GiB of memory"),
         (math.sqrt, (-1.0,), "failed (ValueError: math domain error)"),
     ],
 )
@@ -52,10 +50,22 @@ def test_a_call_that_fails_does_so_alone(function, arguments, said):
     assert list(run_isolated(math.sqrt, [(4.0,), (9.0,)], LIMITS)) == [2.0, 3.0]
 
 
+@pytest.mark.parametrize(
+    ("function", "arguments", "said"),
+    [
+        (crash, (signal.SIGKILL,), "was killed, probably for lack of memory"),
+        (bytearray, (2**32,), "needs more than 1 GiB of memory"),
+    ],
+)
+def test_what_the_machine_lacks_is_told_apart(function, arguments, said):
+    assert list(run_isolated(function, [arguments], LIMITS)) == [Failure(said, by_machine=True)]
+
+
 def test_a_call_that_takes_too_long_is_stopped():
-    (late, early) = run_isolated(time.sleep, [(600.0,), (0.0,)], Limits(1.0, 2**30))
-    assert late == Failure("took longer than 1 s and was stopped", timed_out=True)
-    assert early is None
+    """By its processor time, or by wall time if it sleeps."""
+    said = Failure("took longer than 0.1 s of processor time and was stopped", by_machine=True)
+    assert list(run_isolated(sum, [(range(10**12),)], Limits(0.1, 2**30))) == [said]
+    assert list(run_isolated(time.sleep, [(600.0,), (0.0,)], Limits(0.1, 2**30))) == [said, None]
 
 
 def test_errors_are_results_and_large_results_arrive(capfd):

@@ -3,7 +3,7 @@
 A call that crashes, hangs or takes too much memory ends its own process, and the caller gets a `Failure`. The processes are forked from a
 server: a fresh interpreter that has imported the functions' modules, and that neither CUDA nor threads of this process have touched. So a
 call costs milliseconds, and starts from the same state each time, whatever libraries keep between calls. Each has a supervisor, which
-kills it when its time is over, or when the caller ends or closes the link (Ctrl-C).
+kills it when the caller ends or closes the link (Ctrl-C). Limits are of processor time, which a busy machine does not shorten.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ MODULES = ("synpick_warp.scenes.catalog", "synpick_warp.scenes.lights")
 """What the server imports before it forks; functions of other modules work too, but import theirs in each call."""
 IDLE_TIME = 30.0
 """A server without requests for this long exits [s]; the next call starts another one."""
+_WALL = 60.0
+"""Wall time of a call, relative to its limit of processor time: for one that sleeps, and beyond any load."""
 _GRACE = 5
 """How much later than its supervisor's the alarm of a process itself ends it [s], should the supervisor have died."""
 _REQUEST = struct.Struct("<dQQ")
@@ -47,29 +49,31 @@ _REQUEST = struct.Struct("<dQQ")
 _END = struct.Struct("<i?")
 """Exit status, as of subprocess, and whether the time was over."""
 _STARTED = b"S"
-_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
-"""Calls are the parallelism, and their matrices small. CoACD keeps its OpenMP threads, as often there is a single slow object."""
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+"""Calls are the parallelism, and their matrices small. CoACD keeps its OpenMP threads, as often there is a single slow object;
+waiting ones take no processor time."""
 _BLOCK = 1 << 20
 _MAX_SHOWN = 200
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of an isolated call: wall time [s], and address space beyond the interpreter's [bytes]."""
+    """Limits of an isolated call: processor time [s], and address space beyond the interpreter's [bytes]."""
 
     seconds: float
-    """Wall time [s]."""
+    """Processor time of all threads [s]; a call that waits is stopped after _WALL times as long."""
     memory: int
     """Address space beyond that of the interpreter [bytes]."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """Why an isolated call has no result, and whether it timed out."""
+    """Why an isolated call has no result."""
 
     reason: str
     """Reason, as the rest of a sentence whose subject the caller adds, such as "crashed (SIGSEGV)"."""
-    timed_out: bool = False
+    by_machine: bool = False
+    """Whether time or memory of this machine was the reason, so that the same call may succeed elsewhere."""
 
 
 _STOPPED = Failure("was stopped")
@@ -214,17 +218,19 @@ def _outcome(end: bytes, stream: BinaryIO, limits: Limits) -> Any:
     if len(end) < _END.size:
         return _STOPPED
     code, timed_out = _END.unpack(end)
-    if timed_out or code == -signal.SIGALRM:
-        return Failure(f"took longer than {limits.seconds:g} s and was stopped", timed_out=True)
+    if timed_out or code in (-signal.SIGALRM, -signal.SIGPROF):
+        return Failure(f"took longer than {limits.seconds:g} s of processor time and was stopped", by_machine=True)
     if code == -signal.SIGKILL:
-        return Failure("was killed, probably for lack of memory")
+        return Failure("was killed, probably for lack of memory", by_machine=True)
     if code < 0:
         return Failure(f"crashed ({signal.Signals(-code).name})")
     if code > 0:
         return Failure(f"ended with status {code}")
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
         result = pickle.loads(data)
-    return Failure(f"needs more than {describe_bytes(limits.memory)} of memory") if isinstance(result, MemoryError) else result
+    if isinstance(result, MemoryError):
+        return Failure(f"needs more than {describe_bytes(limits.memory)} of memory", by_machine=True)
+    return result
 
 
 # ---- in the server and its children ----
@@ -275,7 +281,7 @@ def _supervise(link: socket.socket, result: int) -> int:
         os.close(alive)
         _exit_after(_work, result, request, seconds, memory)
     os.close(held)
-    ready = select.select([alive, link], [], [], seconds)[0]
+    ready = select.select([alive, link], [], [], _WALL * seconds)[0]
     if alive not in ready:
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
@@ -290,7 +296,8 @@ def _work(result_file: int, request: bytes, seconds: float, memory: int) -> int:
     null = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(null, stream)
-    signal.alarm(math.ceil(seconds) + _GRACE)
+    signal.setitimer(signal.ITIMER_PROF, seconds)  # SIGPROF ends the process.
+    signal.alarm(math.ceil(_WALL * seconds) + _GRACE)
     _limit_memory(memory)
     try:
         function, arguments = pickle.loads(request)
