@@ -22,6 +22,7 @@ from synpick_warp.scenes.bin_meshes.inside import Surface, subdivide
 from synpick_warp.scenes.collision.simplification import hull_piece
 from synpick_warp.scenes.tote import FLOOR_DEPTH, MIN_WALL
 from synpick_warp.scenes.types import ConvexPiece
+from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul, norm
 
 TOLERANCE = 2e-3
 """Distance of a facet's vertices from its plane [m], as of the tote's rounded corners; doubled until there are at most MAX_PIECES."""
@@ -81,7 +82,7 @@ def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: Surface) ->
         for facet in _grow_facets(found, tolerance):
             points = found.corners[facet].reshape(-1, 3)
             # Faces within a piece, as those of ribs that end in a wall, are none of the surface.
-            if not any((points @ each[:, :3].T + each[:, 3]).max() < -BURIED for each in planes):
+            if not any((matmul(points, each[:, :3].T) + each[:, 3]).max() < -BURIED for each in planes):
                 fresh = _extrude(found, facet, surface)
                 planes += [ConvexHull(piece.vertices.astype(np.float64)).equations for piece in fresh]
                 pieces += fresh
@@ -174,7 +175,8 @@ def _grow_facets(faces: _Faces, tolerance: float) -> list[list[int]]:
         if not free[first]:
             continue
         normal, point = faces.normal[first], faces.corners[first, 0]
-        flat = (np.abs((faces.corners - point) @ normal) <= tolerance).all(axis=1) & (faces.normal @ normal > np.cos(FACET_ANGLE))
+        flat = (np.abs(dot(faces.corners - point, normal)) <= tolerance).all(axis=1)
+        flat &= dot(faces.normal, normal) > np.cos(FACET_ANGLE).round(DECIMALS)
         facet, waiting = [], deque([int(first)])
         free[first] = False
         while waiting:
@@ -191,8 +193,8 @@ def _grow_facets(faces: _Faces, tolerance: float) -> list[list[int]]:
 
 def _extrude(faces: _Faces, facet: list[int], surface: Surface) -> list[ConvexPiece]:
     """Prisms behind a facet."""
-    normal = faces.area[facet] @ faces.normal[facet]
-    normal /= np.linalg.norm(normal)
+    normal = dot(faces.normal[facet].T, faces.area[facet])
+    normal /= norm(normal)
     frame = _plane_axes(normal)
     pieces = []
     for polygons in _cut([*faces.corners[facet]], normal, frame, surface):
@@ -200,7 +202,7 @@ def _extrude(faces: _Faces, facet: list[int], surface: Surface) -> list[ConvexPi
         if normal[2] > STEEP:
             move = np.array([0.0, 0.0, -FLOOR_DEPTH])
         else:
-            out = -normal[:2] / max(float(np.linalg.norm(normal[:2])), 1e-9)
+            out = -normal[:2] / max(float(norm(normal[:2])), 1e-9)
             move = np.array([*out, 0.0])
             move *= min(MIN_WALL, _solid_depth(points, normal, frame, move, faces) / 2.0)
         try:
@@ -213,7 +215,7 @@ def _extrude(faces: _Faces, facet: list[int], surface: Surface) -> list[ConvexPi
 def _plane_axes(normal: np.ndarray) -> np.ndarray:
     """Two unit vectors (2, 3) perpendicular to a normal."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
+    first /= norm(first)
     return np.stack([first, np.cross(normal, first)])
 
 
@@ -231,7 +233,7 @@ def _cut(polygons: list[np.ndarray], normal: np.ndarray, frame: np.ndarray, surf
     done, waiting = [], [polygons]
     while waiting:
         part = waiting.pop()
-        hull = _hull_corners(np.concatenate(part) @ frame.T)
+        hull = _hull_corners(matmul(np.concatenate(part), frame.T))
         if hull is None:
             continue
         if len(part) == 1 or _blocked_area(part, hull, normal, frame, surface) <= MAX_BLOCKED:
@@ -253,9 +255,9 @@ def _blocked_area(part: list[np.ndarray], hull: np.ndarray, normal: np.ndarray, 
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     open_points = points[_in_polygon(points, hull)]
     for polygon in part:
-        open_points = open_points[~_in_polygon(open_points, polygon @ frame.T, step / 2.0)]
-    where = float((np.concatenate(part) @ normal).mean())
-    space = open_points @ frame + where * normal
+        open_points = open_points[~_in_polygon(open_points, matmul(polygon, frame.T), step / 2.0)]
+    where = float(dot(np.concatenate(part), normal).mean())
+    space = matmul(open_points, frame) + where * normal
     cells = surface.index(space)
     free = surface.near_inside[cells] & (space[:, 2] > surface.closed[cells] + FREE)
     return float(free.sum()) * step * step
@@ -268,7 +270,7 @@ def _in_polygon(points: np.ndarray, polygon: np.ndarray, margin: float = 0.0) ->
     outward = np.column_stack([edges[:, 1], -edges[:, 0]]) / length[:, None]
     if ((polygon.mean(axis=0) - polygon) * outward).sum() > 0.0:
         outward = -outward
-    return ((points @ outward.T - (polygon * outward).sum(axis=1)) <= margin).all(axis=1)
+    return ((matmul(points, outward.T) - dot(polygon, outward)) <= margin).all(axis=1)
 
 
 def _best_cut(part: list[np.ndarray], frame: np.ndarray) -> list[list[np.ndarray]] | None:
@@ -278,12 +280,12 @@ def _best_cut(part: list[np.ndarray], frame: np.ndarray) -> list[list[np.ndarray
         across = np.array([along[1], -along[0]])
         sides: list[list[np.ndarray]] = [[], []]
         for polygon in part:
-            distance = (polygon @ frame.T - point) @ across
+            distance = dot(matmul(polygon, frame.T) - point, across)
             for side, sign in enumerate((1.0, -1.0)):
                 clipped = _clip(polygon, sign * distance)
                 if clipped is not None:
                     sides[side].append(clipped)
-        hulls = [_hull_corners(np.concatenate(side) @ frame.T) if side else None for side in sides]
+        hulls = [_hull_corners(matmul(np.concatenate(side), frame.T)) if side else None for side in sides]
         if hulls[0] is None or hulls[1] is None:
             continue
         size = sum(_polygon_area(hull) for hull in hulls if hull is not None)
@@ -294,8 +296,8 @@ def _best_cut(part: list[np.ndarray], frame: np.ndarray) -> list[list[np.ndarray
 
 def _border_edges(part: list[np.ndarray], frame: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Point and direction in the plane of the longest edges of polygons that no other polygon shares."""
-    starts = np.concatenate([polygon @ frame.T for polygon in part])
-    ends = np.concatenate([np.roll(polygon, -1, axis=0) @ frame.T for polygon in part])
+    starts = np.concatenate([matmul(polygon, frame.T) for polygon in part])
+    ends = np.concatenate([matmul(np.roll(polygon, -1, axis=0), frame.T) for polygon in part])
     keys = np.sort(np.stack([starts, ends], axis=1).round(6).view(), axis=1).reshape(-1, 4)
     _, index, uses = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
     border = np.flatnonzero(uses[index.reshape(-1)] == 1)
@@ -325,7 +327,7 @@ def _clip(polygon: np.ndarray, distance: np.ndarray) -> np.ndarray | None:
 def _polygon_area(corners: np.ndarray) -> float:
     """Area of a polygon (n, 2), counter-clockwise."""
     x, y = corners.T
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2.0
+    return float(dot(x, np.roll(y, -1)) - dot(y, np.roll(x, -1))) / 2.0
 
 
 def _solid_depth(points: np.ndarray, normal: np.ndarray, frame: np.ndarray, direction: np.ndarray, faces: _Faces) -> float:
@@ -333,15 +335,15 @@ def _solid_depth(points: np.ndarray, normal: np.ndarray, frame: np.ndarray, dire
 
     Möller-Trumbore intersection; the rays start on a grid in the hull of the points.
     """
-    hull = _hull_corners(points @ frame.T)
+    hull = _hull_corners(matmul(points, frame.T))
     if hull is None:
         return np.inf
     low, high = hull.min(axis=0), hull.max(axis=0)
     shares = (np.arange(RAY_GRID) + 0.5) / RAY_GRID
     grid = low + np.stack(np.meshgrid(shares, shares), axis=-1).reshape(-1, 2) * (high - low)
     grid = np.concatenate([grid[_in_polygon(grid, hull)], hull.mean(axis=0)[None], 0.95 * hull + 0.05 * hull.mean(axis=0)])
-    starts = grid @ frame + float((points @ normal).mean()) * normal
-    toward = faces.normal @ direction > 0.1
+    starts = matmul(grid, frame) + float(dot(points, normal).mean()) * normal
+    toward = dot(faces.normal, direction) > 0.1
     corners = faces.corners[toward]
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(direction, edge2)
@@ -353,7 +355,7 @@ def _solid_depth(points: np.ndarray, normal: np.ndarray, frame: np.ndarray, dire
         offset = start - corners[:, 0]
         u = np.einsum("fi,fi->f", offset, cross) * inverse
         other = np.cross(offset, edge1)
-        v, distance = (other @ direction) * inverse, np.einsum("fi,fi->f", edge2, other) * inverse
+        v, distance = dot(other, direction) * inverse, np.einsum("fi,fi->f", edge2, other) * inverse
         hit = usable & (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1.0 + 1e-6) & (distance > 1e-4)
         nearest = min(nearest, float(distance[hit].min(initial=np.inf)))
     return nearest

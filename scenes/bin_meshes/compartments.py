@@ -18,6 +18,7 @@ from trimesh import Trimesh
 from trimesh.intersections import mesh_plane
 
 from synpick_warp.scenes.bin_meshes.inside import HOLE, MIN_DEPTH, Surface, spread_points
+from synpick_warp.system.linear_algebra import DECIMALS, dot, lstsq
 
 MIN_SIDE = 0.03
 """Least length and width of a compartment [m], as of those that are given by sizes."""
@@ -217,9 +218,9 @@ def _fit_plane(surface: Surface, rectangle: Rectangle) -> tuple[float, float, fl
     low = heights <= (heights.min() + surface.rim) / 2.0
     points, heights = points[low], heights[low]
     terms = np.column_stack([points, np.ones(len(points))])
-    plane = np.linalg.lstsq(terms, heights, rcond=None)[0]
+    plane = lstsq(terms, heights, 1e-6)
     # Single cells on ribs or at walls do not count.
-    above = float(np.quantile(heights - terms @ plane, 0.95))
+    above = float(np.quantile(heights - dot(terms, plane), 0.95))
     return float(plane[0]), float(plane[1]), float(plane[2] + max(above, 0.0))
 
 
@@ -235,10 +236,10 @@ def find_turn(corners: np.ndarray) -> float:
     except QhullError:
         return 0.0
     edges = np.roll(outline, -1, axis=0) - outline
-    lengths, angles = np.hypot(*edges.T), np.degrees(np.arctan2(edges[:, 1], edges[:, 0]))
+    lengths, angles = np.hypot(*edges.T), np.degrees(np.arctan2(edges[:, 1], edges[:, 0])).round(DECIMALS - 3)  # In degrees.
     offset = (angles[:, None] - angles + 45.0) % 90.0 - 45.0
     shares = np.where(np.abs(offset) < PARALLEL, lengths[:, None], 0.0).sum(axis=0) / lengths.sum()
-    areas = np.array([np.prod(_box_sides(outline, angle)) for angle in angles])
+    areas = np.array([np.prod(_box_sides(outline, angle)) for angle in angles]).round(DECIMALS)
     aligned = int(shares.argmax())
     if shares[aligned] <= ALIGNED_SHARE:
         aligned = int(areas.argmin())

@@ -32,6 +32,7 @@ from synpick_warp.scenes.bin_meshes.compartments import (
 )
 from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, HeightField, Surface, find_inside, make_limits
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 SIDES = (0.02, 10.0)
@@ -110,7 +111,7 @@ def _model(row: BinRow) -> BinModel:
     if len(mesh.faces) > MAX_FACES:
         raise CatalogError(f"{path} has {len(mesh.faces):,} triangles; allowed: {MAX_FACES:,}; decimate the mesh")
     _check_sides(mesh, path, unit)
-    mesh = _rotate(mesh, lambda vectors: vectors @ _rotation(up).astype(np.float32).T)
+    mesh = _rotate(mesh, lambda vectors: matmul(vectors, _rotation(up).astype(np.float32).T))
     yaw = find_turn(mesh.vertices[mesh.faces].astype(np.float64))
     mesh = _rotate(mesh, lambda vectors: turned(vectors.astype(np.float64), -yaw).astype(np.float32)) if yaw else mesh
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -197,7 +198,7 @@ def _explain(corners: np.ndarray, up: str) -> str:
     sizes = {}
     back = _rotation(up).T
     for other in AXES:
-        surface = find_inside(corners @ (_rotation(other) @ back).T, COARSE)
+        surface = find_inside(matmul(corners, matmul(_rotation(other), back).T), COARSE)
         if other != up and surface is not None and find_compartments(surface):
             sizes[other] = float((surface.rim - surface.height[surface.inside]).sum()) * surface.cell**2
     rule = f"as seen from above, with up = {up}: it is closed, flat, or not {1e3 * MIN_DEPTH:g} mm deep and {1e3 * MIN_SIDE:g} mm wide"
@@ -306,7 +307,7 @@ def _raise_to_piece(heights: np.ndarray, points: np.ndarray, piece: ConvexPiece)
     if heights[block].size == 0:
         return
     planes = ConvexHull(vertices).equations
-    reach = points[block] @ planes[:, :2].T + planes[:, 3]
+    reach = matmul(points[block], planes[:, :2].T) + planes[:, 3]
     up, down, upright = planes[:, 2] > 1e-6, planes[:, 2] < -1e-6, np.abs(planes[:, 2]) <= 1e-6
     top = (-reach[..., up] / planes[up, 2]).min(axis=-1)
     bottom = (-reach[..., down] / planes[down, 2]).max(axis=-1)

@@ -12,7 +12,7 @@ import numpy as np
 
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
 from synpick_warp.scenes.symmetries.surface import Surface
-from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, matmul, norm, rotation, solve
+from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, lstsq, matmul, norm, rotation, solve
 
 MAX_FOLD = 36
 """Largest fold that is looked for; an axis with all folds up to it is continuous."""
@@ -79,13 +79,6 @@ def _axis_angle(matrix: np.ndarray) -> tuple[np.ndarray, float]:
     return axis / (length or 1.0), round(float(np.arctan2(norm(twice) / 2.0, cosine)), DECIMALS)
 
 
-def _least_norm(matrix: np.ndarray, right: np.ndarray, rcond: float) -> np.ndarray:
-    """Least-squares solution of least norm (n) of a linear system (n, n), without singular values below `rcond` of the largest."""
-    squares, vectors = eigh(matmul(matrix.T, matrix))
-    share = dot(vectors.T, dot(matrix.T, right))
-    return dot(vectors, np.where(squares > rcond**2 * squares[-1], share / np.maximum(squares, 1e-30), 0.0))
-
-
 def find_axes(matrices: np.ndarray) -> list[Turn]:
     """Axes of discrete symmetries (N, 4, 4), each with its largest fold, without distances; larger folds first."""
     found: list[Turn] = []
@@ -94,7 +87,7 @@ def find_axes(matrices: np.ndarray) -> list[Turn]:
         if angle < 1e-3:
             continue
         axis = _upward(axis)
-        turn = Turn(axis, _least_norm(np.eye(3) - matrix[:3, :3], matrix[:3, 3], 1e-6), max(round(2.0 * np.pi / angle), 2), 0.0)
+        turn = Turn(axis, lstsq(np.eye(3) - matrix[:3, :3], matrix[:3, 3], 1e-6), max(round(2.0 * np.pi / angle), 2), 0.0)
         beside = next((index for index, other in enumerate(found) if abs(dot(other.axis, axis)) > np.cos(np.radians(2.0))), None)
         if beside is None:
             found.append(turn)
@@ -222,7 +215,7 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
     if length > 0.1:
         axis = vector * (1.0 if dot(vector, axis) > 0.0 else -1.0)
     shift = dot(matrix[:3, :3], center) + matrix[:3, 3] - center
-    return axis, center + _least_norm(np.eye(3) - matrix[:3, :3], shift - axis * dot(axis, shift), 1e-3)
+    return axis, center + lstsq(np.eye(3) - matrix[:3, :3], shift - axis * dot(axis, shift), 1e-3)
 
 
 def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:

@@ -87,6 +87,13 @@ def eigh(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.diag(matrix)[order], vectors[:, order]
 
 
+def lstsq(matrix: np.ndarray, right: np.ndarray, rcond: float) -> np.ndarray:
+    """Least-squares solution of least norm (n) of a linear system (m, n), without singular values below `rcond` of the largest."""
+    squares, vectors = eigh(matmul(matrix.T, matrix))
+    share = dot(vectors.T, dot(matrix.T, right))
+    return dot(vectors, np.where(squares > rcond**2 * squares[-1], share / np.maximum(squares, np.finfo(float).tiny), 0.0))
+
+
 def rotation(axis: np.ndarray, angle: float | np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) about unit axes (..., 3) by an angle [rad] (Rodrigues), whose sine and cosine are rounded."""
     wave = np.round([np.cos(angle), np.sin(angle)], DECIMALS)
