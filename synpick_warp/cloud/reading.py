@@ -237,6 +237,10 @@ class StoreCache:
         self._held: OrderedDict[int, int] = OrderedDict()
         """Cached episodes with their sizes [B], least recently used first."""
         self.copier.fetch_records()
+        try:
+            read_settings(self.folder, read_manifest(self.folder))
+        except (ConfigError, DatasetError) as error:
+            raise type(error)(str(error).replace(str(self.folder), url)) from None
         for entry in (CONSTANTS, INDICES):
             if self.copier.fetch_entry(entry):
                 self.copier.fetch_files(entry)

@@ -17,7 +17,7 @@ import synpick_warp
 from synpick_warp.cli.main import main
 from synpick_warp.cloud import reading
 from synpick_warp.dataset.pytorch import Views
-from synpick_warp.errors import DatasetError, StoreError
+from synpick_warp.errors import DatasetError, StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import open_store
 from tests.builders import mistake, run
@@ -187,6 +187,14 @@ def test_a_damaged_list_of_episodes_is_named(sets, place, data):
         open_store(sets[0]).put(f"manifest/joined.{end}", content.encode())
     with pytest.raises(DatasetError, match=r"s3://memory-.*/episodes.jsonl, line 1, is damaged"):
         list(synpick_warp.open(sets[0]))
+
+
+@pytest.mark.parametrize("data", [None, b"", b"seed = 1", b"[bake]\nseed = 12345"])
+def test_settings_that_are_not_those_of_the_manifest_are_named(sets, place, data):
+    store = open_store(sets[0])
+    store.delete("config.toml") if data is None else store.put("config.toml", data)
+    with pytest.raises(SynpickError, match=r"s3://memory-.*/config.toml"):
+        synpick_warp.open(sets[0])
 
 
 @pytest.mark.parametrize("name", ["manifest.json", "config.toml", "manifest/000000.json", "manifest/constants.sha256"])
