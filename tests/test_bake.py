@@ -18,6 +18,7 @@ from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
+from synpick_warp.factory import pipeline
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.types import Catalog
@@ -367,7 +368,8 @@ def test_drawn_again_and_counted(tmp_path):
     assert summary.remedies == {Ending.UNSETTLED: advice}
 
 
-def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys):
+def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys, monkeypatch):
+    monkeypatch.setattr(pipeline, "check_disk", lambda *_: None)
     out = small_disk(200) / "set"
     assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
     said = capsys.readouterr().err.strip().splitlines()

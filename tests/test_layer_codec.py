@@ -116,7 +116,7 @@ def test_layer_files_round_trip(tmp_path, name):
 def test_missing_and_invalid_files_are_reported(tmp_path):
     with pytest.raises(DatasetError, match=r"there is no layer depth; layers: normals, "):
         read_layer(SceneFolder(tmp_path), "depth", 0)
-    with pytest.raises(DatasetError, match=r"there is no .*flow/000003.png or .jpg; the data set is not complete"):
+    with pytest.raises(DatasetError, match=r"has no layer flow; it has none; bake with render\.layers"):
         read_layer(SceneFolder(tmp_path), "flow", 3)
     (tmp_path / "flow").mkdir()
     path = tmp_path / "flow" / "000003.png"

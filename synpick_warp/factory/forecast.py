@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.codes import Mode
+from synpick_warp.configs.episodes.manipulation import Move
+from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.factory.order import predict_frames
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import Catalog
@@ -21,15 +24,10 @@ from synpick_warp.system.progress import Progress
 GB = 10**9
 SAMPLED = 1024
 """Maximum number of episodes whose objects are drawn for the forecast; the others have their mean."""
-VIEW_BYTES = {"bop": 739e3, "shards": 739e3, "coco": 480e3, "yolo": 480e3}
-"""Size of a view's files at full HD by format [B]: 57 GB for 77,166 views of real objects, of which colour is 65 %. Formats that are not
-listed are small beside these."""
 FULL_HD, SIZE_EXPONENT = 1920 * 1080, 0.55
 """Files grow with this power of the pixels [px]: 26 kB were measured at 96x54, 109 kB at 320x180."""
-TICK_BYTES = {"zarr": 50e3}
-"""Size of a frame of an episode by format [B], measured with ten objects."""
-SURE = 0.5
-"""A bake is refused if even this fraction of its forecast size is not free: sizes of files vary with pictures by less."""
+SURE = 0.2
+"""A bake is refused if even this fraction of its forecast size is not free: lengths of episodes and sizes of files vary by less."""
 VIEW_TIME = (0.9e-3, 0.15e-9)
 """Time of a view in a bake of many worlds on an H100 with 16 cores: fixed part [s] and part per pixel [s/px] (tools/README.md)."""
 
@@ -64,18 +62,21 @@ def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> 
     frames = round(predict_length(config, catalog, episodes[:: len(episodes) // SAMPLED + 1]) * len(episodes))
     # Of each camera: views a frame, and pixels of a view.
     cameras = [(1.0 / every, width * height) for (width, height), every in zip(config.rig.sizes, config.rig.every, strict=True)]
-    view, tick = (sum(table.get(name, 0.0) for name in config.bake.formats) for table in (VIEW_BYTES, TICK_BYTES))
+    formats = [FORMAT_TABLE[name] for name in config.bake.formats]
+    view, tick = sum(each.view_bytes for each in formats), sum(each.frame_bytes for each in formats)
     size = frames * (tick + view * sum(share * (pixels / FULL_HD) ** SIZE_EXPONENT for share, pixels in cameras))
     seconds = frames * sum(share * (VIEW_TIME[0] + VIEW_TIME[1] * pixels) for share, pixels in cameras)
     return Forecast(len(episodes), frames, round(frames * sum(share for share, _ in cameras)), round(size), seconds)
 
 
 def predict_length(config: Config, catalog: Catalog, episodes: Sequence[int]) -> float:
-    """Mean number of frames of episodes, by their modes and objects; 0 of none."""
+    """Mean number of frames of episodes, by their modes and objects; 0 of none. Those of mode move follow speed and rounds."""
     if not len(episodes):
         return 0.0
-    drawn = sample_episodes_ahead(config, catalog, np.asarray(episodes, np.int32), pick_device(config.bake.device))
-    return float(predict_frames(*drawn).mean())
+    modes, objects = sample_episodes_ahead(config, catalog, np.asarray(episodes, np.int32), pick_device(config.bake.device))
+    stirring = config.move.rounds / Move().rounds * Move().speed / config.move.speed
+    frames = predict_frames(modes, objects) * np.where(modes == Mode.MOVE, stirring, 1.0)
+    return float(frames.mean()) * Physics().tick_time / config.physics.tick_time
 
 
 def forecast_settings(config: Config, episodes: Sequence[int], progress: Progress) -> Forecast:

@@ -348,14 +348,14 @@ def test_a_dry_run_tells_what_a_bake_takes_and_writes_nothing(tmp_path, plans, b
     command = ["bake", "--config", "smoke", "--episodes", "1000", "--dry-run", "--device", "cpu", "--out", str(tmp_path / "data")]
     assert main(command) == 0
     text = capsys.readouterr().out
-    # Mode move: 409 frames, three cameras of 320 x 180 px; 103 kB a view in the format bop.
-    assert all(words in text for words in ("1,000, of some 409 frames", "about 1,227,000", "about 126.3 GB", "at least 0.0 GiB"))
-    disk = types.SimpleNamespace(free=100e9)
+    # Mode move at four times the speed, half the rounds: 51 frames, three cameras of 320 x 180 px; 103 kB a view in the format bop.
+    assert all(words in text for words in ("1,000, of some 51 frames", "about 153,375", "about 15.8 GB", "at least 0.0 GiB"))
+    disk = types.SimpleNamespace(free=12e9)
     monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: disk)
     assert main(command) == 0
     assert "the disk may run full" in capsys.readouterr().out
-    disk.free = 60e9
-    assert mistake(*command).startswith("1,000 episodes of some 409 frames take about 126.3 GB, and ")
+    disk.free = 2e9
+    assert mistake(*command).startswith("1,000 episodes of some 51 frames take about 15.8 GB, and ")
     assert not bakes.calls
     assert not list(tmp_path.iterdir())
 

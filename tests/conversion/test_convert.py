@@ -86,7 +86,7 @@ def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
 )
 def test_converted_sets_equal_baked_ones_byte_for_byte(sets, tmp_path, assets, source, formats, baked):
     before = snapshot(sets[source])
-    assert run(sets[source], tmp_path / "out", *formats) == (2, 0)
+    assert run(sets[source], tmp_path / "out", *formats)[:2] == (2, 0)
     converted, expected = snapshot(tmp_path / "out"), snapshot(sets[baked])
     assert sorted(converted) == sorted(expected)
     assert [name for name in expected if converted[name] != expected[name]] == []
@@ -124,10 +124,10 @@ def test_interrupted_conversion_resumes_to_the_same_bytes(sets, tmp_path):
         (out / "manifest" / name).unlink()
     (out / "test_web" / "shard-000004.tar").write_bytes(b"half")
     (out / ".partial" / "shards" / "000001").mkdir(parents=True)
-    assert run(sets["source"], out, "shards", report=lambda *step: seen.append(step)) == (2, 1)
+    assert run(sets["source"], out, "shards", report=lambda *step: seen.append(step))[:2] == (2, 1)
     assert seen == [("episodes", 2, 2)]
     assert snapshot(out) == snapshot(sets["shards"])
-    assert run(sets["source"], out, "shards") == (2, 2)
+    assert run(sets["source"], out, "shards")[:2] == (2, 2)
 
 
 def test_an_interrupt_leaves_no_files_beside_committed_episodes(sets, tmp_path):

@@ -172,7 +172,6 @@ def test_estimates_are_made_and_scored(plain, tmp_path):
     ("file", "said"),
     [
         ("scene_gt.json", "has no ground truth (scene_gt.json), which poses are estimated with"),
-        ("rgb", "has no colour images, which poses are estimated with"),
         ("depth", "has no depth images, which poses are estimated with"),
     ],
 )

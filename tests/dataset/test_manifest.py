@@ -41,6 +41,8 @@ def changed(key: str) -> Config:
 
 
 def other(value: object) -> object:
+    if value is None:
+        return 1.0
     if isinstance(value, bool):
         return not value
     if isinstance(value, Distribution):

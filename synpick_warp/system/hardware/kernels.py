@@ -218,8 +218,8 @@ class Compiler:
         if build not in self._tasks and build not in self._seen:
             self._seen.add(build)
             if not build.is_cached():
+                self._say(1)
                 self._tasks[build] = self._urgent.submit(self._compile, build)
-                self._say()
         if task := self._tasks.get(build):
             self._wait([task])
 
@@ -232,8 +232,8 @@ class Compiler:
         for task in tasks:
             task.result()
 
-    def _say(self) -> None:
-        """Report progress."""
+    def _say(self, begun: int = 0) -> None:
+        """Report progress; `begun` modules are about to be compiled."""
         self.compiled = sum(task.done() for task in self._tasks.values())
-        if self._tasks:
-            self._report(self.compiled, len(self._tasks))
+        if total := begun + len(self._tasks):
+            self._report(self.compiled, total)
