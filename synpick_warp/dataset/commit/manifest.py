@@ -241,7 +241,7 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
-    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key and key not in FREE_SETTINGS}
+    younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key and value is not None and key not in FREE_SETTINGS}
     before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
