@@ -147,7 +147,7 @@ def run_estimation(scenes: Sequence[Scene], aligner: Aligner, options: Options, 
     ]
     with ThreadPoolExecutor(max(1, options.threads), "estimate") as pool:
         try:
-            for (_, part), found in zip(jobs, pool.map(lambda job: list(_estimate(*job, aligner, options)), jobs), strict=True):
+            for (_, part), found in zip(jobs, pool.map(lambda job: list(_estimate(job[0], job[1], aligner, options)), jobs), strict=True):
                 rows += found
                 views += len(part)
                 report("views", views, total)
@@ -161,7 +161,8 @@ def _estimate(scene: Scene, steps: Sequence[int], aligner: Aligner, options: Opt
     """Estimates in these frames of a scene, in order; tracks go on from one to the next."""
     tracks: dict[int, np.ndarray] = {}
     for step in steps:
-        began, found = time.perf_counter(), []
+        began = time.perf_counter()
+        found: list[Estimate] = []
         for slot in np.flatnonzero(scene.asked[step]).tolist():
             points, truth = observed_points(scene, step, slot, DEPTHS[options.depth]), scene.poses[step, slot]
             object_id, instance, frame = int(scene.object_ids[slot]), int(scene.instances[slot]), scene.plan.frames[step]
@@ -177,9 +178,9 @@ def _estimate(scene: Scene, steps: Sequence[int], aligner: Aligner, options: Opt
             tracks[slot] = pose
             # A hidden instance keeps its track; other methods have no estimate of it.
             if score > 0.0 or options.method == TRACK:
-                found.append((scene.plan.scene, frame, object_id, instance, pose, score))
+                found.append(Estimate(scene.plan.scene, frame, object_id, instance, pose, score, 0.0))
         seconds = time.perf_counter() - began  # BOP wants one time for all rows of an image.
-        yield from (Estimate(*row, seconds) for row in found)
+        yield from (row._replace(seconds=seconds) for row in found)
 
 
 def observed_points(scene: Scene, step: int, slot: int, layer: str) -> np.ndarray:
