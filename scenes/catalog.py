@@ -224,7 +224,7 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
 def _embedded_objects(rules: _Rules, faults: _Faults, distractors: bool) -> list[RawObject]:
     """Embedded objects that fit into the bins; as distractors geometric solids, with procedural surfaces textured.
 
-    Household objects would look like labelled ones, which are of the same kinds.
+    Household objects are excluded, since they resemble labelled objects.
     """
     raws = []
     for raw in solids(rules.surfaces > 0) if distractors else procedural_objects(rules.objects.embedded):

@@ -312,7 +312,7 @@ def _coefficients(tree: Tree, any_size: bool = False) -> tuple[float, ...]:
         raise _FaultError(f"it has {format_value(unknown[0])}, which is no known name; call coefficients distortion_coefficients")
     if _has(tree, _DISTORTION):
         return _numbers(_first(tree, _DISTORTION, None), "distortion coefficients", any_size)
-    # With k4 and without p1 they are the four of a fisheye, or may be.
+    # Coefficients with k4 but without p1 may be those of a fisheye model.
     return _by_name(tree, fisheye="k4" in tree and "p1" not in tree)[1] if "k1" in tree else ()
 
 

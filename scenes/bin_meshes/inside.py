@@ -190,7 +190,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
 
 
 def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell: float) -> np.ndarray:
-    """Height field in whose cells without mesh gaps narrower than WIRES, and than half of the inside, are closed (nx, ny)."""
+    """Height field (nx, ny) with small gaps filled: those narrower than WIRES and than half of the inside."""
     narrowest = int(np.ptp(np.argwhere(inside), axis=0).min()) + 1
     size = min(round(WIRES / cell), narrowest // 2) // 2 * 2 + 1
     return np.where(solid, height, ndimage.grey_closing(height, size, mode="nearest"))

@@ -47,7 +47,7 @@ def held(cup: float, area: float) -> float:
 
 
 def press(device, meshes, cup: float, places=((0.0, 0.0),), turn=UP, cups=((0.0, 0.0),), valve: int = 0, **settings) -> Cups:
-    """One world per place [m] of the first object beside the cup's axis, all objects with their highest points at the lip."""
+    """One world per offset [m] of the first object from the cup's axis; the highest point of each object is at the lip."""
     config = load_config("smoke", {"suction.vacuum": PRESSURE / 1e3, "gripper.cup_width": cup} | settings)
     result = Cups(device, len(places), cups=cups, objects=Catalog(tuple(map(solid, meshes))), config=config, reach=0.03)
     result.scene.cups.common_valve = valve

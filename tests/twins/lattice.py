@@ -1,4 +1,4 @@
-"""Periodic artefacts of a picture, by Welch's method: power spectra of windows at a grid's frequencies, relative to neighbouring ones."""
+"""Measure of periodic image artefacts (Welch, 1967): windowed power spectra at grid frequencies, relative to neighbouring frequencies."""
 
 from __future__ import annotations
 

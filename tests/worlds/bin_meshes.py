@@ -168,7 +168,7 @@ def _loft(first: np.ndarray, second: np.ndarray) -> Mesh:
 
 
 def basket(draft: float = 0.0, gap: float = 0.03, wire: float = 0.004, sections: int = 8) -> Mesh:
-    """A basket of wire: 0.4 x 0.3 m between the middles of the floor's wires, 0.15 m high, walls at a draft [°]."""
+    """Wire basket: 0.4 x 0.3 m between centre lines of the floor's wires, 0.15 m high, with a draft angle of its walls [°]."""
     half, rise = np.array((0.2, 0.15)), 0.15 * np.tan(np.radians(draft))
     lines = []
     for axis in (0, 1):

@@ -26,7 +26,7 @@ MAX_LINES = 40
 ROW = 19
 """Height of a line of a bar chart [px]."""
 HEADROOM = 1.1
-"""Length of the axis of objects over time, relative to the largest value: the line does not lie on the frame."""
+"""Upper axis limit of the chart of objects over time, relative to the largest value, so that the line stays inside the frame."""
 MAX_TICKS = 10
 """Most labels of a histogram's axis, beside the first."""
 HEIGHT = 220

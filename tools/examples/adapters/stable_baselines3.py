@@ -61,7 +61,7 @@ class Sb3Env(VecEnv):
         setattr(self.env, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method of the vector environment once; its result for each of the chosen environments."""
+        """Call a method of the vector environment once, and return its result for each selected environment."""
         return [getattr(self.env, method_name)(*args, **kwargs)] * self._count(indices)
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
