@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from synpick_warp._version import __version__
 from synpick_warp.errors import (
     ActionError,
     CatalogError,
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from synpick_warp.online.stream import ViewStream
     from synpick_warp.system.progress import Progress
 
-__version__ = "0.2.0"
 __all__ = [
     "ActionError",
     "CatalogError",

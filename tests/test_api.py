@@ -59,7 +59,7 @@ def test_importing_and_reading_settings_load_nothing_heavy():
 def test_the_version_stands_in_one_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert "version" not in project["project"]
-    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "synpick_warp.__version__"}
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "synpick_warp._version.__version__"}
 
 
 def test_the_type_marker_is_packaged():

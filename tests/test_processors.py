@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.system import linear_algebra
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("scenes", "configs", "synpick_warp/stages", "synpick_warp/exporters")
+ROOMS = tuple(f"synpick_warp/{name}" for name in ("scenes", "configs", "stages", "exporters"))
 """Where files and decisions are made."""
 BLAS = {"dot", "inner", "vdot", "tensordot", "matmul", "convolve", "correlate", "cov", "corrcoef", "polyfit"}
 OTHERS = {"from_rotvec", "from_euler", "from_matrix", "as_rotvec", "as_euler"}

@@ -69,8 +69,8 @@ class CallGraph:
         """Name of a function of the package; comprehensions and local functions belong to the function around them."""
         if code not in self._names:
             path = Path(code.co_filename)
-            inside = path.is_relative_to(ROOT) or path.is_relative_to(ROOT.parent / "kernels")
-            place = path.relative_to(ROOT if path.is_relative_to(ROOT) else ROOT.parent).with_suffix("") if inside else None
+            inside = path.is_relative_to(ROOT)
+            place = path.relative_to(ROOT).with_suffix("") if inside else None
             self._names[code] = f"{place}:{code.co_qualname.split('.<')[0]}" if inside else None
         return self._names[code]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import cyclopts
 from cyclopts import App, Parameter
 
-from synpick_warp import __version__
+from synpick_warp._version import __version__
 from synpick_warp.cli.commands.convert import convert
 from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate

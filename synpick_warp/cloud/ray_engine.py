@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from synpick_warp import __version__
+from synpick_warp._version import __version__
 from synpick_warp.cloud.claims import Chunks, open_claims, plan_chunks
 from synpick_warp.cloud.crew import RAY, Crew
 from synpick_warp.cloud.ledger import Ledger

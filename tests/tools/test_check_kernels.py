@@ -54,9 +54,9 @@ def add_kernel(
 
 def check(tmp_path: Path, capsys, kernels: str, stage: str = "", elsewhere: str = "") -> list[str]:
     """Write a source tree, check it, and return its faults as "line: rule"."""
-    for folder, text in (("kernels", kernels), ("synpick_warp/stages", stage), ("scenes", elsewhere)):
-        (tmp_path / folder).mkdir(parents=True)
-        (tmp_path / folder / "add.py").write_text(text)
+    for folder, text in (("kernels", kernels), ("stages", stage), ("scenes", elsewhere)):
+        (tmp_path / "synpick_warp" / folder).mkdir(parents=True)
+        (tmp_path / "synpick_warp" / folder / "add.py").write_text(text)
     code = main(tmp_path)
     lines = capsys.readouterr().out.splitlines()
     assert code == (1 if lines else 0)

@@ -27,7 +27,7 @@ CODES = "synpick_warp.codes"
 TYPES = ("typing", "collections")
 """Modules whose names annotations have."""
 LAUNCHING = ("synpick_warp/stages", "synpick_warp/newton_patches")
-HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
+HOST_FOLDERS = ("synpick_warp", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
 _ARRAY = re.compile(r"wp\.array(?:([234])d)?\[")
 _SHAPE = re.compile(r"#\s*\(([^)]*)\)")
@@ -40,7 +40,7 @@ Writes = dict[str, set[int]]
 
 def main(root: Path) -> int:
     """Check the tree under `root`; return the exit code."""
-    modules = {path: ast.parse(path.read_text()) for path in sorted((root / "kernels").rglob("*.py"))}
+    modules = {path: ast.parse(path.read_text()) for path in sorted((root / "synpick_warp" / "kernels").rglob("*.py"))}
     writes = function_writes(modules)
     faults = [fault for path, tree in modules.items() for fault in check_module(path, tree, writes)]
     faults += [fault for folder in HOST_FOLDERS for fault in check_launches(root, folder)]

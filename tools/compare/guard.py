@@ -85,7 +85,11 @@ class Side:
     @property
     def version(self) -> str:
         """Version of the package in this checkout."""
-        match = _VERSION.search((self.checkout / "synpick_warp" / "__init__.py").read_text())
+        match = _VERSION.search(
+            "".join(
+                path.read_text() for name in ("_version", "__init__") if (path := self.checkout / "synpick_warp" / f"{name}.py").exists()
+            )
+        )
         return match[1] if match else "unknown"
 
     def environment(self) -> dict[str, str]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from synpick_warp import __version__
+from synpick_warp._version import __version__
 from synpick_warp.apps.report.album import Album
 from synpick_warp.apps.report.charts import Source, make_charts
 from synpick_warp.apps.report.explained import choose_attempts, make_attempt

@@ -13,7 +13,7 @@ from pathlib import Path
 import warp as wp
 from rich.table import Table
 
-from synpick_warp import __version__
+from synpick_warp._version import __version__
 from synpick_warp.cli.display import format_duration, make_console, make_progress
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config

@@ -25,7 +25,7 @@ from typing import Any
 
 import msgspec
 
-from synpick_warp import __version__
+from synpick_warp._version import __version__
 from synpick_warp.configs.cell.bins import Bins
 from synpick_warp.configs.cell.gripper import EACH, SUCTION1
 from synpick_warp.configs.episodes.manipulation import MASK, SAME

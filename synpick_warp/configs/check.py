@@ -54,7 +54,7 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
     except (_MismatchError, ValueError) as mismatch:
         allowed = str(mismatch) or describe_type(annotation)
         raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
-    if isinstance(result, Distribution) and result.kind == OFF != item.default.kind:
+    if isinstance(result, Distribution) and result.kind == OFF != getattr(item.default, "kind", OFF):
         raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}")
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
@@ -74,7 +74,7 @@ def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
         return "a path, in a file relative to it"
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if _is_distribution(annotation):
-        off = f'"{OFF}", ' if item.default.kind == OFF else ""
+        off = f'"{OFF}", ' if getattr(item.default, "kind", "") == OFF else ""
         return f"{off}{annotation.noun} or distribution, {', '.join(words)}"
     if not words:
         return describe_type(annotation)
