@@ -1,32 +1,28 @@
-"""Default folders and files of the commands: where a bake writes without --out, which data set the others read, where outputs go.
+"""Default folders and files of the commands: which data set is read, where outputs go.
 
-A data set is a folder with manifest.json and manifest/. The others take the current folder if it is one, else the last data set in it:
+A data set is a folder with manifest.json and manifest/. Commands take the current folder if it is one, else the last data set in it:
 finished ones before unfinished ones, then by the time at which an episode was last committed, which neither reading nor checking changes.
 """
 
 from __future__ import annotations
 
-import fcntl
 import os
-import re
 import stat
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from synpick_warp.cli.options import one_line
-from synpick_warp.configs.schema import Bake, Split
-from synpick_warp.errors import DatasetError, OutputError, SynpickError, escape
+from synpick_warp.errors import DatasetError, OutputError, escape
 from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
 
 DEFAULT_NAME = "synpick-data"
-"""Folder of a bake without --out; its neighbours are synpick-data-2, synpick-data-3, ..."""
-_NUMBERED = re.compile(rf"{DEFAULT_NAME}(?:-([2-9]|[1-9][0-9]{{1,8}}))?")
+"""Folder of a bake without --out."""
 _MAX_NAMED = 3
 """Most folders that a message names."""
 OWN_SUFFIXES = (".png", ".jpg", ".jpeg", ".html", ".htm", ".csv")
@@ -53,92 +49,6 @@ def _has(path: str, kind: Callable[[int], bool]) -> bool:
         return kind(os.lstat(path).st_mode)
     except (OSError, ValueError):
         return False
-
-
-# ---- where a bake writes ----
-
-
-def choose_output(manifest: dict[str, Any], bake: Bake, splits: Sequence[Split]) -> tuple[Path, str]:
-    """Choose the folder of a bake without --out: that of the same bake, else the first of DEFAULT_NAME and its neighbours that is free.
-
-    The same bake has the same settings, number of episodes, and folders of objects and lights; it resumes.
-
-    Args:
-        manifest: Its manifest.
-        bake, splits: Of its settings.
-
-    Returns:
-        The folder, relative to the current one, and the choice in a line.
-
-    Raises:
-        OutputError: The current folder is in a data set, or cannot be read.
-    """
-    try:
-        inside = next((folder for folder in (Path.cwd(), *Path.cwd().parents) if is_data_set(folder)), None)
-        names = sorted((int(match[1] or 1), name) for name in os.listdir() if (match := _NUMBERED.fullmatch(name)))
-    except OSError as error:
-        raise OutputError(f"the current folder cannot be read: {error.strerror}; name the data set's folder with --out") from None
-    if inside is not None:
-        raise OutputError(f"the current folder is in the data set {inside}; name the new data set's folder with --out")
-    known = {number: Path(name) for number, name in names}
-    own = next((folder for folder in known.values() if _is_same_bake(folder, manifest, _extent(bake, splits))), None)
-    if own is not None:
-        return own, f"data set: ./{own}, which the same bake has started"
-    number = 1
-    while number in known and not _is_free(known[number]):
-        number += 1
-    taken = [str(folder) for folder in known.values()][: number - 1]
-    more = f" and {len(taken) - _MAX_NAMED} more" if len(taken) > _MAX_NAMED else ""
-    reason = f"; {', '.join(taken[:_MAX_NAMED])}{more} {'is' if len(taken) == 1 else 'are'} taken" if taken else ""
-    folder = Path(DEFAULT_NAME if number == 1 else f"{DEFAULT_NAME}-{number}")
-    return folder, f"data set: ./{folder} (--out names another folder{reason})"
-
-
-def _is_same_bake(folder: Path, wanted: dict[str, Any], extent: tuple[object, ...]) -> bool:
-    """Whether a folder is of a bake with this manifest and extent."""
-    from synpick_warp.dataset.commit.manifest import CONFIG_FILE, INPUTS, describe_differences, read_manifest, read_settings
-
-    if not is_data_set(folder):
-        return False
-    try:
-        manifest = read_manifest(folder)
-        if describe_differences(wanted, {name: manifest[name] for name in manifest if name != INPUTS}):
-            return False
-        # Without settings it was killed before its first episode.
-        if not os.path.lexists(folder / CONFIG_FILE):
-            return True
-        settings = read_settings(folder, manifest)
-        return _extent(settings.bake, settings.splits) == extent
-    except (SynpickError, OSError):
-        return False
-
-
-def _extent(bake: Bake, splits: Sequence[Split]) -> tuple[object, ...]:
-    """What the manifest does not have of a bake: numbers of episodes, absolute folders of models and lights."""
-    folders = (os.path.abspath(path) if path else "" for path in (bake.models, bake.lights))
-    return (bake.episodes, *(split.episodes for split in splits), *folders)
-
-
-def _is_free(folder: Path) -> bool:
-    """Whether a bake can take an existing folder: it is empty but for hidden files, and no other bake is about to fill it."""
-    if not _has(str(folder), stat.S_ISDIR):
-        return False
-    try:
-        if any(name == ".partial" or not name.startswith(".") for name in os.listdir(folder)):
-            return False
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # A file system without locks.
-        return True
-    else:
-        return True
-    finally:
-        os.close(handle)
 
 
 # ---- which data set is read ----

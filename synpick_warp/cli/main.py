@@ -23,7 +23,7 @@ from synpick_warp.cli.commands.statistics import show_statistics
 from synpick_warp.cli.commands.validate import validate
 from synpick_warp.cli.commands.verify import verify
 from synpick_warp.cli.examples import EXAMPLES
-from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, choose_output, drop_fetched, name_fetched
+from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
 from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
@@ -116,8 +116,8 @@ OutOption = Annotated[
     Path | None,
     Parameter(
         help="Output folder: new, empty, or of an interrupted bake with the same settings "
-        f"(default {DEFAULT_NAME} in the current folder, or {DEFAULT_NAME}-2, ... if other bakes have taken it). Or a prefix in an object "
-        "store, such as s3://bucket/prefix (pip install 'synpick-warp[cloud]')."
+        f"(default {DEFAULT_NAME} in the current folder). Or a prefix in an object store, such as s3://bucket/prefix (pip install "
+        "'synpick-warp[cloud]')."
     ),
 ]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
@@ -207,7 +207,7 @@ def bake(
     crew = parse_engine(engine, workers, price, out, devices or shard, claim)
     if dry_run:
         return _forecast(resolved, out, part, names)
-    out = out or _choose_out(resolved)
+    out = out or _default_out()
     run = partial(_bake, resolved, out, part, names, several, claim, crew)
     return _profiled(run, profile_out, out) if profiles else run()
 
@@ -403,13 +403,10 @@ def _profiled(bake: Callable[[], int], named: Path | None, out: Path) -> int:
     return code
 
 
-def _choose_out(config: Config) -> Path:
-    """Choose the default output folder, and print the choice."""
-    from synpick_warp.dataset.commit.manifest import make_manifest
-
-    out, choice = choose_output(make_manifest(config), config.bake, config.splits)
-    print(choice, flush=True)
-    return out
+def _default_out() -> Path:
+    """Output folder of a bake without --out, which is printed."""
+    print(f"data set: ./{DEFAULT_NAME} (--out names another folder)", flush=True)
+    return Path(DEFAULT_NAME)
 
 
 def _forecast(config: Config, out: Path | None, shard: tuple[int, int], splits: Sequence[str]) -> int:

@@ -1,9 +1,8 @@
-"""Default folders: where a bake writes without --out, which data set the other commands read, and outputs that must replace nothing."""
+"""Default folders: where a bake writes without --out, which data set the other commands read, and outputs that replace nothing."""
 
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 import os
 import shutil
@@ -11,13 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cli.folders import beside, choose_output
+from synpick_warp.cli.folders import beside
 from synpick_warp.cli.main import main
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
-from synpick_warp.errors import OutputError
 from tests.builders import mistake
 from tests.harness.scripted_bake import bake, settings
 
@@ -77,61 +75,14 @@ def test_splits_set_their_own_episodes():
     assert load_config("synpick", {"bake.worlds": 512}, splits=True).bake.episodes == 300
 
 
-def chosen(config: Config) -> tuple[Path, str]:
-    return choose_output(make_manifest(config), config.bake, config.splits)
-
-
-def test_a_bake_without_a_folder_takes_the_first_that_is_free_or_its_own(here):
-    config, other = load_config("smoke"), load_config("smoke", {"bake.seed": 5})
-    assert chosen(config) == (Path("synpick-data"), "data set: ./synpick-data (--out names another folder)")
-    (here / "synpick-data").mkdir()
-    (here / "synpick-data" / ".git").mkdir()
-    assert chosen(config)[0] == Path("synpick-data")
-    start("synpick-data", config)
-    assert chosen(config) == (Path("synpick-data"), "data set: ./synpick-data, which the same bake has started")
-    said = "data set: ./synpick-data-2 (--out names another folder; synpick-data is taken)"
-    assert chosen(other) == (Path("synpick-data-2"), said)
-    start("synpick-data-12", other)
-    assert chosen(other)[0] == Path("synpick-data-12")
-
-
-@pytest.mark.parametrize(
-    "given",
-    [{"bake.episodes": 3}, {"bake.worlds": 3}, {"bake.models": "there"}, {"bake.lights": "there"}, {"bake.formats": ["shards"]}],
-)
-def test_another_bake_is_one_of_other_settings_extent_or_inputs(here, given):
-    start("synpick-data", load_config("smoke"))
-    assert chosen(load_config("smoke", given))[0] == Path("synpick-data-2")
-
-
-def test_where_it_was_baked_and_how_fast_makes_no_other_bake(here):
-    start("synpick-data", load_config("smoke", {"bake.models": "there"}))
-    same = load_config("smoke", {"bake.models": str(here / "there"), "bake.worlds": 1, "bake.episodes": 2, "bake.writers": 3})
-    assert chosen(same)[0] == Path("synpick-data")
-
-
-def test_what_only_looks_like_a_folder_of_ours_is_left_alone(here):
-    config = load_config("smoke")
-    (here / "synpick-data").write_text("a file")
-    (here / "synpick-data-2").symlink_to("nowhere")
-    start("synpick-data-3", config).joinpath("manifest.json").write_text("{")
-    (here / "synpick-data-4").mkdir()
-    (here / "synpick-data-4" / "thesis.txt").touch()
-    (here / "synpick-data-5").mkdir()
-    handle = os.open("synpick-data-5", os.O_RDONLY)
-    fcntl.flock(handle, fcntl.LOCK_EX)  # A bake that has not written its manifest yet.
-    folder, said = chosen(config)
-    os.close(handle)
-    assert folder == Path("synpick-data-6")
-    assert said.endswith("synpick-data, synpick-data-2, synpick-data-3 and 2 more are taken)")
-    assert chosen(config)[0] == Path("synpick-data-5")
-
-
-def test_a_bake_within_a_data_set_needs_a_folder(here, monkeypatch):
-    monkeypatch.chdir(start("DATA", load_config("smoke")) / "manifest")
-    with pytest.raises(OutputError, match=r"the current folder is in the data set .*DATA; name the new data set's folder with --out"):
-        chosen(load_config("smoke"))
-    assert main(["bake", "--config", "smoke", "--device", "cpu"]) == 2
+def test_a_bake_without_a_folder_takes_the_default_one_unless_another_bake_has_it(here, monkeypatch):
+    start("synpick-data", load_config("smoke", {"bake.seed": 5}))
+    line = mistake("bake", "--config", "smoke", "--device", "cpu")
+    assert line.startswith("synpick-data was started with other settings: ")
+    assert line.endswith("; resume with the same, or name another folder with --out")
+    monkeypatch.chdir(here / "synpick-data" / "manifest")
+    line = mistake("bake", "--config", "smoke", "--device", "cpu")
+    assert line.startswith("--out is synpick-data, among the files of the data set ")
 
 
 # ---- which data set the others read ----
