@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from synpick_warp.configs.cell.bins import BinRow
 from synpick_warp.configs.cell.cameras import CameraRow, Jitter, Pose
 from synpick_warp.configs.episodes.randomize import Distribution
-from synpick_warp.configs.fields import INT32_MAX
-from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.fields import INT32_MAX, settings_of
+from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Settle
 from synpick_warp.configs.schema import Physics as PhysicsSettings
 from synpick_warp.errors import ConfigError, SynpickError
@@ -166,8 +166,8 @@ def test_times_of_more_ticks_than_32_bits_count_are_out_of_range(key):
         ConfigError, match=rf"{key} is 1e\+300 in the settings passed; allowed: (above|at least) 0, at most (3600|60) \[s\]"
     ):
         load_config("smoke", {key: 1e300})
-    step = settings_of(PhysicsSettings)["step"][0].metadata["low"]
-    assert settings_of(Settle)["max_time"][0].metadata["high"] < INT32_MAX * step
+    step = settings_of(PhysicsSettings)["step"].bounds.low
+    assert settings_of(Settle)["max_time"].bounds.high < INT32_MAX * step
 
 
 def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed(tmp_path, monkeypatch):
@@ -345,10 +345,10 @@ def test_any_text_in_the_files_of_control_groups_gives_a_number(tmp_path_factory
 # ---- any settings ----
 
 NUMBERS = [
-    (f"{section}.{name}", annotation)
+    (f"{section}.{name}", item.kind)
     for section, kind in sections().items()
-    for name, (_, annotation) in settings_of(kind).items()
-    if annotation in (int, float, tuple[int, int])
+    for name, item in settings_of(kind).items()
+    if item.kind in (int, float, tuple[int, int])
 ]
 WHOLE = st.one_of(
     st.integers(-1, 4096),

@@ -21,9 +21,9 @@ from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.codes import names
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
+from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.files.load import sections, table_lists
-from synpick_warp.configs.files.split_tables import SPLITS, split_settings
-from synpick_warp.configs.files.table_lists import settings_of
+from synpick_warp.configs.files.split_tables import SPLITS
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from synpick_warp.views.picks import COLUMNS, STATES
@@ -71,13 +71,12 @@ def _anchor(title: str) -> str:
 def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
     lines = [f'| <a id="{_anchor(title)}"></a>**`{title}`** | | | | **{" ".join((kind.__doc__ or "").split())}** |']
-    for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
-        if is_table(annotation):
-            lines += _section(f"{prefix}{name}", annotation, f"{prefix}{name}.")[1:]
+    for name, item in settings_of(kind).items():
+        if is_table(item.kind):
+            lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
             continue
-        unit, rule = item.metadata["unit"], describe_allowed(item, annotation)
         default = "" if item.default is None else f"`{format_toml(item.default)}`"
-        lines.append(f"| `{prefix}{name}` | {default} | {unit} | {rule} | {item.metadata['doc']} |")
+        lines.append(f"| `{prefix}{name}` | {default} | {item.unit} | {describe_allowed(item)} | {item.doc} |")
     return lines
 
 

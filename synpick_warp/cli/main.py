@@ -40,7 +40,7 @@ from synpick_warp.cli.options import (
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.fields import PATH_RULE
+from synpick_warp.configs.fields import PATH_RULE, settings_of
 from synpick_warp.configs.files.load import (
     COMMAND_LINE,
     DEFAULT_PRESET,
@@ -48,7 +48,6 @@ from synpick_warp.configs.files.load import (
     parse_assignment,
     preset_names,
     sections,
-    settings_of,
 )
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
@@ -85,11 +84,11 @@ app = App(
 def _help(key: str, extra: str = "") -> str:
     """Help text of a setting from its declaration: meaning, range, default, unit and key."""
     section, name = key.split(".")
-    item, kind = settings_of(sections()[section])[name]
-    unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
+    item = settings_of(sections()[section])[name]
+    unit = f" {item.unit}" if item.unit else ""
     default = "x".join(map(str, item.default)) if isinstance(item.default, tuple) else str(item.default) or "empty"
-    rule = "" if kind is str and not item.metadata["choices"] else f"{describe_allowed(item, kind)}; "
-    return f"{item.metadata['doc']}{extra} ({rule}default {default}{unit}; {key})"
+    rule = "" if item.kind is str and not item.choices else f"{describe_allowed(item)}; "
+    return f"{item.doc}{extra} ({rule}default {default}{unit}; {key})"
 
 
 ConfigOption = Annotated[

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from synpick_warp.configs.episodes.randomize import OFF, Distribution
+from synpick_warp.configs.fields import Setting
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _NAMES = {
@@ -35,50 +36,47 @@ def to_index(value: object) -> int | None:
         return None
 
 
-def check_value(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
+def check_value(key: str, value: object, item: Setting, source: str) -> Any:
     """Validate a value; returns it in the type of its setting, for instance a list as a tuple.
 
     Args:
         key: Full key of the setting, for messages.
         value: The value as parsed from TOML.
-        item: The setting's field, declared by `fields.setting`.
-        annotation: The field's resolved type.
+        item: The setting.
         source: Where the value comes from, for messages, such as "in my.toml".
 
     Raises:
         ConfigError: The value has the wrong type or length, is not finite, or lies outside the setting's range.
     """
+    hint = ""
     try:
-        parse = item.metadata.get("parse")
-        result = _convert(parse(value) if parse else value, annotation)
+        result = _convert(item.parse(value) if item.parse else value, item.kind)
     except (_MismatchError, ValueError) as mismatch:
-        allowed = str(mismatch) or describe_type(annotation)
-        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
-    if isinstance(result, Distribution) and result.kind == OFF != getattr(item.default, "kind", OFF):
-        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}")
-    if not all(_inside(leaf, item) for leaf in _leaves(result)):
-        wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
-        hint = suggest(str(wrong), item.metadata["choices"])
-        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}{hint}")
-    return result
+        allowed = str(mismatch) or describe_type(item.kind)
+    else:
+        wrong = [leaf for leaf in _leaves(result) if not _inside(leaf, item)]
+        is_off = isinstance(result, Distribution) and result.kind == OFF != getattr(item.default, "kind", OFF)
+        if not wrong and not is_off:
+            return result
+        allowed, hint = describe_allowed(item), "" if is_off else suggest(str(wrong[0]), item.choices)
+    unit = f" [{item.unit}]" if item.unit else ""
+    raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{unit}{hint}")
 
 
-def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
+def describe_allowed(item: Setting) -> str:
     """Describe the range or the choices of a setting, or its type if it has neither."""
-    rules = item.metadata
-    if rules["allowed"]:
-        return rules["allowed"]
-    if rules["choices"]:
-        return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(choice or '""' for choice in rules["choices"])
-    if rules["path"]:
+    if item.allowed:
+        return item.allowed
+    is_list = typing.get_origin(item.kind) is tuple
+    if item.choices:
+        return "any of " * is_list + ", ".join(choice or '""' for choice in item.choices)
+    if item.path:
         return "a path, in a file relative to it"
-    words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
-    if _is_distribution(annotation):
+    words = [f"{word} {_number(bound)}" for name, word in _BOUNDS if (bound := getattr(item.bounds, name)) is not None]
+    if _is_distribution(item.kind):
         off = f'"{OFF}", ' if getattr(item.default, "kind", "") == OFF else ""
-        return f"{off}{annotation.noun} or distribution, {', '.join(words)}"
-    if not words:
-        return describe_type(annotation)
-    return ("each " if typing.get_origin(annotation) is tuple else "") + ", ".join(words)
+        return f"{off}{item.kind.noun} or distribution, {', '.join(words)}"
+    return "each " * is_list + ", ".join(words) if words else describe_type(item.kind)
 
 
 def describe_type(annotation: Any, *, plural: bool = False) -> str:
@@ -169,23 +167,14 @@ def _leaves(value: Any) -> Iterator[Any]:
         yield value
 
 
-def _inside(leaf: Any, item: dataclasses.Field[Any]) -> bool:
+def _inside(leaf: Any, item: Setting) -> bool:
     """Whether a value is one of the choices, or within the bounds, of its setting."""
-    rules = item.metadata
-    if rules["choices"]:
-        return leaf in rules["choices"]
+    if item.choices:
+        return leaf in item.choices
     if isinstance(leaf, str | bool):
         return True
-    return (
-        (rules["low"] is None or leaf >= rules["low"])
-        and (rules["high"] is None or leaf <= rules["high"])
-        and (rules["above"] is None or leaf > rules["above"])
-    )
-
-
-def _unit(item: dataclasses.Field[Any]) -> str:
-    """Unit of a setting in brackets, after a space; empty without one."""
-    return f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""
+    low, high, above = item.bounds.low, item.bounds.high, item.bounds.above
+    return (low is None or leaf >= low) and (high is None or leaf <= high) and (above is None or leaf > above)
 
 
 def _number(value: float) -> str:

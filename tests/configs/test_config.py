@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.configs.calibration.sensor_presets import ASSUMED, DEFINED, MEASURED, PUBLISHED, SENSORS, sensor_settings
+from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import (
     COMMAND_LINE,
     load_config,
@@ -21,7 +22,6 @@ from synpick_warp.configs.files.load import (
     parse_assignment,
     preset_names,
     sections,
-    settings_of,
 )
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, ObjectRow
@@ -314,9 +314,7 @@ def test_presets_survive_writing_and_reading(tmp_path, name, comments):
     assert ("[N·s/m]" in text) == comments
 
 
-PATHS = sorted(
-    f"{section}.{name}" for section, kind in sections().items() for name, (item, _) in settings_of(kind).items() if item.metadata["path"]
-)
+PATHS = sorted(f"{section}.{name}" for section, kind in sections().items() for name, item in settings_of(kind).items() if item.path)
 
 
 def test_paths_in_a_file_are_relative_to_it_and_others_to_the_current_folder(tmp_path, monkeypatch):
@@ -337,33 +335,33 @@ def test_paths_in_a_file_are_relative_to_it_and_others_to_the_current_folder(tmp
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 
 
-def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
+def values(item: Setting) -> st.SearchStrategy:
     """Strategy for the allowed values of a setting."""
-    rules = item.metadata
-    if rules["choices"]:
-        one = st.sampled_from(rules["choices"])
+    bounds, kind = item.bounds, item.kind
+    if item.choices:
+        one = st.sampled_from(item.choices)
         min_size = 0 if item.default == () else 1
         return st.lists(one, min_size=min_size, unique=True).map(tuple) if kind == tuple[str, ...] else one
     if kind is float:
-        low = rules["above"] if rules["above"] is not None else rules["low"]
-        return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
+        low = bounds.above if bounds.above is not None else bounds.low
+        return st.floats(low, bounds.high, exclude_min=bounds.above is not None, allow_nan=False, allow_infinity=False)
     if kind is int:
-        return st.integers(rules["low"], min(rules["high"] or 2**63 - 1, 2**63 - 1))
-    text = TEXT.map(lambda name: name and os.path.abspath(name)) if rules["path"] else TEXT
+        return st.integers(bounds.low, bounds.high or 2**63 - 1)
+    text = TEXT.map(lambda name: name and os.path.abspath(name)) if item.path else TEXT
     return st.booleans() if kind is bool else text
 
 
 def free_settings() -> dict[str, st.SearchStrategy]:
-    known = {f"{section}.{name}": pair for section, kind in sections().items() for name, pair in settings_of(kind).items()}
-    free = {key: pair for key, pair in known.items() if key not in COUPLED and key.split(".")[0] not in COUPLED_SECTIONS}
-    return {key: values(*pair) for key, pair in free.items() if pair[1] in (float, int, bool, str, tuple[str, ...])}
+    known = {f"{section}.{name}": item for section, kind in sections().items() for name, item in settings_of(kind).items()}
+    free = {key: item for key, item in known.items() if key not in COUPLED and key.split(".")[0] not in COUPLED_SECTIONS}
+    return {key: values(item) for key, item in free.items() if item.kind in (float, int, bool, str, tuple[str, ...])}
 
 
 TURNS = {
     "symmetries_discrete": st.sampled_from([(), ((0.0, 0.0, 1.0, 4.0), (1.0, 0.0, 0.0, 2.0, 0.0, 0.1, 0.0))]),
     "symmetries_continuous": st.sampled_from([(), ((0.0, 1.0, 0.5),), ((0.0, 1.0, 0.0, 0.1, 0.0, 0.0),)]),
 }
-ROW = st.builds(ObjectRow, **{name: values(*pair) for name, pair in settings_of(ObjectRow).items()} | TURNS)
+ROW = st.builds(ObjectRow, **{name: values(item) for name, item in settings_of(ObjectRow).items()} | TURNS)
 ROWS = st.lists(ROW, max_size=3, unique_by=lambda row: row.id)
 WORD = st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=20)
 ANYTHING = st.one_of(st.none(), st.integers(), st.floats(), TEXT, st.lists(st.integers(), max_size=3))

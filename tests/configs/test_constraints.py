@@ -6,7 +6,8 @@ import re
 
 import pytest
 
-from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.grippers.mechanism import finger_collider
 from synpick_warp.scenes.grippers.suction1 import cup_collider
@@ -129,11 +130,10 @@ def test_values_at_the_limits_of_their_constraints(overrides):
 def test_every_number_has_limits_at_both_ends():
     """Of a setting with one end open, some value makes labels meaningless, such as depth in counts of a kilometre."""
     for section, kind in sections().items():
-        for name, (item, annotation) in settings_of(kind).items():
-            if any(word in str(annotation) for word in ("float", "int")):
-                rules = item.metadata
-                assert rules["high"] is not None, f"{section}.{name}"
-                assert (rules["low"] is None) != (rules["above"] is None), f"{section}.{name}"
+        for name, item in settings_of(kind).items():
+            if any(word in str(item.kind) for word in ("float", "int")):
+                assert item.bounds.high is not None, f"{section}.{name}"
+                assert (item.bounds.low is None) != (item.bounds.above is None), f"{section}.{name}"
 
 
 @pytest.mark.parametrize("size", [{"cup_length": 0.5, "cup_width": 0.005}, {"cup_length": 0.005, "cup_width": 0.5}])

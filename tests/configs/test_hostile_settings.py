@@ -12,7 +12,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
-from synpick_warp.configs.files.load import load_config, parse_assignment, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import load_config, parse_assignment, sections
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.errors import ConfigError

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.dataset.modes import mode_weights
-from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from tests.twins import rng

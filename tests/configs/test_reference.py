@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from synpick_warp.configs.files.load import preset_names, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import preset_names, sections
 from tools.docs import SETTINGS_REFERENCE, settings_reference
 
 

@@ -13,7 +13,8 @@ import pytest
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.episodes.randomize import FIXED, Distribution
-from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import fields
 from unittest import mock
 
 import numpy as np
@@ -15,6 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
 from scipy.spatial.transform import Rotation
 
+from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.collision import simplification
@@ -161,7 +161,7 @@ def test_fewer_vertices_than_a_box_has_are_refused(limit):
 
 
 def test_the_settings_allow_no_fewer_vertices_either():
-    lows = {field.name: field.metadata["low"] for field in fields(Objects) if field.name in ("hull_vertices", "piece_vertices")}
+    lows = {name: settings_of(Objects)[name].bounds.low for name in ("hull_vertices", "piece_vertices")}
     assert lows == {"hull_vertices": MIN_VERTICES, "piece_vertices": MIN_VERTICES}
 
 

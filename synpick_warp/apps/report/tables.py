@@ -9,7 +9,8 @@ from synpick_warp.apps.report.markup import Html, element, join
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.files.load import load_config, sections, settings_of
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.system.codecs.tables import Table
@@ -92,10 +93,10 @@ def changed_settings(config: Config) -> list[tuple[str, str, str, str]]:
     """Key, value, value of the default preset, and meaning of each setting that differs from it."""
     default, rows = load_config(), []
     for section, kind in sections().items():
-        for name, (item, _) in settings_of(kind).items():
+        for name, item in settings_of(kind).items():
             key = f"{section}.{name}"
             here, there = config.value(key), default.value(key)
             if here != there:
-                unit = f" [{item.metadata['unit']}]" if item.metadata["unit"] else ""
-                rows.append((key, format_toml(here), format_toml(there), f"{item.metadata['doc']}{unit}"))
+                unit = f" [{item.unit}]" if item.unit else ""
+                rows.append((key, format_toml(here), format_toml(there), f"{item.doc}{unit}"))
     return rows

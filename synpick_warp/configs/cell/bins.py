@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from synpick_warp.configs.episodes.objects import UNITS
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import Color, Fraction, Within, above, setting
 from synpick_warp.errors import ConfigError, format_value
 
 TOTE, OWN, NONE, PALLET = "tote", "own", "none", "pallet"
@@ -18,13 +18,15 @@ KINDS = (TOTE, OWN, NONE, PALLET)
 class Tote:
     """The tote (an open box). Its frame is the world frame: origin at the centre of the inner floor, z up. Sizes of the released mesh."""
 
-    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0, high=10.0)
-    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Length and width of the inner floor.", above=0.0, high=10.0)
-    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Length and width of the opening at the rim.", above=0.0, high=10.0)
-    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0, high=1.0)
-    color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
-    metallic: float = setting(0.0, "", "Metallic factor.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
+    outer_size: Annotated[tuple[float, float, float], above(0.0, 10.0, "m")] = setting(
+        (0.615, 0.373, 0.200), "Outer length, width and height."
+    )
+    floor_size: Annotated[tuple[float, float], above(0.0, 10.0, "m")] = setting((0.513, 0.319), "Length and width of the inner floor.")
+    rim_size: Annotated[tuple[float, float], above(0.0, 10.0, "m")] = setting((0.545, 0.352), "Length and width of the opening at the rim.")
+    wall: Annotated[float, above(0.0, 1.0, "m")] = setting(0.0045, "Thickness of walls and floor.")
+    color: Color = setting((0.65, 0.05, 0.04), "Base colour.")
+    metallic: Fraction = setting(0.0, "Metallic factor.")
+    roughness: Fraction = setting(0.5, "Roughness.")
 
 
 AXES = ("z", "-z", "y", "-y", "x", "-x")
@@ -43,21 +45,23 @@ class MeasuredBin:
     along its sides."""
 
     REQUIRED: ClassVar = ("box", "opening", "height", "compartments", "checksum")
-    box: tuple[float, float, float, float, float, float] = setting((0.0,) * 6, "m", "Lower and upper corner of the mesh.")
-    opening: tuple[float, float] = setting((0.0, 0.0), "m", "Length and width of the inside at the rim.", above=0.0)
-    floor: tuple[float, float] | None = setting(
-        None, "m", "Length and width of the floor from wall to wall; as the opening unless it is given.", above=0.0
+    box: Annotated[tuple[float, float, float, float, float, float], Within(unit="m")] = setting(
+        (0.0,) * 6, "Lower and upper corner of the mesh."
     )
-    height: float = setting(0.0, "m", "Height of the rim, over which the inside would spill.", above=0.0)
-    origin: tuple[float, float, float] = setting((0.0, 0.0, 0.0), "m", "Origin of the bin's frame in the world.")
-    yaw: float | None = setting(None, "°", "Angle about z of the bin's frame in the world; 0 unless it is given.")
-    compartments: tuple[tuple[float, float, float, float, float, float, float], ...] = setting(
-        (), "m", "Floor of each compartment: centre x, y, length, width; and its height, z = a x + b y + c."
+    opening: Annotated[tuple[float, float], above(0.0, unit="m")] = setting((0.0, 0.0), "Length and width of the inside at the rim.")
+    floor: Annotated[tuple[float, float] | None, above(0.0, unit="m")] = setting(
+        None, "Length and width of the floor from wall to wall; as the opening unless it is given."
     )
-    openings: tuple[tuple[float, float, float, float], ...] | None = setting(
-        None, "m", "Opening of each compartment: centre x, y, length, width; as the floors unless it is given."
+    height: Annotated[float, above(0.0, unit="m")] = setting(0.0, "Height of the rim, over which the inside would spill.")
+    origin: Annotated[tuple[float, float, float], Within(unit="m")] = setting((0.0, 0.0, 0.0), "Origin of the bin's frame in the world.")
+    yaw: Annotated[float | None, Within(unit="°")] = setting(None, "Angle about z of the bin's frame in the world; 0 unless it is given.")
+    compartments: Annotated[tuple[tuple[float, float, float, float, float, float, float], ...], Within(unit="m")] = setting(
+        (), "Floor of each compartment: centre x, y, length, width; and its height, z = a x + b y + c."
     )
-    checksum: str = setting("", "", "SHA-256 of the mesh and its material.")
+    openings: Annotated[tuple[tuple[float, float, float, float], ...] | None, Within(unit="m")] = setting(
+        None, "Opening of each compartment: centre x, y, length, width; as the floors unless it is given."
+    )
+    checksum: str = setting("", "SHA-256 of the mesh and its material.")
 
 
 @dataclass(frozen=True)
@@ -65,27 +69,25 @@ class BinRow(Tote):
     """A bin of bins.kind = "own", an open box as the tote or a mesh. An episode draws one of the bins by their weights."""
 
     REQUIRED: ClassVar = ("name",)
-    name: str = setting("", "", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
-    weight: float = setting(1.0, "", "Weight with which an episode draws it.", low=0.0, high=1e6)
-    compartments: tuple[int, int] = setting((1, 1), "", "Columns (along x) and rows of compartments of equal floors.", low=1, high=6)
-    divider_height: float = setting(0.1, "m", "Height of the dividers between compartments.", above=0.0, high=10.0)
-    file: str | None = setting(None, "", "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) instead of sizes and compartments.", path=True)
-    unit: str | None = setting(None, "", "Unit of the mesh; m unless it is given.", choices=tuple(UNITS))
-    up: str | None = setting(None, "", "Axis of the mesh that points up; z unless it is given.", choices=AXES)
+    name: str = setting("", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
+    weight: Annotated[float, Within(0.0, 1e6)] = setting(1.0, "Weight with which an episode draws it.")
+    compartments: Annotated[tuple[int, int], Within(1, 6)] = setting((1, 1), "Columns (along x) and rows of compartments of equal floors.")
+    divider_height: Annotated[float, above(0.0, 10.0, "m")] = setting(0.1, "Height of the dividers between compartments.")
+    file: str | None = setting(None, "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) instead of sizes and compartments.", path=True)
+    unit: str | None = setting(None, "Unit of the mesh; m unless it is given.", choices=tuple(UNITS))
+    up: str | None = setting(None, "Axis of the mesh that points up; z unless it is given.", choices=AXES)
     place: str | None = setting(
         None,
-        "",
         "Where the mesh lies: floor (unless it is given: its lowest inner point is the world's z = 0, below the middle of its opening), or "
         "file (as modelled: the mesh's origin is the world's; bins after the first stand on the table of the first).",
         choices=PLACES,
     )
     collision: str | None = setting(
         None,
-        "",
         "What the mesh collides as: mesh (unless it is given), or box (a closed one between its floors and openings, for baskets of wire).",
         choices=COLLISIONS,
     )
-    measured: MeasuredBin | None = setting(None, "", "What the mesh measures; the program writes this table.")
+    measured: MeasuredBin | None = setting(None, "What the mesh measures; the program writes this table.")
 
     @property
     def replaced(self) -> tuple[str, ...]:
@@ -99,20 +101,21 @@ class Bins:
 
     kind: str = setting(
         TOTE,
-        "",
         "What objects are dropped into or onto: tote ([tote]), own (a bin of [[bin]], drawn in each episode), none (the table), pallet.",
         choices=KINDS,
     )
-    shift: tuple[float, float] = setting(
-        (0.0, 0.0), "m", "Half widths of the offset in x and y that each episode draws for its bin.", low=0.0, high=1.0
+    shift: Annotated[tuple[float, float], Within(0.0, 1.0, "m")] = setting(
+        (0.0, 0.0), "Half widths of the offset in x and y that each episode draws for its bin."
     )
-    yaw: float = setting(0.0, "°", "Half width of the rotation about z that each episode draws for its bin.", low=0.0, high=180.0)
-    area: tuple[float, float] = setting(
-        (0.5, 0.35), "m", "Length and width over which objects are dropped, without walls.", above=0.0, high=10.0
+    yaw: Annotated[float, Within(0.0, 180.0, "°")] = setting(0.0, "Half width of the rotation about z that each episode draws for its bin.")
+    area: Annotated[tuple[float, float], above(0.0, 10.0, "m")] = setting(
+        (0.5, 0.35), "Length and width over which objects are dropped, without walls."
     )
-    margin: float = setting(0.15, "m", "Without walls, an object that is farther outside of the area has left.", low=0.0, high=5.0)
-    pallet_size: tuple[float, float, float] = setting(
-        (0.6, 0.4, 0.144), "m", "Length, width and height of the pallet; half a EUR pallet by default.", above=0.0, high=10.0
+    margin: Annotated[float, Within(0.0, 5.0, "m")] = setting(
+        0.15, "Without walls, an object that is farther outside of the area has left."
+    )
+    pallet_size: Annotated[tuple[float, float, float], above(0.0, 10.0, "m")] = setting(
+        (0.6, 0.4, 0.144), "Length, width and height of the pallet; half a EUR pallet by default."
     )
 
 

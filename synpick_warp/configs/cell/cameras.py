@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from synpick_warp.configs.calibration.files import MAX_NUMBER, MODELS
 from synpick_warp.configs.episodes.randomize import Distribution
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import Within, above, setting
 from synpick_warp.views.layers import LAYER_TABLE
 
 Vector = tuple[float, float, float]
@@ -26,22 +26,17 @@ MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
 class Cameras:
     """Pinhole cameras above the tote: square pixels with centres at +0.5, principal point in the middle of the image."""
 
-    resolution: tuple[int, int] = setting((1920, 1080), "px", "Image width and height.", low=1, high=8192)
-    fov: float = setting(20.0, "°", "Horizontal field of view.", low=1.0, high=170.0)
-    positions: tuple[tuple[float, float, float], ...] = setting(
-        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)),
-        "m",
-        "Position of each camera in the tote's frame (released).",
-        low=-100.0,
-        high=100.0,
+    resolution: Annotated[tuple[int, int], Within(1, 8192, "px")] = setting((1920, 1080), "Image width and height.")
+    fov: Annotated[float, Within(1.0, 170.0, "°")] = setting(20.0, "Horizontal field of view.")
+    positions: Annotated[tuple[tuple[float, float, float], ...], Within(-100.0, 100.0, "m")] = setting(
+        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)), "Position of each camera in the tote's frame (released)."
     )
-    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "Look-at point of all cameras (released).", low=-100.0, high=100.0)
-    ups: tuple[tuple[float, float, float], ...] = setting(
+    target: Annotated[tuple[float, float, float], Within(-100.0, 100.0, "m")] = setting(
+        (0.0, 0.0, 0.16), "Look-at point of all cameras (released)."
+    )
+    ups: Annotated[tuple[tuple[float, float, float], ...], Within(-1e3, 1e3)] = setting(
         ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
-        "",
         "Up vector of each camera; by default +y for the first, and towards the tote's centre line for the others.",
-        low=-1e3,
-        high=1e3,
     )
 
 
@@ -49,18 +44,19 @@ class Cameras:
 class Pose:
     """Pose of a camera in the tote's frame, in one of three forms."""
 
-    matrix: tuple[tuple[float, float, float, float], ...] | None = setting(
-        None, "m", "Camera-to-world transform, 4 x 4 (extrinsics as OpenCV's are its inverse).", low=-100.0, high=100.0
+    matrix: Annotated[tuple[tuple[float, float, float, float], ...] | None, Within(-100.0, 100.0, "m")] = setting(
+        None, "Camera-to-world transform, 4 x 4 (extrinsics as OpenCV's are its inverse)."
     )
-    position: tuple[float, float, float] | None = setting(
-        None, "m", "Optical centre; with quaternion, or with look_at and up.", low=-100.0, high=100.0
+    position: Annotated[tuple[float, float, float] | None, Within(-100.0, 100.0, "m")] = setting(
+        None, "Optical centre; with quaternion, or with look_at and up."
     )
-    quaternion: tuple[float, float, float, float] | None = setting(None, "", "Camera-to-world rotation: x, y, z, w.", low=-1.1, high=1.1)
-    look_at: tuple[float, float, float] | None = setting(None, "m", "Point that the optical axis meets.", low=-100.0, high=100.0)
-    up: tuple[float, float, float] | None = setting(None, "", "Direction that is up in the image.", low=-1e3, high=1e3)
+    quaternion: Annotated[tuple[float, float, float, float] | None, Within(-1.1, 1.1)] = setting(
+        None, "Camera-to-world rotation: x, y, z, w."
+    )
+    look_at: Annotated[tuple[float, float, float] | None, Within(-100.0, 100.0, "m")] = setting(None, "Point that the optical axis meets.")
+    up: Annotated[tuple[float, float, float] | None, Within(-1e3, 1e3)] = setting(None, "Direction that is up in the image.")
     axes: str | None = setting(
         None,
-        "",
         "Axes of the camera in matrix or quaternion: opencv (x right, y down, z forward; ROS too), unless it is given, or opengl (x right, "
         "y up, z backward; Blender, nerfstudio and USD too).",
         choices=(OPENCV, OPENGL),
@@ -77,12 +73,14 @@ class Jitter:
     Components are independent. Normal distributions are cut at three standard deviations. Not in the paper.
     """
 
-    position: Distribution = setting(_NONE, "m", "Offset of the position along each axis of the frame of the pose.", low=-10.0, high=10.0)
-    rotation: Distribution = setting(
-        _NONE, "°", "Components of a rotation vector in the camera's axes, by which the camera is turned.", low=-90.0, high=90.0
+    position: Annotated[Distribution, Within(-10.0, 10.0, "m")] = setting(
+        _NONE, "Offset of the position along each axis of the frame of the pose."
     )
-    focal_length: Distribution = setting(_NONE, "", "Relative change of fx and fy, such as 0.01 for 1 % more.", low=-0.9, high=9.0)
-    center: Distribution = setting(_NONE, "px", "Offset of cx and of cy.", low=-8192.0, high=8192.0)
+    rotation: Annotated[Distribution, Within(-90.0, 90.0, "°")] = setting(
+        _NONE, "Components of a rotation vector in the camera's axes, by which the camera is turned."
+    )
+    focal_length: Annotated[Distribution, Within(-0.9, 9.0)] = setting(_NONE, "Relative change of fx and fy, such as 0.01 for 1 % more.")
+    center: Annotated[Distribution, Within(-8192.0, 8192.0, "px")] = setting(_NONE, "Offset of cx and of cy.")
 
 
 @dataclass(frozen=True)
@@ -90,58 +88,48 @@ class CameraRow:
     """A camera. The tables replace [cameras]; pixel centres are at +0.5: add 0.5 to cx and cy of OpenCV and ROS, which have integers."""
 
     REQUIRED: ClassVar = ("pose",)
-    name: str = setting("", "", "Name in the files of a data set: lower-case letters, digits and underscores; empty: camera_0 and so on.")
-    resolution: tuple[int, int] | None = setting(None, "px", "Image width and height; not given: cameras.resolution.", low=1, high=8192)
-    fov: float | None = setting(
-        None, "°", "Horizontal field of view, with square pixels and the principal point in the middle.", low=1.0, high=170.0
+    name: str = setting("", "Name in the files of a data set: lower-case letters, digits and underscores; empty: camera_0 and so on.")
+    resolution: Annotated[tuple[int, int] | None, Within(1, 8192, "px")] = setting(
+        None, "Image width and height; not given: cameras.resolution."
     )
-    matrix: tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None = setting(
-        None, "px", "Camera matrix with fx, fy, cx and cy, instead of fov.", low=-MAX_NUMBER, high=MAX_NUMBER
+    fov: Annotated[float | None, Within(1.0, 170.0, "°")] = setting(
+        None, "Horizontal field of view, with square pixels and the principal point in the middle."
     )
-    distortion: tuple[float, ...] | None = setting(
-        None,
-        "",
-        "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4.",
-        low=-MAX_NUMBER,
-        high=MAX_NUMBER,
+    matrix: Annotated[
+        tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None,
+        Within(-MAX_NUMBER, MAX_NUMBER, "px"),
+    ] = setting(None, "Camera matrix with fx, fy, cx and cy, instead of fov.")
+    distortion: Annotated[tuple[float, ...] | None, Within(-MAX_NUMBER, MAX_NUMBER)] = setting(
+        None, "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
     )
-    model: str | None = setting(None, "", "Distortion model, pinhole unless it is given.", choices=MODELS)
+    model: str | None = setting(None, "Distortion model, pinhole unless it is given.", choices=MODELS)
     file: str | None = setting(
         None,
-        "",
         "Calibration file of OpenCV, ROS, Kalibr, BOP, COLMAP, nerfstudio, Open3D, RealSense or Zivid, or cam_K.txt, instead of matrix, "
         "distortion and resolution.",
         path=True,
     )
-    scale: float | None = setting(
+    scale: Annotated[float | None, above(0.0, 1.0)] = setting(
         None,
-        "",
         "Factor on the size of the images, and on the camera matrix with it, such as 0.25 for pictures scaled to a quarter; not given: 1.",
-        above=0.0,
-        high=1.0,
     )
-    sensor: str | None = setting(None, "", "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
-    pixel_center: float | None = setting(
-        None,
-        "px",
-        "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's.",
+    sensor: str | None = setting(None, "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
+    pixel_center: Annotated[float | None, Within(unit="px")] = setting(
+        None, "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's."
     )
-    pose: Pose = setting(Pose(), "", "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
+    pose: Pose = setting(Pose(), "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
     fixed_to: str | None = setting(
         None,
-        "",
         "What carries the camera: the world, unless it is given, or the gripper (eye-in-hand). The pose is then in the frame of its shaft, "
         "whose origin is on the wrist axis, z up.",
         choices=(WORLD, GRIPPER),
     )
     modalities: tuple[str, ...] | None = setting(
-        None, "", "Images in its files: any of the allowed names, of layers those in render.layers; not given: all.", choices=MODALITIES
+        None, "Images in its files: any of the allowed names, of layers those in render.layers; not given: all.", choices=MODALITIES
     )
-    every: int | None = setting(
-        None, "frames", "Frames from one picture to the next, of which the first is that of frame 0; not given: 1.", low=1, high=1000
+    every: Annotated[int | None, Within(1, 1000, "frames")] = setting(
+        None, "Frames from one picture to the next, of which the first is that of frame 0; not given: 1."
     )
     jitter: Jitter | None = setting(
-        None,
-        "",
-        "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution.",
+        None, "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution."
     )

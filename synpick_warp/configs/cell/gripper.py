@@ -6,10 +6,11 @@ import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.episodes.objects import UNITS
-from synpick_warp.configs.fields import INT32_MAX, Conflict, setting
+from synpick_warp.configs.fields import INT32_MAX, Color, Conflict, Fraction, Within, above, setting
 
 SUCTION1 = "suction1"
 SUCTION_ARRAY = "suction_array"
@@ -36,104 +37,87 @@ class Gripper:
     """The gripper: a conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
 
     kind: str = setting(
-        SUCTION1, "", "Kind of gripper: suction1 (one cup) or suction_array (a plate with the cups of gripper.cups).", choices=GRIPPERS
+        SUCTION1, "Kind of gripper: suction1 (one cup) or suction_array (a plate with the cups of gripper.cups).", choices=GRIPPERS
     )
-    cups: tuple[tuple[float, float], ...] = setting(
+    cups: Annotated[tuple[tuple[float, float], ...], Within(-0.5, 0.5, "m")] = setting(
         (),
-        "m",
         "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
         f"at most {MAX_CUPS}.",
-        low=-0.5,
-        high=0.5,
     )
     valve: str = setting(
         EACH,
-        "",
         "Vacuum of a suction_array: each (a valve for each cup) or common (one for all: if one leaks or breaks off, all seals are poor).",
         choices=(EACH, COMMON),
     )
     mesh: str = setting(
         "",
-        "",
         "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) of the body of a suction_array: origin on the wrist axis, which is "
         "y, cups towards -z. Empty: a plate.",
         path=True,
     )
-    mesh_unit: str = setting("m", "", "Unit of that mesh.", choices=tuple(UNITS))
-    mesh_checksum: str = setting("", "", "SHA-256 of that mesh; the program writes it.")
-    finger_length: float = setting(0.35, "m", "Length of the shaft, from its top to the wrist axis.", low=0.005, high=2.0)
-    finger_width: float = setting(0.075, "m", "Diameter of the shaft at its top.", low=0.005, high=1.0)
-    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", low=0.005, high=0.5)
-    cup_length: float = setting(
-        0.055, "m", "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip.", low=0.005, high=0.5
+    mesh_unit: str = setting("m", "Unit of that mesh.", choices=tuple(UNITS))
+    mesh_checksum: str = setting("", "SHA-256 of that mesh; the program writes it.")
+    finger_length: Annotated[float, Within(0.005, 2.0, "m")] = setting(0.35, "Length of the shaft, from its top to the wrist axis.")
+    finger_width: Annotated[float, Within(0.005, 1.0, "m")] = setting(0.075, "Diameter of the shaft at its top.")
+    cup_width: Annotated[float, Within(0.005, 0.5, "m")] = setting(0.042, "Diameter of the suction cup.")
+    cup_length: Annotated[float, Within(0.005, 0.5, "m")] = setting(
+        0.055, "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip."
     )
-    finger_mass: float = setting(1.5, "kg", "Mass of the shaft.", low=0.001, high=1e3)
-    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", low=0.001, high=1e3)
-    tilt_limit: float = setting(90.0, "°", "Joint limit of the wrist, to both sides.", above=0.0, high=90.0)
-    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the wrist's PD position drive.", above=0.0, high=1e6)
-    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the wrist's PD position drive.", low=0.0, high=1e5)
-    tilt_torque: float = setting(200.0, "N·m", "Torque limit of the wrist's drive.", above=0.0, high=1e5)
-    color: tuple[float, float, float] = setting((0.55, 0.56, 0.58), "sRGB", "Base colour of the shaft.", low=0.0, high=1.0)
-    cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
-    metallic: float = setting(0.01, "", "Metallic factor of shaft and cup (released).", low=0.0, high=1.0)
-    roughness: float = setting(0.9, "", "Roughness of shaft and cup (released).", low=0.0, high=1.0)
+    finger_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(1.5, "Mass of the shaft.")
+    cup_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(0.5, "Mass of the cup.")
+    tilt_limit: Annotated[float, above(0.0, 90.0, "°")] = setting(90.0, "Joint limit of the wrist, to both sides.")
+    tilt_stiffness: Annotated[float, above(0.0, 1e6, "N·m/rad")] = setting(2500.0, "Stiffness of the wrist's PD position drive.")
+    tilt_damping: Annotated[float, Within(0.0, 1e5, "N·m·s/rad")] = setting(200.0, "Damping of the wrist's PD position drive.")
+    tilt_torque: Annotated[float, above(0.0, 1e5, "N·m")] = setting(200.0, "Torque limit of the wrist's drive.")
+    color: Color = setting((0.55, 0.56, 0.58), "Base colour of the shaft.")
+    cup_color: Color = setting((0.05, 0.05, 0.055), "Base colour of the cup.")
+    metallic: Fraction = setting(0.01, "Metallic factor of shaft and cup (released).")
+    roughness: Fraction = setting(0.9, "Roughness of shaft and cup (released).")
 
 
 @dataclass(frozen=True)
 class Suction:
     """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
 
-    rays: int = setting(10, "", "Rays of the seal test, on a circle at the cup's lip (paper).", low=3, high=64)
-    vacuum: float | None = setting(
+    rays: Annotated[int, Within(3, 64)] = setting(10, "Rays of the seal test, on a circle at the cup's lip (paper).")
+    vacuum: Annotated[float | None, above(0.0, _ATMOSPHERE, "kPa")] = setting(
         None,
-        "kPa",
         "Vacuum below a tight cup, such as 60: seals then follow from physics. A seal breaks at the vacuum times the area of the mouth "
         "that the object covers, less what leaks take. Rays meet the mesh, on the lip and within; it sets radius, rays, surface and break "
         "forces. Not given: good_force and poor_force, whatever the cup (paper).",
-        above=0.0,
-        high=_ATMOSPHERE,
     )
-    flow: float | None = setting(
+    flow: Annotated[float | None, Within(0.1, 1e5, "l/min")] = setting(
         None,
-        "l/min",
         "Suction rate of the ejector with an open cup, 40 unless given. Air that enters through holes, beside the object or below the lip "
         "lowers the vacuum: linear characteristic, orifice with a discharge coefficient of 0.62. Small ejectors have 10 to 80; Schmalz "
         "lists 8.3 for airtight parts and cups of up to 60 mm.",
-        low=0.1,
-        high=1e5,
     )
-    compliance: float | None = setting(
+    compliance: Annotated[float | None, Within(0.0, 1.0)] = setting(
         None,
-        "",
         "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: a ball seals if its cap below the lip "
         "is no higher, so with a radius of 1.3 cups; with 0.05, as of a flat cup, of 2.5.",
-        low=0.0,
-        high=1.0,
     )
-    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0, high=0.25)
-    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0, high=1.0)
+    radius: Annotated[float, above(0.0, 0.25, "m")] = setting(0.01, "Radius of that circle (released).")
+    reach: Annotated[float, above(0.0, 1.0, "m")] = setting(0.03, "Length of the rays (paper).")
     surface: str = setting(
         "hull",
-        "",
         "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh: a pitcher is open).",
         choices=("hull", "mesh"),
     )
-    tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0, high=INT32_MAX)
-    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0, high=1e5)
-    poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0, high=1e5)
-    stiffness: float = setting(
-        2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0, high=1e6
+    tolerated_misses: Annotated[int, Within(0, INT32_MAX)] = setting(
+        0, "Maximum rays that may miss for a good seal (paper: 0; released: 2)."
     )
-    damping: float = setting(100.0, "N·s/m", "Linear damping of a seal.", low=0.0, high=1e5)
-    twist_stiffness: float = setting(50.0, "N·m/rad", "Torsional stiffness about the cup's axis.", low=0.0, high=1e6)
-    twist_damping: float = setting(0.1, "N·m·s/rad", "Angular damping of twist and swing.", low=0.0, high=1e5)
-    swing_limit: float = setting(5.0, "°", "Angle by which an attached object may swing freely (released).", low=0.0, high=90.0)
-    swing_stiffness: float = setting(
-        50.0,
-        "N·m/rad",
-        "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°.",
-        low=0.0,
-        high=1e6,
+    good_force: Annotated[float, above(0.0, 1e5, "N")] = setting(40.0, "Break force of a good seal (paper).")
+    poor_force: Annotated[float, above(0.0, 1e5, "N")] = setting(2.0, "Break force of any other seal (paper: 2; released: 0.2).")
+    stiffness: Annotated[float, above(0.0, 1e6, "N/m")] = setting(
+        2e4, "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm."
+    )
+    damping: Annotated[float, Within(0.0, 1e5, "N·s/m")] = setting(100.0, "Linear damping of a seal.")
+    twist_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(50.0, "Torsional stiffness about the cup's axis.")
+    twist_damping: Annotated[float, Within(0.0, 1e5, "N·m·s/rad")] = setting(0.1, "Angular damping of twist and swing.")
+    swing_limit: Annotated[float, Within(0.0, 90.0, "°")] = setting(5.0, "Angle by which an attached object may swing freely (released).")
+    swing_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(
+        50.0, "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°."
     )
 
     @property

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import Fraction, Within, above, setting
 
 
 @dataclass(frozen=True)
@@ -15,51 +16,34 @@ class Effects:
     Each view draws its own parameters uniformly from these ranges (minimum, maximum; 0, 0: off), and they are recorded. Not in the paper.
     """
 
-    exposure_jitter: float = setting(
-        0.0,
-        "EV",
-        "Half width of the uniform random exposure offset of each view, as by a camera's automatic exposure.",
-        low=0.0,
-        high=5.0,
+    exposure_jitter: Annotated[float, Within(0.0, 5.0, "EV")] = setting(
+        0.0, "Half width of the uniform random exposure offset of each view, as by a camera's automatic exposure."
     )
-    white_balance_jitter: float = setting(
-        0.0,
-        "EV",
-        "Half width of the uniform random gains of red and of blue; 500 K more at 5,500 K are 0.12 EV more blue and 0.06 EV less red.",
-        low=0.0,
-        high=2.0,
+    white_balance_jitter: Annotated[float, Within(0.0, 2.0, "EV")] = setting(
+        0.0, "Half width of the uniform random gains of red and of blue; 500 K more at 5,500 K are 0.12 EV more blue and 0.06 EV less red."
     )
-    vignette: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Fraction of light lost in the image corners, with cos⁴ falloff towards the centre.", low=0.0, high=1.0
+    vignette: Annotated[tuple[float, float], Within(0.0, 1.0)] = setting(
+        (0.0, 0.0), "Fraction of light lost in the image corners, with cos⁴ falloff towards the centre."
     )
-    chromatic_aberration: tuple[float, float] = setting(
+    chromatic_aberration: Annotated[tuple[float, float], Within(-16.0, 16.0, "px")] = setting(
         (0.0, 0.0),
-        "px",
         "Lateral chromatic aberration in the image corners: red is displaced outward and blue inward by this; negative: the reverse.",
-        low=-16.0,
-        high=16.0,
     )
-    blur: tuple[float, float] = setting((0.0, 0.0), "px", "Standard deviation of a Gaussian blur, as by defocus.", low=0.0, high=16.0)
-    shot_noise: tuple[float, float] = setting(
-        (0.0, 0.0),
-        "",
-        "Standard deviation of shot noise at full scale, relative to it; a full well of N electrons has 1/√N: 0.01 for 10,000.",
-        low=0.0,
-        high=1.0,
+    blur: Annotated[tuple[float, float], Within(0.0, 16.0, "px")] = setting(
+        (0.0, 0.0), "Standard deviation of a Gaussian blur, as by defocus."
     )
-    read_noise: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Standard deviation of signal-independent read noise, relative to full scale.", low=0.0, high=1.0
+    shot_noise: Annotated[tuple[float, float], Within(0.0, 1.0)] = setting(
+        (0.0, 0.0), "Standard deviation of shot noise at full scale, relative to it; a full well of N electrons has 1/√N: 0.01 for 10,000."
     )
-    jpeg_quality: tuple[int, int] = setting((0, 0), "", "JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
-    contrast: tuple[float, float] = setting(
-        (0.0, 0.0),
-        "",
-        "Relative change of the contrast of sRGB values about their middle, as by a camera's processing.",
-        low=-0.9,
-        high=4.0,
+    read_noise: Annotated[tuple[float, float], Within(0.0, 1.0)] = setting(
+        (0.0, 0.0), "Standard deviation of signal-independent read noise, relative to full scale."
     )
-    saturation: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Relative change of the difference of sRGB values to their luma; -1: grey.", low=-1.0, high=4.0
+    jpeg_quality: Annotated[tuple[int, int], Within(0, 100)] = setting((0, 0), "JPEG quality; 0, 0: bop.jpeg_quality.")
+    contrast: Annotated[tuple[float, float], Within(-0.9, 4.0)] = setting(
+        (0.0, 0.0), "Relative change of the contrast of sRGB values about their middle, as by a camera's processing."
+    )
+    saturation: Annotated[tuple[float, float], Within(-1.0, 4.0)] = setting(
+        (0.0, 0.0), "Relative change of the difference of sRGB values to their luma; -1: grey."
     )
 
 
@@ -94,88 +78,62 @@ class DepthSensor:
 
     preset: str = setting(
         "",
-        "",
         "Sensor that sets baseline, noise, quantization and range, [as listed](#sensor-presets), unless they are set beside it.",
         choices=("", *SENSORS),
     )
-    baseline: float = setting(
-        0.075,
-        "m",
-        "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right one of two cameras.",
-        above=0.0,
-        high=1.0,
+    baseline: Annotated[float, above(0.0, 1.0, "m")] = setting(
+        0.075, "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right one of two cameras."
     )
-    disparity_step: float = setting(
-        0.125,
-        "px",
-        "Disparity quantization, which makes depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012).",
-        above=0.0,
-        high=16.0,
+    disparity_step: Annotated[float, above(0.0, 16.0, "px")] = setting(
+        0.125, "Disparity quantization, which makes depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012)."
     )
-    disparity_noise: float = setting(
-        0.0, "px", "Standard deviation of disparity, which makes depth noise z² / (f · baseline) times this.", low=0.0, high=16.0
+    disparity_noise: Annotated[float, Within(0.0, 16.0, "px")] = setting(
+        0.0, "Standard deviation of disparity, which makes depth noise z² / (f · baseline) times this."
     )
-    max_disparity: float = setting(
-        0.0, "px", "Largest disparity that is searched, so the least depth is f · baseline / max_disparity; 0: no limit.", low=0.0, high=1e4
+    max_disparity: Annotated[float, Within(0.0, 1e4, "px")] = setting(
+        0.0, "Largest disparity that is searched, so the least depth is f · baseline / max_disparity; 0: no limit."
     )
-    distances: tuple[float, float] = setting((0.4, 5.0), "m", "Minimum and maximum depth that is measured.", above=0.0, high=100.0)
-    noise: float = setting(0.0012, "m", "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012).", low=0.0, high=1.0)
-    noise_growth: float = setting(0.0019, "1/m", "Quadratic growth of axial noise with depth (Nguyen et al., 2012).", low=0.0, high=1.0)
-    noise_distance: float = setting(0.4, "m", "Depth of minimum axial noise (Nguyen et al., 2012).", low=0.0, high=100.0)
-    noise_angle: float = setting(
-        1e-4, "m^1.5", "Growth of axial noise with the angle of incidence (Nguyen et al., 2012).", low=0.0, high=1.0
+    distances: Annotated[tuple[float, float], above(0.0, 100.0, "m")] = setting((0.4, 5.0), "Minimum and maximum depth that is measured.")
+    noise: Annotated[float, Within(0.0, 1.0, "m")] = setting(
+        0.0012, "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012)."
     )
-    lateral_noise: float = setting(
-        0.5,
-        "px",
-        "Standard deviation of the pixel offset at which depth is sampled, which makes edges ragged (Handa et al., 2014).",
-        low=0.0,
-        high=16.0,
+    noise_growth: Annotated[float, Within(0.0, 1.0, "1/m")] = setting(
+        0.0019, "Quadratic growth of axial noise with depth (Nguyen et al., 2012)."
     )
-    noise_width: int = setting(
+    noise_distance: Annotated[float, Within(0.0, 100.0, "m")] = setting(0.4, "Depth of minimum axial noise (Nguyen et al., 2012).")
+    noise_angle: Annotated[float, Within(0.0, 1.0, "m^1.5")] = setting(
+        1e-4, "Growth of axial noise with the angle of incidence (Nguyen et al., 2012)."
+    )
+    lateral_noise: Annotated[float, Within(0.0, 16.0, "px")] = setting(
+        0.5, "Standard deviation of the pixel offset at which depth is sampled, which makes edges ragged (Handa et al., 2014)."
+    )
+    noise_width: Annotated[int, Within(1, 64, "px")] = setting(
         1,
-        "px",
         "Distance of lattice points between which noise, axial and lateral, is interpolated, so that neighbours' noise is correlated; 1: "
         "each pixel has noise of its own.",
-        low=1,
-        high=64,
     )
-    grazing_angle: float = setting(80.0, "°", "Angle of incidence above which there is no depth.", low=10.0, high=89.0)
-    edge_width: int = setting(
-        1,
-        "px",
-        "Distance to a disparity edge below which there is no depth, since the matching window covers two surfaces.",
-        low=0,
-        high=16,
+    grazing_angle: Annotated[float, Within(10.0, 89.0, "°")] = setting(80.0, "Angle of incidence above which there is no depth.")
+    edge_width: Annotated[int, Within(0, 16, "px")] = setting(
+        1, "Distance to a disparity edge below which there is no depth, since the matching window covers two surfaces."
     )
-    edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0, high=1e3)
-    shadows: bool = setting(True, "", "No depth where the projector is occluded, or the infrared camera that registration names.")
-    registration: float = setting(
+    edge_step: Annotated[float, above(0.0, 1e3, "px")] = setting(1.0, "Disparity difference that makes an edge.")
+    shadows: bool = setting(True, "No depth where the projector is occluded, or the infrared camera that registration names.")
+    registration: Fraction = setting(
         0.0,
-        "",
         "Place on the baseline of the camera to whose image depth is registered: 0 that of the infrared camera itself, 1 that of the "
         "projector. In between there are shadows at both sides of objects.",
-        low=0.0,
-        high=1.0,
     )
-    projector: float = setting(
-        0.5, "", "Place of a stereo camera's dot projector on its baseline: 0 at the left camera, 1 at the right one.", low=0.0, high=1.0
+    projector: Fraction = setting(
+        0.5, "Place of a stereo camera's dot projector on its baseline: 0 at the left camera, 1 at the right one."
     )
-    dot_spacing: float = setting(
-        4.0,
-        "px",
-        "Width of a cell of the projected pattern, which has one dot at a random place; in pixels of the camera.",
-        low=2.0,
-        high=64.0,
+    dot_spacing: Annotated[float, Within(2.0, 64.0, "px")] = setting(
+        4.0, "Width of a cell of the projected pattern, which has one dot at a random place; in pixels of the camera."
     )
-    dot_brightness: float = setting(
+    dot_brightness: Annotated[float, Within(0.0, 1e3)] = setting(
         2.0,
-        "",
         "Brightness of projected dots on a white surface at 1 m, relative to full scale; it falls with the square of depth; 0: no pattern.",
-        low=0.0,
-        high=1e3,
     )
-    ambient: float = setting(
-        0.25, "", "Brightness of infrared images by ambient light, relative to that of colour images, without shadows.", low=0.0, high=10.0
+    ambient: Annotated[float, Within(0.0, 10.0)] = setting(
+        0.25, "Brightness of infrared images by ambient light, relative to that of colour images, without shadows."
     )
-    infrared_noise: float = setting(0.005, "", "Standard deviation of noise in infrared images, relative to full scale.", low=0.0, high=1.0)
+    infrared_noise: Fraction = setting(0.005, "Standard deviation of noise in infrared images, relative to full scale.")

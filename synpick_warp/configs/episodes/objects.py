@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import hypot
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
-from synpick_warp.configs.fields import INT32_MAX, setting
+from synpick_warp.configs.fields import INT32_MAX, Fraction, Within, above, setting
 
 AUTO_UNIT = "auto"
 """Unit of mesh files by their kind: millimetres of BOP models, metres of others."""
@@ -117,91 +117,68 @@ class Objects:
 
     embedded: tuple[str, ...] = setting(
         (HOUSEHOLD,),
-        "",
         "Sets of embedded objects, where bake.models is empty: household (21, like those of YCB-Video), industrial (bolt, nut, bracket, "
         "pipe_tee, gear, sheet_part, box).",
         choices=EMBEDDED,
     )
     unit: str = setting(
         AUTO_UNIT,
-        "",
         "Unit of all mesh files; auto: mm for BOP models (obj_NNNNNN.ply), m for others. STEP files name their own.",
         choices=(AUTO_UNIT, *UNITS),
     )
-    hull_vertices: int = setting(
+    hull_vertices: Annotated[int, Within(8, 256)] = setting(
         64,
-        "",
         "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.5 mm outside.",
-        low=8,
-        high=256,
     )
-    piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
-    pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
-    concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
-    decomposition_time: float = setting(
-        1800.0,
-        "s",
-        "Limit of processor time of a convex decomposition; an object that takes longer is an error.",
-        above=0.0,
-        high=86400.0,
+    piece_vertices: Annotated[int, Within(8, 256)] = setting(32, "Maximum vertices of each piece of a convex decomposition.")
+    pieces: Annotated[int, Within(1, 64)] = setting(16, "Maximum pieces of a convex decomposition.")
+    concavity: Annotated[float, Within(0.01, 1.0)] = setting(
+        0.05, "CoACD's concavity threshold; smaller values follow the surface more closely."
     )
-    concave_ratio: float = setting(
+    decomposition_time: Annotated[float, above(0.0, 86400.0, "s")] = setting(
+        1800.0, "Limit of processor time of a convex decomposition; an object that takes longer is an error."
+    )
+    concave_ratio: Fraction = setting(
         0.6,
-        "",
         "Objects whose row does not say whether they are concave are decomposed if 1 - depth is below this. Depth is that of the convex "
         "hull above the surface, at most, in halves of the hull's thickness: 0 of a hollow ball, 0.8 of a tube, above 1 of a bowl, of a "
         "bracket, and of a plate with holes as wide as it is thick.",
-        low=0.0,
-        high=1.0,
     )
     strict: bool = setting(
-        False, "", "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
+        False, "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
     )
-    density: float = setting(
-        400.0, "kg/m³", "Density of objects without a mass; where it is not set, their mass is a guess, which is told.", above=0.0, high=1e5
+    density: Annotated[float, above(0.0, 1e5, "kg/m³")] = setting(
+        400.0, "Density of objects without a mass; where it is not set, their mass is a guess, which is told."
     )
     mass_volume: str = setting(
         HULL,
-        "",
         "Volume that the density is multiplied by: hull, that of the convex hull, or mesh, that of the mesh where it is watertight, and of "
         "the collision shape elsewhere. Where density is set and this is not: mesh.",
         choices=(HULL, MESH),
     )
-    metallic: float = setting(0.1, "", "Metallic factor of objects whose material names none.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness of objects whose material names none.", low=0.0, high=1.0)
-    crease_angle: float = setting(
+    metallic: Fraction = setting(0.1, "Metallic factor of objects whose material names none.")
+    roughness: Fraction = setting(0.5, "Roughness of objects whose material names none.")
+    crease_angle: Annotated[float, Within(0.0, 180.0, "°")] = setting(
         35.0,
-        "°",
         "Meshes without normals are smooth where triangles meet at up to this angle, and have a sharp edge beyond; 180: smooth all over.",
-        low=0.0,
-        high=180.0,
     )
     center: bool = setting(
-        False,
-        "",
-        "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are.",
+        False, "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are."
     )
     symmetries: str = setting(
         DECLARED,
-        "",
         "Symmetries of objects: declared (those of their rows, else of models_info.json), or detect (of objects that declare none, by the "
         "shape alone: texture does not count).",
         choices=SYMMETRIES,
     )
-    symmetry_tolerance: float = setting(
+    symmetry_tolerance: Annotated[float, Within(1e-3, 0.2)] = setting(
         0.03,
-        "",
         "Largest distance between a surface and its rotated self for the rotation to be detected as a symmetry, in diameters (BOP's "
         "organizers took 0.1, at least 15 mm, and left out what texture tells apart).",
-        low=1e-3,
-        high=0.2,
     )
-    diameter_tolerance: float = setting(
+    diameter_tolerance: Annotated[float, above(0.0, 1.0)] = setting(
         0.1,
-        "",
         "Largest relative difference between a model's diameter and that of its row in the object table; with more, the row is not used.",
-        above=0.0,
-        high=1.0,
     )
 
 
@@ -211,27 +188,27 @@ class ObjectRow:
 
     REQUIRED: ClassVar = ("id", "diameter")
     IDENTITY: ClassVar = ("id", "name", "diameter", "symmetries_discrete", "symmetries_continuous")
-    id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
+    id: Annotated[int, Within(0, INT32_MAX)] = setting(0, "The model's obj_id in its BOP folder.")
     name: str = setting(
-        "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
+        "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
     )
-    diameter: float = setting(0.0, "m", "Diameter of the model, which must agree for the row to be used; 0: any.", low=0.0)
-    mass: float | None = setting(None, "kg", "Mass; not given: by objects.density.", above=0.0)
+    diameter: Annotated[float, Within(0.0, unit="m")] = setting(
+        0.0, "Diameter of the model, which must agree for the row to be used; 0: any."
+    )
+    mass: Annotated[float | None, above(0.0, unit="kg")] = setting(None, "Mass; not given: by objects.density.")
     concave: bool | None = setting(
-        None, "", "Use a convex decomposition as collision shape instead of the convex hull; not given: by objects.concave_ratio."
+        None, "Use a convex decomposition as collision shape instead of the convex hull; not given: by objects.concave_ratio."
     )
-    metallic: float = setting(0.1, "", "Metallic factor, unless the mesh file names one.", low=0.0, high=1.0)
-    roughness: float = setting(0.5, "", "Roughness, unless the mesh file names one.", low=0.0, high=1.0)
-    symmetries_discrete: tuple[tuple[float, ...], ...] = setting(
+    metallic: Fraction = setting(0.1, "Metallic factor, unless the mesh file names one.")
+    roughness: Fraction = setting(0.5, "Roughness, unless the mesh file names one.")
+    symmetries_discrete: Annotated[tuple[tuple[float, ...], ...], Within(unit="m")] = setting(
         (),
-        "m",
         f"Discrete symmetries in the frame of the mesh file, replacing those of models_info.json; each {_DISCRETE}. Without an offset the "
         "axis passes through the centroid of the surface. Products of those listed are added.",
         parse=_parse_discrete,
     )
-    symmetries_continuous: tuple[tuple[float, ...], ...] = setting(
+    symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], Within(unit="m")] = setting(
         (),
-        "m",
         f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
         parse=_parse_continuous,
     )

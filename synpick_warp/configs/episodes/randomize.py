@@ -7,10 +7,10 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from synpick_warp.codes import LookKind, names
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import Within, setting
 
 OFF, FIXED, UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = KINDS = names(LookKind)
 """Kinds of distributions."""
@@ -162,69 +162,63 @@ class Randomize:
     what is allowed) or `{ choice = [...], weights = [...] }`. Not in the paper.
     """
 
-    object_hue: Distribution = setting(_NONE, "°", "Rotation of the hue of each object's base colour and texture.", low=-180.0, high=180.0)
-    object_brightness: Distribution = setting(
-        _NONE, "", "Factor on the base colour of each object, in linear light; the result is clamped to 1.", low=0.05, high=20.0
+    object_hue: Annotated[Distribution, Within(-180.0, 180.0, "°")] = setting(
+        _NONE, "Rotation of the hue of each object's base colour and texture."
     )
-    object_roughness: Distribution = setting(_NONE, "", "Roughness of each object, in place of its own.", low=0.0, high=1.0)
-    object_metallic: Distribution = setting(_NONE, "", "Metallic factor of each object, in place of its own.", low=0.0, high=1.0)
-    bin_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the bin; with a texture, its factor.", low=0.0, high=1.0)
-    bin_roughness: Distribution = setting(_NONE, "", "Roughness of the bin.", low=0.0, high=1.0)
-    bin_metallic: Distribution = setting(_NONE, "", "Metallic factor of the bin.", low=0.0, high=1.0)
-    bin_textures: str = setting("", "", "Folder of images, one of which each episode draws as the bin's texture; empty: none.", path=True)
-    table_color: ColorDistribution = setting(_NO_COLOR, "sRGB", "Base colour of the table; with a texture, its factor.", low=0.0, high=1.0)
-    table_roughness: Distribution = setting(_NONE, "", "Roughness of the table.", low=0.0, high=1.0)
-    table_textures: str = setting(
-        "", "", "Folder of images, one of which each episode draws as the table's texture; empty: none.", path=True
+    object_brightness: Annotated[Distribution, Within(0.05, 20.0)] = setting(
+        _NONE, "Factor on the base colour of each object, in linear light; the result is clamped to 1."
     )
+    object_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of each object, in place of its own.")
+    object_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of each object, in place of its own.")
+    bin_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
+        _NO_COLOR, "Base colour of the bin; with a texture, its factor."
+    )
+    bin_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the bin.")
+    bin_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of the bin.")
+    bin_textures: str = setting("", "Folder of images, one of which each episode draws as the bin's texture; empty: none.", path=True)
+    table_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
+        _NO_COLOR, "Base colour of the table; with a texture, its factor."
+    )
+    table_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the table.")
+    table_textures: str = setting("", "Folder of images, one of which each episode draws as the table's texture; empty: none.", path=True)
     background_textures: str = setting(
-        "",
         "",
         "Folder of images, one of which each episode draws as the texture of a floor, which is seen beyond the edge of the table "
         "(render.table_size); empty: the environment map is seen there.",
         path=True,
     )
-    surfaces: int = setting(
+    surfaces: Annotated[int, Within(0, MOST_CHOICES // 2)] = setting(
         0,
-        "",
         "Procedural textures (carpet, boards, checks, print, clutter) of table and floor, beside those of folders. With them, "
         "distractors of no folder are geometric solids with such textures.",
-        low=0,
-        high=MOST_CHOICES // 2,
     )
-    texture_width: Distribution = setting(
-        _HALF_METRE, "m", "Width of one repeat of the textures of bin, table and floor.", low=0.01, high=100.0
+    texture_width: Annotated[Distribution, Within(0.01, 100.0, "m")] = setting(
+        _HALF_METRE, "Width of one repeat of the textures of bin, table and floor."
     )
-    lamps: Distribution = setting(
+    lamps: Annotated[Distribution, Within(0, 4)] = setting(
+        _NONE, "Number of lamps besides an environment map, rounded: distant discs, which cast soft shadows."
+    )
+    lamp_variants: Annotated[int, Within(1, 64)] = setting(4, "With lamps: variants of each environment map, each with lamps of its own.")
+    lamp_elevation: Annotated[Distribution, Within(10.0, 90.0, "°")] = setting(_ELEVATION, "Height of each lamp above the horizon.")
+    lamp_radius: Annotated[Distribution, Within(0.3, 20.0, "°")] = setting(_RADIUS, "Angular radius of each lamp.")
+    lamp_strength: Annotated[Distribution, Within(0.01, 100.0)] = setting(
+        _STRENGTH, "Light of each lamp on a surface that faces up, relative to that of the map."
+    )
+    lamp_temperature: Annotated[Distribution, Within(1700.0, 25000.0, "K")] = setting(_TEMPERATURE, "Colour temperature of each lamp.")
+    distractors: Annotated[Distribution, Within(0, MOST_DISTRACTORS)] = setting(
         _NONE,
-        "",
-        "Number of lamps besides an environment map, rounded: distant discs, which cast soft shadows.",
-        low=0,
-        high=4,
-    )
-    lamp_variants: int = setting(4, "", "With lamps: variants of each environment map, each with lamps of its own.", low=1, high=64)
-    lamp_elevation: Distribution = setting(_ELEVATION, "°", "Height of each lamp above the horizon.", low=10.0, high=90.0)
-    lamp_radius: Distribution = setting(_RADIUS, "°", "Angular radius of each lamp.", low=0.3, high=20.0)
-    lamp_strength: Distribution = setting(
-        _STRENGTH, "", "Light of each lamp on a surface that faces up, relative to that of the map.", low=0.01, high=100.0
-    )
-    lamp_temperature: Distribution = setting(_TEMPERATURE, "K", "Colour temperature of each lamp.", low=1700.0, high=25000.0)
-    distractors: Distribution = setting(
-        _NONE,
-        "",
         "Number of distractors, rounded: objects in the pile that are rendered and occlude others, but have no labels and are no targets. "
         "They count towards arrangement.max_objects.",
-        low=0,
-        high=MOST_DISTRACTORS,
     )
     distractor_models: str = setting(
-        "",
         "",
         "Folder of distractors, as bake.models, without those that have a name or the shape of a labelled object, in any size; empty: "
         "geometric solids.",
         path=True,
     )
-    exposure: Distribution = setting(_NONE, "EV", "Exposure offset, in place of what render.exposure_spread draws.", low=-5.0, high=5.0)
+    exposure: Annotated[Distribution, Within(-5.0, 5.0, "EV")] = setting(
+        _NONE, "Exposure offset, in place of what render.exposure_spread draws."
+    )
 
     @property
     def most_distractors(self) -> int:

@@ -15,8 +15,9 @@ from synpick_warp.configs.cell.gripper import COMPLIANCE, FLOW, Gripper
 from synpick_warp.configs.check import is_table
 from synpick_warp.configs.episodes.objects import MESH
 from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution
+from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.files.load import sections, table_lists
-from synpick_warp.configs.files.table_lists import given_values, settings_of
+from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.files.write import describe_setting, format_toml
 
 WIDTH = 120
@@ -184,6 +185,6 @@ def _table(header: str, name: str, values: Mapping[str, Any], examples: Mapping[
     lines = [header]
     for mark, settings in (("", values), ("#", examples)):
         for key, value in settings.items():
-            lines += _comment(describe_setting(*known[key])) if first else []
+            lines += _comment(describe_setting(known[key])) if first else []
             lines.append(f"{mark}{key} = {format_toml(given_values(value) if is_table(type(value)) else value)}")
     return [*lines, ""]

@@ -18,10 +18,11 @@ from synpick_warp.configs.cell.cameras import Cameras
 from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.episodes.objects import MESH
-from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
-from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows, settings_of
+from synpick_warp.configs.fields import Setting, settings_of
+from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits
+from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows
 from synpick_warp.configs.rules.consistency import find_conflicts
-from synpick_warp.configs.schema import Bake, Bop, Config
+from synpick_warp.configs.schema import Bake, Bop, Config, Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 from synpick_warp.system.inputs.toml import decode_toml, read_toml
 
@@ -162,20 +163,18 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not equals:
         raise ConfigError(f"--set {shorten(text)} has no value; write --set section.key=value, as in --set physics.friction=0.4")
     section, _, name = key.partition(".")
-    if section == SPLITS:
-        annotation = split_settings().get(name.rpartition(".")[2], (None, str))[1]
-    else:
-        _, annotation = _setting(section, name, COMMAND_LINE)
+    found = settings_of(Split).get(name.rpartition(".")[2]) if section == SPLITS else _setting(section, name, COMMAND_LINE)
+    kind = found.kind if found else str
     try:
         document = decode_toml(f"value = {written}")
     except ValueError:  # TOML's errors are ValueErrors.
         # A shell removes the quotes of ["a","b"].
         words = written.strip().removeprefix("[").removesuffix("]").split(",")
-        return key, [word.strip() for word in words] if annotation == tuple[str, ...] else written
+        return key, [word.strip() for word in words] if kind == tuple[str, ...] else written
     if len(document) > 1:
         raise ConfigError(f"--set {key} is followed by further lines; write one --set for each setting")
     value = document["value"]
-    return key, written if annotation is str and not isinstance(value, str) else value
+    return key, written if kind is str and not isinstance(value, str) else value
 
 
 @functools.cache
@@ -216,7 +215,7 @@ def _read(preset_or_file: str) -> Values:
 def _locate(document: dict[str, Any], folder: str) -> None:
     """Make the paths in a document absolute that are relative to its folder; whatever else is wrong with them is left as it is."""
     for name, kind in (sections() | table_lists()).items():
-        paths = [key for key, (item, _) in settings_of(kind).items() if item.metadata["path"]]
+        paths = [key for key, item in settings_of(kind).items() if item.path]
         content = document.get(name)
         for table in content if isinstance(content, list) else [content]:
             for key in paths:
@@ -281,8 +280,7 @@ def _section_values(section: str, content: Mapping[str, Any], source: str) -> Va
         content = sensor_settings(str(content.get("preset", ""))) | dict(content)
     for name, value in content.items():
         key = f"{section}.{name}"
-        item, annotation = _setting(section, name, source)
-        values[key] = (check_value(key, _plain(value), item, annotation, source), source)
+        values[key] = (check_value(key, _plain(value), _setting(section, name, source), source), source)
     return values
 
 
@@ -308,8 +306,8 @@ def _check_section(section: str, source: str) -> None:
         )
 
 
-def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[Any], Any]:
-    """Field and type of a setting; raises ConfigError if there is none of the name, with a hint."""
+def _setting(section: str, name: str, source: str) -> Setting:
+    """A setting; raises ConfigError if there is none of the name, with a hint."""
     _check_section(section, source)
     known = settings_of(sections()[section])
     if not name:

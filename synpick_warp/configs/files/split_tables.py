@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import re
-import typing
 from collections.abc import Mapping
 from typing import Any
 
 from synpick_warp.configs.check import check_value
-from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.fields import INT32_MAX, settings_of
 from synpick_warp.configs.schema import Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
@@ -23,14 +21,6 @@ _NEXT = -1
 
 Tables = dict[str, dict[str, Any]]
 """Name of a split -> its checked settings."""
-
-
-@functools.cache
-def split_settings() -> dict[str, tuple[Any, Any]]:
-    """Name -> (field, resolved type) of every setting of a split, in order."""
-    hints = typing.get_type_hints(Split)
-    fields = Split.__dataclass_fields__
-    return {name: (item, hints[name]) for name, item in fields.items() if name != "name"}
 
 
 def read_tables(content: Any, source: str) -> Tables:
@@ -55,11 +45,11 @@ def check_setting(name: str, key: str, value: Any, source: str) -> Any:
     Raises:
         ConfigError: There is no such setting, or the value is not allowed.
     """
-    known = split_settings()
+    known = settings_of(Split)
     if key not in known:
         keys = f"keys of {SPLITS}.{name}: {', '.join(known)}"
         raise ConfigError(f"there is no key {SPLITS}.{name}.{shorten(key)}, set {source}; {keys}{suggest(key, list(known))}")
-    return check_value(f"{SPLITS}.{name}.{key}", value, *known[key], source)
+    return check_value(f"{SPLITS}.{name}.{key}", value, known[key], source)
 
 
 def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:

@@ -9,32 +9,13 @@ the setting's type.
 from __future__ import annotations
 
 import dataclasses
-import functools
-import types
-import typing
 from collections.abc import Mapping
 from typing import Any
 
 from synpick_warp.configs.check import check_value, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
+from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
-
-Settings = dict[str, tuple[dataclasses.Field[Any], Any]]
-"""Name -> (field, resolved type)."""
-
-
-@functools.cache
-def settings_of(kind: type[Any]) -> Settings:
-    """Settings of a section or of a row, in order; the type of one that may be left out (None) is that of its values."""
-    hints = typing.get_type_hints(kind)
-    return {item.name: (item, _given(hints[item.name])) for item in dataclasses.fields(kind)}
-
-
-def _given(annotation: Any) -> Any:
-    """Type of a setting's values other than None."""
-    if typing.get_origin(annotation) not in (types.UnionType, typing.Union):
-        return annotation
-    return next(part for part in typing.get_args(annotation) if part is not type(None))
 
 
 def read_rows(key: str, kind: type[Any], content: Any, source: str) -> tuple[Any, ...]:
@@ -63,14 +44,12 @@ def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
     for name in required:
         if name not in content:
             raise ConfigError(f"{key} has no {name} {source}; a row needs {' and '.join(required)}")
-    return kind(**{name: _read_setting(f"{key}.{name}", value, *known[name], source) for name, value in content.items()})
+    return kind(**{name: _read_setting(f"{key}.{name}", value, known[name], source) for name, value in content.items()})
 
 
-def _read_setting(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
+def _read_setting(key: str, value: object, item: Setting, source: str) -> Any:
     """Checked value of a setting, which may be a table."""
-    if is_table(annotation):
-        return read_table(key, annotation, value, source)
-    return check_value(key, value, item, annotation, source)
+    return read_table(key, item.kind, value, source) if is_table(item.kind) else check_value(key, value, item, source)
 
 
 def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mapping[str, Any], source: str) -> tuple[Any, ...]:
@@ -82,12 +61,12 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
     identity = getattr(kind, "IDENTITY", ())
     if not identity:
         raise ConfigError(f"{key} is a table {source}; allowed: [[{key}]] tables, one for each")
-    known = {name: pair for name, pair in settings_of(kind).items() if name not in identity}
+    known = {name: item for name, item in settings_of(kind).items() if name not in identity}
     for name in changes:
         if name not in known:
             rule = f"keys that may hold for every row: {', '.join(known)}; [[{key}]] tables have all"
             raise ConfigError(f"[{key}] has the key {shorten(name)} {source}; {rule}{suggest(name, list(known))}")
-    values = {name: check_value(f"{key}.{name}", value, *known[name], source) for name, value in changes.items()}
+    values = {name: check_value(f"{key}.{name}", value, known[name], source) for name, value in changes.items()}
     return tuple(dataclasses.replace(row, **values) for row in rows)
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 import os
 import re
-from dataclasses import Field
 from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.episodes.randomize import Distribution
+from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import sections, table_lists
-from synpick_warp.configs.files.split_tables import SPLITS, split_settings
-from synpick_warp.configs.files.table_lists import given_values, settings_of
+from synpick_warp.configs.files.split_tables import SPLITS
+from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.schema import Config, Split
 
 CAMERAS = "cameras"
@@ -48,21 +48,21 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
 def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
     """Lines of a TOML table; `comments`: each setting with meaning, unit and allowed values above it."""
     lines, given = [], given_values(values)
-    for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
+    for name, item in settings_of(kind).items():
         if name not in given:
             continue
         if comments:
-            lines.append(f"# {describe_setting(item, annotation)}")
-        value = os.path.abspath(given[name]) if item.metadata["path"] and given[name] else given[name]
+            lines.append(f"# {describe_setting(item)}")
+        value = os.path.abspath(given[name]) if item.path and given[name] else given[name]
         lines.append(f"{name} = {format_toml(value)}")
     return lines
 
 
-def describe_setting(item: Field[Any], annotation: Any) -> str:
+def describe_setting(item: Setting) -> str:
     """Meaning, unit and allowed values of a setting, in sentences."""
-    unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
-    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.metadata["doc"])  # Links lead from configs/README.md.
-    return f"{meaning} {unit}Allowed: {describe_allowed(item, annotation)}."
+    unit = f"[{item.unit}] " if item.unit else ""
+    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.doc)  # Links lead from configs/README.md.
+    return f"{meaning} {unit}Allowed: {describe_allowed(item)}."
 
 
 def format_toml(value: Any) -> str:

@@ -12,6 +12,7 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.configs.episodes.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
+from synpick_warp.configs.fields import settings_of
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
@@ -67,8 +68,8 @@ def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
     """
     drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
     for place, name in SETTINGS.items():
-        rules = Randomize.__dataclass_fields__[name].metadata
-        drawn[place] = getattr(looks.randomize, name), rules["low"], rules["high"]
+        bounds = settings_of(Randomize)[name].bounds
+        drawn[place] = getattr(looks.randomize, name), bounds.low, bounds.high
     drawn[LookPart.LAMP, Look.AZIMUTH] = Distribution(UNIFORM, ((-180.0,), (180.0,))), 0.0, 0.0
     for part, textures in looks.textures.items():
         if textures:
