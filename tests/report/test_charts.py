@@ -12,7 +12,7 @@ import synpick_warp
 from synpick_warp.apps.report.charts import Source, make_charts, object_labels
 from synpick_warp.apps.report.sampling import Brightness, Episodes, find_content, measure_brightness, read_episodes, sample_views
 from synpick_warp.apps.statistics import compute_statistics
-from synpick_warp.apps.statistics.timeline import TimePoint
+from synpick_warp.apps.statistics.figures import TimePoint
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.system.codecs.charts import VEGA_LITE
 

@@ -9,12 +9,9 @@ import pytest
 from synpick_warp.apps.report.findings import NOTE, WARNING, Figures, find
 from synpick_warp.apps.report.sampling import Brightness, Episodes, spread
 from synpick_warp.apps.statistics import GroupStatistics, ObjectStatistics, Statistics
-from synpick_warp.apps.statistics.annotations import Annotations
-from synpick_warp.apps.statistics.attempts import Episodes as EpisodeFigures
-from synpick_warp.apps.statistics.coverage import Coverage
-from synpick_warp.apps.statistics.depth import Depth
-from synpick_warp.apps.statistics.lights import Lights
-from synpick_warp.apps.statistics.records import EpisodeFacts
+from synpick_warp.apps.statistics.columns import EpisodeFacts
+from synpick_warp.apps.statistics.figures import Annotations, Coverage, Depth, Lights
+from synpick_warp.apps.statistics.figures import Episodes as EpisodeFigures
 
 ANNOTATIONS = Annotations(600, 6000, 0.7, 200, (0,) * 20, {1: 3000, 2: 2000, 3: 1000})
 EPISODES = EpisodeFigures(

@@ -7,9 +7,12 @@ import io
 import itertools
 import json
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,27 +23,41 @@ from rich.console import Console
 
 import synpick_warp
 from synpick_warp.apps.statistics import collect as collecting
-from synpick_warp.apps.statistics import partial as partials
-from synpick_warp.apps.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
-from synpick_warp.apps.statistics.attempts import FORCE_BIN, EpisodeCounts
-from synpick_warp.apps.statistics.bins import BinCounts, BinUse
-from synpick_warp.apps.statistics.collect import SceneTask, collect
-from synpick_warp.apps.statistics.compute import assemble, compute_statistics
-from synpick_warp.apps.statistics.counting import Group
-from synpick_warp.apps.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, SECTORS, CoverageCounts, direction_bins
-from synpick_warp.apps.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
-from synpick_warp.apps.statistics.lights import LightCounts
+from synpick_warp.apps.statistics import compute, counts
+from synpick_warp.apps.statistics.collect import SceneTask, collect, read_episode, read_scene
+from synpick_warp.apps.statistics.columns import (
+    BANDS,
+    DEPTH_BIN,
+    DIRECTION_BINS,
+    FORCE_BIN,
+    MIN_VISIBILITY,
+    SECTORS,
+    TIME_BIN,
+    VISIBILITY_BINS,
+    AttemptFacts,
+    BinFacts,
+    EpisodeFacts,
+    Light,
+    depth_blocks,
+    direction_bins,
+    episode_blocks,
+    frame_blocks,
+    light_blocks,
+    rest_blocks,
+    scene_blocks,
+)
+from synpick_warp.apps.statistics.compute import DEPTH_QUANTILES, assemble, compute_statistics
+from synpick_warp.apps.statistics.counts import Block, Counts, Group
+from synpick_warp.apps.statistics.figures import BinUse, Coverage, Rest
 from synpick_warp.apps.statistics.output import print_statistics
-from synpick_warp.apps.statistics.partial import Partial
-from synpick_warp.apps.statistics.records import AttemptFacts, BinFacts, EpisodeFacts, Light
-from synpick_warp.apps.statistics.scenes import SceneTruth
 from synpick_warp.apps.statistics.tables import make_tables
-from synpick_warp.apps.statistics.timeline import TIME_BIN, TimelineCounts
 from synpick_warp.configs.cell.gripper import Suction
+from synpick_warp.dataset.bop.arrays import SceneArrays
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, PERIOD, PRISM, VISIBILITY, write_evaluation_set
 
+GROUP = Group("train", "pick")
 ATTEMPTS = [
     {"outcome": "target_picked", "good_seal": True, "engaged": [1], "peak_force": [0.0, 3.0, 5.5]},
     {"outcome": "target_picked", "good_seal": False, "engaged": [0, 1], "peak_force": [0.0, 500.0]},
@@ -125,9 +142,8 @@ def test_a_line_tells_that_no_seal_came_near_its_break_force(statistics, forces,
     rows = [
         AttemptFacts("target_picked", good, [1], [0.0, force], limit) for force, good, limit in (*forces, *[(2.5, False, None)] * broken)
     ]
-    counts = EpisodeCounts()
-    counts.add_episode(Group("a", "pick"), EpisodeFacts("pick", 9, "finished"), rows, Suction())
-    episodes = counts.result(counts.groups())
+    found = counted(episode_blocks(GROUP, EpisodeFacts("pick", 9, "finished"), rows, Suction()))
+    episodes = compute.episode_figures(found, [GROUP])
     assert episodes.largest_load == (100 if broken else load)
     console = Console(file=io.StringIO(), width=200)
     print_statistics(console, replace(statistics, total=replace(statistics.total, episodes=episodes)))
@@ -137,12 +153,13 @@ def test_a_line_tells_that_no_seal_came_near_its_break_force(statistics, forces,
 def test_bins_have_the_known_answers_and_merge(statistics):
     step = math.radians(5.0)
     assert statistics.bins == {"kanban": BinUse(1, (0.01, 0.02), (-0.02, -0.01), (-2 * step, -step))}
-    one, other = BinCounts(), BinCounts()
-    one.add_episode(BinFacts("a", (0.0, 0.0, 0.0), 0.0))
-    other.add_episode(BinFacts("b", (0.0, 0.0, 0.0), 0.0))
-    other.add_episode(BinFacts("b", (0.035, 0.0, 0.0), 0.0))
+    one, other, third = (
+        counted(episode_blocks(GROUP, EpisodeFacts("pick", 9, "finished", bin=BinFacts(name, (x, 0.0, 0.0), 0.0)), [], None))
+        for name, x in (("a", 0.0), ("b", 0.0), ("b", 0.035))
+    )
     one.merge(other)
-    assert {name: (use.episodes, use.x) for name, use in one.result().items()} == {"b": (2, (0.0, 0.04)), "a": (1, (0.0, 0.01))}
+    one.merge(third)
+    assert {name: (use.episodes, use.x) for name, use in compute.bin_figures(one).items()} == {"b": (2, (0.0, 0.04)), "a": (1, (0.0, 0.01))}
 
 
 def test_lights_have_the_known_answers_and_what_is_missing_is_told(statistics, data_set):
@@ -176,7 +193,7 @@ def test_depth_is_that_of_all_pixels(statistics, folder):
     pixels = np.sort(np.concatenate([image[image > 0] for image in images])) * 0.1
     assert statistics.depth.views == len(images) == FRAMES * CAMERAS
     assert statistics.depth.missing == pytest.approx(np.mean(np.stack(images) == 0))
-    for quantile in QUANTILES:
+    for quantile in DEPTH_QUANTILES:
         expected = np.quantile(pixels, quantile, method="inverted_cdf")
         assert statistics.depth.quantiles[quantile] == pytest.approx(expected, abs=DEPTH_BIN / 2 + 1e-6)
 
@@ -207,16 +224,22 @@ def test_all_figures_are_those_of_a_twin_that_reads_view_by_view(statistics, dat
 # ---- merges ----
 
 
+def counted(*tables: Iterable[Block]) -> Counts:
+    """Sums over tables."""
+    result = Counts()
+    for blocks in tables:
+        result.add(blocks)
+    return result
+
+
 @given(
     order=st.permutations(list(itertools.product(range(len(MODES)), range(CAMERAS)))),
     parts=st.lists(st.integers(0, 3), min_size=6, max_size=6),
 )
-def test_parts_merge_to_the_whole_in_any_order(data_set, whole, order, parts):
-    pieces = [Partial() for _ in range(4)]
-    for (episode, camera), part in zip(order, parts, strict=True):
-        pieces[part].add_scene(data_set, episode, camera, range(FRAMES))
-        if camera == 0:
-            pieces[part].add_episode(data_set, episode)
+def test_parts_merge_to_the_whole_in_any_order(blocks, whole, order, parts):
+    pieces = [Counts() for _ in range(4)]
+    for place, part in zip(order, parts, strict=True):
+        pieces[part].add(blocks[place])
     left, right = pieces[:2], pieces[2:]
     for side in (left, right):
         side[0].merge(side[1])
@@ -225,13 +248,20 @@ def test_parts_merge_to_the_whole_in_any_order(data_set, whole, order, parts):
 
 
 @pytest.fixture(scope="module")
-def whole(data_set) -> Partial:
-    result = Partial()
-    for episode in range(len(MODES)):
-        result.add_episode(data_set, episode)
-        for camera in range(CAMERAS):
-            result.add_scene(data_set, episode, camera, range(FRAMES))
-    return result
+def blocks(data_set) -> dict[tuple[int, int], list[Block]]:
+    """Tables of each (episode, camera); those of the episode are with camera 0."""
+    return {
+        (episode, camera): [
+            *read_scene(data_set, SceneTask(episode, camera, FRAMES, range(FRAMES))),
+            *(read_episode(data_set, episode) if camera == 0 else ()),
+        ]
+        for episode, camera in itertools.product(range(len(MODES)), range(CAMERAS))
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(blocks) -> Counts:
+    return counted(*blocks.values())
 
 
 @given(
@@ -242,23 +272,20 @@ def whole(data_set) -> Partial:
 def test_a_scene_counts_as_its_halves(visibility, cut, seed):
     random = np.random.default_rng(seed)
     ids = random.integers(1, 5, len(visibility))
-    group = Group("train", "move")
-    whole, halves = AnnotationCounts(), AnnotationCounts()
-    whole.add_scene(group, scene(np.array(visibility), ids))
-    for part in (slice(0, cut), slice(cut, None)):
-        other = AnnotationCounts()
-        other.add_scene(group, scene(np.array(visibility[part]), ids[part]))
-        halves.merge(other)
-    halves.views[group] = whole.views[group]
+    whole = counted(scene_blocks(GROUP, scene(visibility, ids), ""))
+    halves = counted(*(scene_blocks(GROUP, scene(visibility[part], ids[part]), "") for part in (slice(0, cut), slice(cut, None))))
+    halves.sums["views"][GROUP, "views"] -= 1
     assert halves == whole
-    result = whole.result([group])
+    result = compute.annotation_figures(whole, [GROUP])
     assert result.visibility == pytest.approx(np.mean(visibility), abs=1e-9)
     assert sum(result.histogram) == result.instances == len(visibility)
 
 
-def scene(visibility: np.ndarray, ids: np.ndarray, counts: np.ndarray | None = None) -> SceneTruth:
-    counts = np.array([len(ids)]) if counts is None else counts
-    return SceneTruth(len(counts), counts, ids, visibility, np.tile((0.0, 0.0, 1.0), (len(ids), 1)), None, np.ones(len(counts)), None)  # type: ignore[arg-type]
+def scene(visibility: Sequence[float], ids: np.ndarray, frames: Sequence[int] | None = None) -> SceneArrays:
+    """Scene of instances before the camera, `frames` of them in each frame; without, all in one."""
+    frames, number = [len(ids)] if frames is None else frames, len(ids)
+    row, pose = np.repeat(np.arange(len(frames)), frames), (np.tile(np.eye(3), (number, 1, 1)), np.tile((0.0, 0.0, -1.0), (number, 1)))
+    return SceneArrays(np.arange(len(frames)), [], row, ids, ids, True, *pose, np.array(visibility), np.zeros((number, 4)))
 
 
 def test_processes_count_what_one_counts(data_set, statistics, monkeypatch):
@@ -272,7 +299,7 @@ def test_processes_count_what_one_counts(data_set, statistics, monkeypatch):
 
 @given(frames=st.lists(st.integers(1, 40), min_size=1, max_size=8), count=st.integers(0, 50))
 def test_depth_is_sampled_evenly(frames, count):
-    tasks = collecting._sample_depth([SceneTask(index, 0, length) for index, length in enumerate(frames)], count)
+    tasks = list(collecting._sample_depth([SceneTask(index, 0, length) for index, length in enumerate(frames)], count))
     places = [sum(frames[: task.episode]) + frame for task in tasks for frame in task.depth_frames]
     assert len(places) == len(set(places)) == min(count, sum(frames))
     assert all(frame < task.frames for task in tasks for frame in task.depth_frames)
@@ -280,59 +307,96 @@ def test_depth_is_sampled_evenly(frames, count):
         assert np.ptp(np.diff(places)) <= 1
 
 
-# ---- single accumulators ----
+# ---- single figures ----
 
 
 def test_bins_of_directions_have_equal_areas():
     """Even directions fill them evenly; the axes have known bins."""
-    random = np.random.default_rng(0).normal(size=(BINS * 500, 3))
-    counts = np.bincount(direction_bins(random / np.linalg.norm(random, axis=1, keepdims=True)), minlength=BINS)
-    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (BINS - 1)) < 4.5 * np.sqrt(2.0 * BINS)
+    random = np.random.default_rng(0).normal(size=(DIRECTION_BINS * 500, 3))
+    counts = np.bincount(direction_bins(random / np.linalg.norm(random, axis=1, keepdims=True)), minlength=DIRECTION_BINS)
+    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (DIRECTION_BINS - 1)) < 4.5 * np.sqrt(2.0 * DIRECTION_BINS)
     bands = direction_bins(np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])) // SECTORS
     assert bands.tolist() == [BANDS - 1, 0, BANDS // 2, BANDS // 2, BANDS // 2]
     assert (direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % SECTORS).tolist() == [SECTORS // 2, 3 * SECTORS // 4]
 
 
+def coverage(counts: Counts, object_id: int) -> Coverage:
+    return compute.coverage_figures(counts.of("directions"), object_id)
+
+
 def test_evenness_is_0_for_one_direction_and_1_for_all():
-    one, even = CoverageCounts(), CoverageCounts()
-    one.add_scene(scene(np.ones(5), np.full(5, 7)))
-    assert (one.result(7).views, one.result(7).evenness, one.result(7).occupied) == (5, 0.0, 1 / BINS)
-    even.bins.update({(7, index): 2 for index in range(BINS)})
-    assert even.result(7).evenness == pytest.approx(1.0)
-    assert even.result(8) == dataclasses.replace(one.result(8), views=0)
-    hidden = CoverageCounts()
-    hidden.add_scene(scene(np.full(5, MIN_VISIBILITY - 1e-6), np.full(5, 7)))
-    assert hidden.result(7).views == 0
+    one, even = counted(scene_blocks(GROUP, scene(np.ones(5), np.full(5, 7)), "")), Counts()
+    first = coverage(one, 7)
+    assert (first.views, first.evenness, first.occupied) == (5, 0.0, 1 / DIRECTION_BINS)
+    even.sums["directions"].update({(7, index): 2 for index in range(DIRECTION_BINS)})
+    assert coverage(even, 7).evenness == pytest.approx(1.0)
+    assert coverage(even, 8) == dataclasses.replace(first, views=0, occupied=0.0, bins=(0,) * DIRECTION_BINS)
+    hidden = counted(scene_blocks(GROUP, scene(np.full(5, MIN_VISIBILITY - 1e-6), np.full(5, 7)), ""))
+    assert coverage(hidden, 7).views == 0
 
 
 def test_objects_over_time_are_a_mean_over_those_that_last():
-    group, counts = Group("train", "pick"), TimelineCounts()
-    frames = round(2 * TIME_BIN / PERIOD)
-    counts.add_scene(group, scene(np.ones(0), np.ones(0, int), np.repeat((5, 3), frames // 2)), PERIOD)
-    counts.add_scene(group, scene(np.ones(0), np.ones(0, int), np.full(frames // 2, 1)), PERIOD)
-    assert counts.result([group]) == ((0.0, frames, 3.0), (TIME_BIN, frames // 2, 3.0))
+    half = round(TIME_BIN / PERIOD)
+    frames = ([5] * half + [3] * half, [1] * half)
+    found = counted(*(frame_blocks(GROUP, scene(np.ones(sum(each)), np.ones(sum(each), int), each), PERIOD) for each in frames))
+    assert compute.timeline_figures(found, [GROUP]) == ((0.0, 2 * half, 3.0), (TIME_BIN, half, 3.0))
 
 
 def test_depth_without_pixels():
-    counts = DepthCounts()
-    assert counts.result() is None
-    counts.add_image(np.zeros((2, 3), np.uint16), 0.1)
-    assert counts.result().quantiles == {}
-    assert counts.result().missing == 1.0
+    assert compute.depth_figures(Counts()) is None
+    depth = compute.depth_figures(counted(depth_blocks(np.zeros((2, 3), np.uint16), 0.1)))
+    assert (depth.quantiles, depth.missing) == ({}, 1.0)
 
 
 @given(yaw=st.floats(-100.0, 100.0), exposure=st.floats(-5.0, 5.0))
 def test_any_light_has_a_bin(yaw, exposure):
-    counts = LightCounts()
-    counts.add_episode(Light("sky", yaw, exposure))
-    assert sum(counts.result().yaw) == 1
-    ((low, _),) = counts.result().exposure.items()
+    lights = compute.light_figures(counted(light_blocks(Light("sky", yaw, exposure))))
+    assert sum(lights.yaw) == 1
+    ((low, _),) = lights.exposure.items()
     assert low - 1e-6 <= exposure < low + 0.1 + 1e-6
 
 
 def test_endlessly_many_objects_are_refused(monkeypatch):
-    monkeypatch.setattr(partials, "MAX_OBJECTS", 3)
-    part = Partial()
-    part.annotations.add_scene(Group("train", "move"), scene(np.ones(4), np.arange(4)))
+    monkeypatch.setattr(counts, "MAX_OBJECTS", 3)
     with pytest.raises(DatasetError, match="more than 3 different obj_id"):
-        Partial().merge(part)
+        Counts().merge(counted(scene_blocks(GROUP, scene(np.ones(4), np.arange(4)), "")))
+
+
+# ---- piles at rest ----
+
+STEP, WINDOWS = 2e-3, 5
+TIME = STEP * np.arange(round(WINDOWS * 0.2 / STEP))
+HUM = np.sin(2 * np.pi * 50.0 * TIME)
+"""50 Hz."""
+
+
+def rest(speed: np.ndarray, **others: Any) -> Rest | None:
+    """Windows of an episode in which one of two objects has these speeds [m/s] along x; a third is not in the scene."""
+    velocity = np.zeros((len(TIME), 3, 3), np.float32)
+    velocity[:, 1, 0], velocity[:, 2] = speed, np.nan
+    steps = {"velocity": velocity, "attached": np.zeros((len(TIME), 3), bool), "gripper_contact_load": np.zeros((len(TIME), 2))}
+    return compute.rest_figures(counted(rest_blocks(SimpleNamespace(steps={**steps, **others}), STEP)))
+
+
+@pytest.mark.parametrize(
+    ("speed", "windows", "vibrating"),
+    [
+        (0.0 * TIME, 5, 0),
+        (0.006 * HUM, 5, 5),
+        (0.006 * HUM + 0.001, 5, 5),
+        (0.004 * HUM, 5, 0),
+        (0.006 * HUM * (TIME < 0.4), 5, 2),
+        (0.1 * HUM * np.exp(-TIME / 0.02), 5, 0),
+        (0.006 * HUM + 0.02 * (TIME < 0.2), 4, 4),
+    ],
+)
+def test_windows_that_vibrate_are_counted(speed, windows, vibrating):
+    """To and fro without decay; objects that drift or are shaken once are no pile at rest that vibrates."""
+    assert rest(speed) == Rest(windows, vibrating)
+
+
+def test_what_the_gripper_does_is_no_rest():
+    pressed = np.zeros((len(TIME), 2))
+    pressed[150, 1] = 3.0
+    assert rest(0.006 * HUM, gripper_contact_load=pressed) == Rest(4, 4)
+    assert rest(0.006 * HUM, attached=np.ones((len(TIME), 3), bool)) is None

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.apps.statistics.annotations import Annotations
-from synpick_warp.apps.statistics.counting import Group
+from synpick_warp.apps.statistics.figures import Annotations, Episodes, GroupStatistics
 from synpick_warp.apps.statistics.paper import compare, object_distance, read_paper, total_variation
 
 COUNTS = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 1000)).filter(lambda counts: sum(counts.values()) > 0)
@@ -51,15 +50,15 @@ def test_total_variation_is_a_metric(first, second, third):
 def test_the_papers_own_set_has_no_difference():
     paper = read_paper()
     ids = {name: index for index, name in enumerate(paper.groups[0].objects)}
-    ours = {
-        Group(each.split, each.mode): Annotations(
-            each.views, each.instances, each.visibility, 0, (), {ids[name]: count for name, count in each.objects.items()}
+    ours = []
+    for each in paper.groups:
+        objects = {ids[name]: count for name, count in each.objects.items()}
+        episodes = Episodes(each.sequences, 0, {}, 0, 0, 0, 0, {}, 0, 0, None, ())
+        ours.append(
+            GroupStatistics(each.split, each.mode, episodes, Annotations(each.views, each.instances, each.visibility, 0, (), objects), ())
         )
-        for each in paper.groups
-    }
-    sequences = {Group(each.split, each.mode): each.sequences for each in paper.groups}
     names = {index: f"000_{name}" for name, index in ids.items()}
-    rows = compare(ours, sequences, {"train": "train", "test": "test"}, names, paper.cameras)
+    rows = compare(ours, {"train": "train", "test": "test"}, names, paper.cameras)
     assert len(rows) == 6
     for row in rows:
         assert row.ours == row.paper

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.report.album import Album, Picture, Section, encode_ids, encode_photo, shrink
 from synpick_warp.apps.report.sampling import Content
-from synpick_warp.apps.statistics.records import MAX_NAME
+from synpick_warp.apps.statistics.columns import MAX_NAME
 from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.preview_layers import draw_layer

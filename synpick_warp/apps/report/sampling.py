@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.apps.statistics.records import EpisodeFacts
+from synpick_warp.apps.statistics.columns import EpisodeFacts
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet

@@ -1,22 +1,42 @@
-"""Statistics of a data set: assembles the figures of all groups."""
+"""Statistics of a data set: computes the figures of all groups from the counts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Collection, Mapping, Sequence
 
-from synpick_warp.apps.statistics.annotations import Annotations
-from synpick_warp.apps.statistics.attempts import Episodes
-from synpick_warp.apps.statistics.bins import BinUse
+import numpy as np
+
 from synpick_warp.apps.statistics.collect import Collected, Report, collect
-from synpick_warp.apps.statistics.counting import Group
-from synpick_warp.apps.statistics.coverage import Coverage
-from synpick_warp.apps.statistics.depth import Depth
-from synpick_warp.apps.statistics.lights import Lights
-from synpick_warp.apps.statistics.looks import LookStatistics
-from synpick_warp.apps.statistics.paper import Comparison, compare
-from synpick_warp.apps.statistics.rest import Rest
-from synpick_warp.apps.statistics.timeline import TimePoint
+from synpick_warp.apps.statistics.columns import (
+    BIN_STEPS,
+    DEPTH_BIN,
+    DIRECTION_BINS,
+    EXPOSURE_BIN,
+    FORCE_BINS,
+    FORCE_UNIT,
+    TIME_BIN,
+    VISIBILITY_BINS,
+    VISIBILITY_UNIT,
+    YAW_BINS,
+)
+from synpick_warp.apps.statistics.counts import Counts, Group
+from synpick_warp.apps.statistics.figures import (
+    Annotations,
+    BinUse,
+    Coverage,
+    Depth,
+    Episodes,
+    GroupStatistics,
+    Lights,
+    LookStatistics,
+    ObjectStatistics,
+    Range,
+    Rest,
+    Statistics,
+    TimePoint,
+)
+from synpick_warp.apps.statistics.paper import compare
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.object_names import object_names
@@ -30,64 +50,8 @@ NOT_BAKED = "this data set is from another source: its scenes count as episodes,
 """What is missing of data sets of other programs."""
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""
-
-
-@dataclass(frozen=True)
-class GroupStatistics:
-    """Statistics of the episodes of a split and a mode (empty: all): episodes, annotations, objects over time."""
-
-    split: str
-    """Name of the split; empty: all."""
-    mode: str
-    """pick, target or move; empty: all."""
-    episodes: Episodes
-    annotations: Annotations
-    objects_over_time: tuple[TimePoint, ...]
-
-
-@dataclass(frozen=True)
-class ObjectStatistics:
-    """Statistics of one object: obj_id, name, annotated instances, coverage of viewing directions."""
-
-    object_id: int
-    name: str
-    """Empty: it is not known."""
-    instances: int
-    """Annotated instances."""
-    coverage: Coverage
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """Statistics of a data set: groups and total, objects, depth, lights (None: not read), comparison with the paper, what is
-    missing, looks and bins.
-    """
-
-    cameras: int
-    groups: tuple[GroupStatistics, ...]
-    """By split in the order of the settings, then by mode."""
-    total: GroupStatistics
-    objects: tuple[ObjectStatistics, ...]
-    """By obj_id: the objects that are annotated, and those of the models folder that never are."""
-    depth: Depth | None
-    """None: no depth image was read."""
-    lights: Lights | None
-    """None: no scene names its light."""
-    paper: tuple[Comparison, ...]
-    """Groups that the paper has, too."""
-    missing: tuple[str, ...]
-    """What the data set does not have, a sentence each."""
-    looks: tuple[LookStatistics, ...] = ()
-    """By part and parameter; none: looks are not randomized."""
-    bins: Mapping[str, BinUse] = field(default_factory=dict)
-    """By name; empty: no episode names its bin, since the tote is always in its place."""
-    rest: Rest | None = None
-    """None: no steps of piles at rest were recorded."""
-
-    @property
-    def has_paper_objects(self) -> bool:
-        """Whether the objects are those of the paper, with which a comparison makes sense."""
-        return any(row.distance is not None for row in self.paper)
+DEPTH_QUANTILES = (0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
+LOOK_QUANTILES = (0.05, 0.5, 0.95)
 
 
 def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, threads: int = 0, report: Report | None = None) -> Statistics:
@@ -112,27 +76,15 @@ def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, thr
 
 def assemble(data_set: DataSet, collected: Collected) -> Statistics:
     """Compute the statistics of a data set from the counts."""
-    partial, missing = collected.partial, list(collected.missing)
+    counts, missing = collected.counts, list(collected.missing)
     order = {name: index for index, name in enumerate(data_set.splits)}
-    groups = sorted(partial.episodes.groups(), key=lambda group: (order.get(group.split, len(order)), group.mode))
-
-    def figures(split: str, mode: str, members: Iterable[Group]) -> GroupStatistics:
-        members = tuple(members)
-        counted = partial.episodes.result(members), partial.annotations.result(members), partial.timeline.result(members)
-        return GroupStatistics(split, mode, *counted)
-
-    rows = tuple(figures(*group, [group]) for group in groups)
-    total = figures("", "", groups)
-    objects = _objects(data_set, collected, total.annotations)
+    groups = sorted(counts.groups(), key=lambda group: (order.get(group.split, len(order)), group.mode, group.split))
+    rows = tuple(_group(counts, *group, groups=[group]) for group in groups)
+    total = _group(counts, "", "", groups)
+    objects = _objects(data_set, counts, total.annotations)
     kinds = {name: split_kind(folder) for name, folder in data_set.split_folders.items()}
-    paper = compare(
-        {group: row.annotations for group, row in zip(groups, rows, strict=True)},
-        {group: row.episodes.episodes for group, row in zip(groups, rows, strict=True)},
-        kinds,
-        {each.object_id: each.name for each in objects},
-        data_set.camera_count,
-    )
-    depth, lights = partial.depth.result(), partial.lights.result()
+    paper = compare(rows, kinds, {each.object_id: each.name for each in objects}, data_set.camera_count)
+    depth, lights = depth_figures(counts), light_figures(counts)
     if not total.annotations.views:
         missing.append(
             "no images: no views, visibility, objects over time, coverage, depth or light maps; bake with --formats bop or shards"
@@ -146,11 +98,17 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
         missing.append("no attempts: no episode picks, so there are neither outcomes nor seal forces")
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
-    drawn = partial.looks.result(), partial.bins.result(), partial.rest.result()
+    drawn = look_figures(counts), bin_figures(counts), rest_figures(counts)
     return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), *drawn)
 
 
-def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tuple[ObjectStatistics, ...]:
+def _group(counts: Counts, split: str, mode: str, groups: Collection[Group]) -> GroupStatistics:
+    """Statistics of some groups together, under the name of a split and a mode."""
+    figures = episode_figures(counts, groups), annotation_figures(counts, groups), timeline_figures(counts, groups)
+    return GroupStatistics(split, mode, *figures)
+
+
+def _objects(data_set: DataSet, counts: Counts, total: Annotations) -> tuple[ObjectStatistics, ...]:
     """Statistics of each object that has a model or an annotation, by obj_id."""
     try:
         known = set(data_set.models_info)
@@ -163,7 +121,117 @@ def _objects(data_set: DataSet, collected: Collected, total: Annotations) -> tup
         names = object_names(data_set.folder, set(object_ids), config.object_rows, config.objects.diameter_tolerance)
     elif data_set.has_store:
         names = {each.object_id: each.name for each in data_set.objects}
+    directions = counts.of("directions")
     return tuple(
-        ObjectStatistics(each, names.get(each, ""), total.objects.get(each, 0), collected.partial.coverage.result(each))
-        for each in object_ids
+        ObjectStatistics(each, names.get(each, ""), total.objects.get(each, 0), coverage_figures(directions, each)) for each in object_ids
     )
+
+
+def episode_figures(counts: Counts, groups: Collection[Group]) -> Episodes:
+    """Episodes of some groups and their attempts."""
+    totals, seals, loads = (counts.of(name, groups) for name in ("episodes", "seals", "loads"))
+    return Episodes(
+        **{name: totals[name] for name in ("episodes", "frames", "objects", "picked", "lost", "attempts")},
+        endings=_ranked(counts.of("endings", groups)),
+        outcomes=_ranked(counts.of("outcomes", groups)),
+        good_seals=counts.of("good_seals", groups)["good_seals"],
+        seals=seals["seals"],
+        force=seals["force"] / (FORCE_UNIT * seals["seals"]) if seals["seals"] else None,
+        force_histogram=_histogram(counts.of("forces", groups), FORCE_BINS),
+        largest_load=max(loads, default=None),
+    )
+
+
+def annotation_figures(counts: Counts, groups: Collection[Group]) -> Annotations:
+    """Annotations of some groups."""
+    totals, objects = counts.of("views", groups), counts.of("objects", groups)
+    return Annotations(
+        views=totals["views"],
+        instances=objects.total(),
+        visibility=totals["visibility"] / (VISIBILITY_UNIT * totals["known"]) if totals["known"] else None,
+        invisible=totals["invisible"],
+        histogram=_histogram(counts.of("visibility", groups), VISIBILITY_BINS),
+        objects=dict(sorted(objects.items())),
+    )
+
+
+def timeline_figures(counts: Counts, groups: Collection[Group]) -> tuple[TimePoint, ...]:
+    """Mean number of objects over time in some groups."""
+    sums = counts.of("timeline", groups)
+    bins = sorted({index for index, _ in sums})
+    return tuple(TimePoint(each * TIME_BIN, sums[each, "frames"], sums[each, "objects"] / sums[each, "frames"]) for each in bins)
+
+
+def coverage_figures(directions: Mapping[tuple[int, int], int], object_id: int) -> Coverage:
+    """Pose coverage of an object, from the numbers of views by obj_id and bin. Symmetries are not taken into account: of a can, all
+    longitudes look the same, and count as different."""
+    bins = tuple(directions.get((object_id, index), 0) for index in range(DIRECTION_BINS))
+    total = sum(bins)
+    shares = [count / total for count in bins if count]
+    evenness = max(0.0, -math.fsum(share * math.log(share) for share in shares)) / math.log(DIRECTION_BINS)
+    return Coverage(total, len(shares) / DIRECTION_BINS, evenness, bins)
+
+
+def depth_figures(counts: Counts) -> Depth | None:
+    """Depth of the pixels of all depth images that were read; None: none was."""
+    totals = counts.of("depth_views")
+    if not totals["pixels"]:
+        return None
+    pixels = {each: number for (each, _), number in counts.of("depths").items()}
+    # Ranks count from 1 on, so that both ends are pixels.
+    quantiles = {share: (each + 0.5) * DEPTH_BIN for share, each in _quantiles(pixels, DEPTH_QUANTILES).items()}
+    return Depth(totals["views"], totals["pixels"], totals["missing"] / totals["pixels"], quantiles)
+
+
+def light_figures(counts: Counts) -> Lights | None:
+    """Light of all episodes; None: no episode names its light."""
+    maps = counts.of("light_maps")
+    if not maps:
+        return None
+    exposure = {round(index * EXPOSURE_BIN, 6): count for index, count in sorted(counts.of("exposures").items())}
+    return Lights(maps.total(), _ranked(maps), _histogram(counts.of("light_yaws"), YAW_BINS), exposure)
+
+
+def look_figures(counts: Counts) -> tuple[LookStatistics, ...]:
+    """What was drawn of each part and parameter, sorted; none: looks are not randomized."""
+    drawn: dict[tuple[str, str], dict[float, int]] = {}
+    for (part, parameter, value), count in counts.of("looks").items():
+        drawn.setdefault((part, parameter), {})[value] = count
+    return tuple(
+        LookStatistics(*key, sum(values.values()), tuple(_quantiles(values, LOOK_QUANTILES).values()))
+        for key, values in sorted(drawn.items())
+    )
+
+
+def bin_figures(counts: Counts) -> dict[str, BinUse]:
+    """Use of each bin, the most frequent first."""
+    steps: dict[tuple[str, str], list[int]] = {}
+    for name, axis, step in counts.of("bin_places"):
+        steps.setdefault((name, axis), []).append(step)
+    ends: dict[tuple[str, str], Range] = {
+        (name, axis): (min(found) * BIN_STEPS[axis], (max(found) + 1) * BIN_STEPS[axis]) for (name, axis), found in steps.items()
+    }
+    return {name: BinUse(count, *(ends[name, axis] for axis in BIN_STEPS)) for name, count in _ranked(counts.of("bins")).items()}
+
+
+def rest_figures(counts: Counts) -> Rest | None:
+    """Windows of piles at rest; None: there is none."""
+    windows = counts.of("windows")
+    return Rest(windows["at_rest"], windows["vibrating"]) if windows["at_rest"] else None
+
+
+def _ranked(counts: Mapping[str, int]) -> dict[str, int]:
+    """Counts by name, the largest first."""
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _histogram(counts: Mapping[int, int], size: int) -> tuple[int, ...]:
+    """Counts of bins 0 to `size` - 1."""
+    return tuple(counts.get(index, 0) for index in range(size))
+
+
+def _quantiles(counts: Mapping[float, int], shares: Sequence[float]) -> dict[float, float]:
+    """Value at each quantile of numbers that are given by counts (the inverse of their distribution function); empty: there are none."""
+    values = sorted(counts)
+    bounds = np.cumsum([counts[value] for value in values])
+    return {share: values[int(np.searchsorted(bounds, share * bounds[-1]))] for share in shares if values}

@@ -11,15 +11,17 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-from synpick_warp.apps.statistics.attempts import NEAR
-from synpick_warp.apps.statistics.compute import OTHER_OBJECTS, Statistics
-from synpick_warp.apps.statistics.rest import AMPLITUDE, WINDOW
+from synpick_warp.apps.statistics.columns import REST_AMPLITUDE, REST_WINDOW
+from synpick_warp.apps.statistics.compute import OTHER_OBJECTS
+from synpick_warp.apps.statistics.figures import Statistics
 from synpick_warp.apps.statistics.tables import PAPER, TIMELINE, make_tables
 from synpick_warp.errors import OutputError, escape
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.system.codecs.tables import Table, to_csv, to_text
 from synpick_warp.system.folders import make_folder
 
+NEAR = 50
+"""Load from which a seal is near its limit [% of its break force]."""
 MAX_TEXT_ROWS = 24
 """Rows of objects over time in text: of a longer table, evenly spread rows are shown."""
 
@@ -91,8 +93,8 @@ def print_statistics(console: Console, statistics: Statistics, paper: bool | Non
         line = f"no seal was loaded beyond {load} % of its break force: no pick depended on how strong suction is"
         console.print(line, markup=False, soft_wrap=True)
     if (rest := statistics.rest) is not None:
-        line = f"piles that vibrate: {rest.vibrating:,} of {rest.windows:,} windows of {WINDOW} s at rest have an object above"
-        console.print(f"{line} {1e3 * AMPLITUDE:g} mm/s, to and fro", markup=False, soft_wrap=True)
+        line = f"piles that vibrate: {rest.vibrating:,} of {rest.windows:,} windows of {REST_WINDOW} s at rest have an object above"
+        console.print(f"{line} {1e3 * REST_AMPLITUDE:g} mm/s, to and fro", markup=False, soft_wrap=True)
     if paper is None and statistics.paper and not shown:
         console.print("the objects are not those of the paper; --paper shows its numbers beside these", markup=False, soft_wrap=True)
 

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 
-from synpick_warp.apps.statistics.annotations import Annotations
-from synpick_warp.apps.statistics.counting import Group
+from synpick_warp.apps.statistics.figures import Comparison, GroupStatistics, Numbers
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.toml import read_toml
 
@@ -52,73 +50,32 @@ class Paper(msgspec.Struct, frozen=True):
         return next((each for each in self.groups if (each.split, each.mode) == (split, mode)), None)
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """Numbers compared with the paper: sequences, views, frames of a sequence, visible fraction, instances a view (None: not known)."""
-
-    sequences: int
-    views: int
-    views_per_sequence: float
-    """Views of one camera in a sequence: its frames."""
-    visibility: float | None
-    instances_per_view: float | None
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """Group of the data set beside that of the paper, with the total variation distance of their instances over objects (None: other
-    names), and that between the paper's own train and test.
-    """
-
-    split: str
-    mode: str
-    ours: Numbers
-    paper: Numbers
-    distance: float | None
-    """Total variation distance of the distributions of instances over objects, from 0 to 1; None: the objects have other names."""
-    paper_distance: float
-    """The same between train and test of the paper in this mode: how far its own two draws are apart."""
-
-
 @functools.cache
 def read_paper() -> Paper:
     """Read the paper's numbers from paper.toml."""
     return msgspec.convert(read_toml(Path(__file__).with_name("paper.toml"), DatasetError), Paper)
 
 
-def compare(
-    annotations: Mapping[Group, Annotations],
-    sequences: Mapping[Group, int],
-    kinds: Mapping[str, str],
-    names: Mapping[int, str],
-    cameras: int,
-) -> tuple[Comparison, ...]:
+def compare(groups: Sequence[GroupStatistics], kinds: Mapping[str, str], names: Mapping[int, str], cameras: int) -> tuple[Comparison, ...]:
     """Compare every group that the paper has, too, with the paper's numbers; one comparison each.
 
     Args:
-        annotations: Annotations of each group.
-        sequences: Episodes of each group.
+        groups: The groups.
         kinds: Split -> train, val or test.
         names: Names of objects by obj_id.
         cameras: Number of cameras.
     """
     paper, rows = read_paper(), []
-    for group, ours in annotations.items():
+    for group in groups:
+        ours, sequences = group.annotations, group.episodes.episodes
         theirs = paper.group(kinds.get(group.split, group.split), group.mode)
         if theirs is None or not ours.views:
             continue
         other = paper.group("test" if theirs.split == "train" else "train", theirs.mode)
-        mine = Numbers(sequences[group], ours.views, ours.views / (sequences[group] * cameras), ours.visibility, ours.instances_per_view)
-        rows.append(
-            Comparison(
-                split=group.split,
-                mode=group.mode,
-                ours=mine,
-                paper=_numbers(theirs, paper.cameras),
-                distance=object_distance(ours.objects, names, theirs.objects),
-                paper_distance=total_variation(theirs.objects, other.objects) if other else 0.0,
-            )
-        )
+        distance = total_variation(theirs.objects, other.objects) if other else 0.0
+        mine = Numbers(sequences, ours.views, ours.views / (sequences * cameras), ours.visibility, ours.instances_per_view)
+        pair = mine, _numbers(theirs, paper.cameras)
+        rows.append(Comparison(group.split, group.mode, *pair, object_distance(ours.objects, names, theirs.objects), distance))
     return tuple(rows)
 
 
