@@ -1,7 +1,7 @@
-"""Layered graph drawing (Sugiyama et al., 1981) of the clutter graph: arrows run downward, from the object on top to the one below.
+"""Layered drawing of the clutter graph: arrows run downward, from the object on top to the one below.
 
-Layers by longest path, order and columns by barycentres under the nodes' widths, long edges as splines. networkx' `multipartite_layout` is
-not used: it keeps the order of its input and spaces all layers evenly, so edges cross, and the nodes of wide layers overlap.
+Layers by longest path (networkx), each ordered by the mean place of what lies on its nodes, and spread evenly about the middle; an arrow
+that would run over another node is bent aside.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import cv2
 import networkx as nx
 import numpy as np
-from scipy.interpolate import PchipInterpolator
-from scipy.optimize import isotonic_regression
 
 from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
 from synpick_warp.apps.viz.explain_record import Attempt, labels
@@ -23,32 +21,27 @@ from synpick_warp.errors import DatasetError
 
 RADIUS = 20
 """Radius of a node [px]."""
-_MIN_GAP = 13
-"""Minimum gap between nodes of a layer [px]."""
-_MAX_STRETCH = 1.7
-"""Maximum factor by which a narrow graph is widened."""
-_ROUTE = 9
-"""Half the width reserved for an edge that passes a layer [px]."""
+_MIN_STEP, _MAX_STEP = 53, 110
+"""Minimum and maximum distance of neighbours in a layer [px]."""
 _MAX_LAYER_GAP = 150
 """Maximum distance of two layers [px]."""
 _MARGIN = 38
 """Distance from the border to the outermost nodes' centres [px]."""
-_SWEEPS = 8
-"""Number of downward and of upward barycentre sweeps; graphs of this size converge within them."""
-_MAX_PIECES = 1000
-"""Maximum number of edges between neighbouring layers; those of 100 objects are some 200."""
+_MAX_EDGES = 1000
+"""Maximum number of kept edges; those of 100 objects are some 200."""
 _BEND = 0.32
 """Offset of the control point of a removed edge's curve, as a fraction of its length; the curve deviates by half of it."""
-_SAMPLES = 12
-"""Number of points of a curve between two layers."""
+_OFFSETS = (0, 60, -60, 100, -100, 160, -160, 240, -240)
+"""Offsets [px] to the side that are tried for the control point of a kept edge's curve, until it passes beside all nodes."""
+_CLEARANCE = RADIUS + 6
+"""Distance [px] at which a curve passes beside a node."""
+_SAMPLES = 36
+"""Number of points of a curve."""
 _SHIFT = 4
 """Fractional bits of OpenCV's fixed-point coordinates."""
 GREY = (150, 150, 150)
 RED = (60, 60, 200)
 KEPT, OUTVOTED, CYCLIC = "kept", "outvoted by the opposite", "dropped to break a cycle"
-
-Key = int | tuple[int, int, int]
-"""A node: an instance id, or the dummy node of edge (upper, lower) in layer n."""
 
 
 @dataclass(frozen=True)
@@ -91,10 +84,10 @@ def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
 
 
 def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> Layout:
-    """Place nodes in layers such that every kept edge runs downward, with few crossings.
+    """Place nodes in layers such that every kept edge runs downward.
 
     Args:
-        attempt: Its suction points give the initial order from left to right.
+        attempt: Its suction points give the order of the uppermost objects from left to right.
         edges: Edges of the attempt.
         size: Width and height of the image [px].
 
@@ -102,81 +95,57 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
         DatasetError: The kept edges have a cycle, or are far more than those of any pile.
     """
     width, height = size
-    kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
-    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.observation.resolution[0] for one in attempt.seen}
-    depth = _assign_layers(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _MIN_GAP)) + 1))
-    if sum(depth[lower] - depth[upper] for upper, lower in kept) > _MAX_PIECES:
-        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has too many edges to be drawn")
-    graph = nx.Graph()
-    graph.add_nodes_from(depth)
-    layers: dict[Key, int] = {**depth}
-    chains: dict[tuple[int, int], list[Key]] = {}
-    for upper, lower in kept:
-        chain: list[Key] = [upper, *((upper, lower, layer) for layer in range(depth[upper] + 1, depth[lower])), lower]
-        for step, key in enumerate(chain[1:-1], start=1):
-            layers[key] = depth[upper] + step
-            place[key] = place[upper] + (place[lower] - place[upper]) * step / (len(chain) - 1)
-        nx.add_path(graph, chain)
-        chains[upper, lower] = chain
-    column = _widen(_place_columns(graph, layers, {key: _MARGIN + x * (width - 2 * _MARGIN) for key, x in place.items()}, width), width)
-    gap = min(_MAX_LAYER_GAP, (height - 2 * _MARGIN) / max([1, *depth.values()]))
-    point = {key: (column[key], _MARGIN + gap * layer) for key, layer in layers.items()}
-    routes = {edge: _curve(np.array([point[key] for key in chain])) for edge, chain in chains.items()}
-    return Layout({instance: point[instance] for instance in depth}, routes)
-
-
-def _assign_layers(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping[Key, float], capacity: int) -> dict[int, int]:
-    """Assign each instance to a layer by its longest path from a source; layers with more than `capacity` nodes are split."""
-    graph = nx.DiGraph(kept)
+    graph = nx.DiGraph([(edge.upper, edge.lower) for edge in edges if edge.state == KEPT])
     graph.add_nodes_from(one.instance for one in attempt.seen)
+    if graph.number_of_edges() > _MAX_EDGES:
+        raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has too many edges to be drawn")
+    rows = _rows(attempt, graph, int((width - 2 * _MARGIN) // _MIN_STEP) + 1)
+    longest = max((len(row) for row in rows), default=1)
+    step = min(_MAX_STEP, (width - 2 * _MARGIN) / max(1, longest - 1))
+    gap = min(_MAX_LAYER_GAP, (height - 2 * _MARGIN) / max(1, len(rows) - 1))
+    nodes = {
+        instance: (width / 2 + step * (place - (len(row) - 1) / 2), _MARGIN + gap * layer)
+        for layer, row in enumerate(rows)
+        for place, instance in enumerate(row)
+    }
+    return Layout(nodes, {(upper, lower): _route(nodes, upper, lower, width) for upper, lower in graph.edges})
+
+
+def _rows(attempt: Attempt, graph: nx.DiGraph, capacity: int) -> list[list[int]]:
+    """Instances of each layer from left to right: layers by longest path from above, in rows of at most `capacity`, ordered by the mean
+    place of its nodes' predecessors, or of those without any by their suction points."""
     try:
-        generations = [
-            sorted(layer, key=lambda instance: (graph.degree(instance) > 0, place[instance])) for layer in nx.topological_generations(graph)
-        ]
+        generations = list(nx.topological_generations(graph))
     except nx.NetworkXUnfeasible as error:
         raise DatasetError(f"the clutter graph of attempt {attempt.attempt} of episode {attempt.episode} has a cycle") from error
-    rows = [layer[start : start + capacity] for layer in generations for start in range(0, len(layer), capacity)]
-    return {instance: number for number, row in enumerate(rows) for instance in row}
+    place = {one.instance: one.grasp_pixel[0] / attempt.observation.resolution[0] for one in attempt.seen}
+    rows = []
+    for layer in generations:
+        ordered = sorted(layer, key=lambda instance: (graph.degree(instance) > 0, place[instance]))
+        for start in range(0, len(ordered), capacity):
+            row = ordered[start : start + capacity]
+            means = {key: float(np.mean([place[upper] for upper in graph.predecessors(key)] or [place[key]])) for key in row}
+            rows.append(sorted(row, key=means.__getitem__))
+            place.update({instance: (number + 0.5) / len(row) for number, instance in enumerate(rows[-1])})
+    return rows
 
 
-def _place_columns(graph: nx.Graph, layers: Mapping[Key, int], place: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """x of each node [px], by barycentre sweeps from the first x in `place`: each layer is ordered by the mean x of its nodes' neighbours,
-    and moved as near to these means (least squares, isotonic regression) as the widths of its nodes allow.
-
-    The first sweeps use the layer before, downward and upward in turn, which finds the order; the others use both sides.
-    """
-    rows: list[list[Key]] = [[] for _ in range(1 + max(layers.values(), default=-1))]
-    for key, layer in layers.items():
-        rows[layer].append(key)
-    x = dict(place)
-    for sweep in range(4 * _SWEEPS):
-        step = 1 if sweep % 2 == 0 else -1
-        for row in rows[::step]:
-            seen = {key: [x[other] for other in graph[key] if sweep >= 2 * _SWEEPS or layers[other] == layers[key] - step] for key in row}
-            means = {key: float(np.mean(near or [x[key]])) for key, near in seen.items()}
-            row.sort(key=means.__getitem__)
-            half = np.array([RADIUS + _MIN_GAP / 2 if isinstance(key, int) else _ROUTE for key in row])
-            apart = np.concatenate(([0.0], np.cumsum(half[1:] + half[:-1])))
-            apart *= min(1.0, (width - 2 * _MARGIN) / max(apart[-1], 1.0))
-            free = np.asarray(isotonic_regression(np.array([means[key] for key in row]) - apart).x)
-            x.update(zip(row, np.clip(free, _MARGIN, width - _MARGIN - apart[-1]) + apart, strict=True))
-    return x
+def _route(nodes: Mapping[int, tuple[float, float]], upper: int, lower: int, width: int) -> np.ndarray:
+    """Curve (N, 2) from node to node that passes beside all others: straight if possible, else bent to the side, y never turning back."""
+    others = np.array([place for instance, place in nodes.items() if instance not in (upper, lower)])
+    start, end = np.array(nodes[upper]), np.array(nodes[lower])
+    curves = [_arc(start, end, np.array((offset, 0.0))) for offset in _OFFSETS]
+    inside = [curve for curve in curves if curve[:, 0].min() >= 0 and curve[:, 0].max() <= width]
+    if not len(others):
+        return inside[0]
+    free = [min(_CLEARANCE, float(np.linalg.norm(curve[:, None] - others, axis=2).min())) for curve in inside]
+    return inside[int(np.argmax(free))]
 
 
-def _widen(column: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """Centre the graph horizontally, and widen it where the image allows."""
-    if not column:
-        return {}
-    low, high = min(column.values()), max(column.values())
-    factor = min(_MAX_STRETCH, (width - 2 * _MARGIN) / max(high - low, 1.0))
-    return {key: width / 2 + factor * (x - (low + high) / 2) for key, x in column.items()}
-
-
-def _curve(points: np.ndarray) -> np.ndarray:
-    """Polyline (N, 2) along a monotone cubic spline (PCHIP; Fritsch and Butland, 1984) of x and y over the index of the points: y never
-    turns back. Two points give a straight line.
-    """
-    return PchipInterpolator(range(len(points)), points)(np.linspace(0, len(points) - 1, _SAMPLES * (len(points) - 1)))
+def _arc(start: np.ndarray, end: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Quadratic Bézier curve (N, 2), whose control point is the middle of both ends, moved by `offset` [px]."""
+    t = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
+    return (1 - t) ** 2 * start + 2 * t * (1 - t) * ((start + end) / 2 + offset) + t**2 * end
 
 
 def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Image:
@@ -244,9 +213,8 @@ def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
     edge may run.
     """
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
-    bend = (start + end) / 2 + _BEND * np.array([end[1] - start[1], start[0] - end[0]])
-    t = np.linspace(0.0, 1.0, 3 * _SAMPLES)[:, None]
-    _draw_arrow(canvas, (1 - t) ** 2 * start + 2 * t * (1 - t) * bend + t**2 * end, GREY if edge.state == OUTVOTED else RED, 1, dashed=True)
+    route = _arc(start, end, _BEND * np.array([end[1] - start[1], start[0] - end[0]]))
+    _draw_arrow(canvas, route, GREY if edge.state == OUTVOTED else RED, 1, dashed=True)
 
 
 def _draw_weight(canvas: Image, edge: Edge, route: np.ndarray) -> None:

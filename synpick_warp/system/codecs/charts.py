@@ -37,9 +37,8 @@ for spec in json.load(sys.stdin):
     sys.stdout.buffer.write(struct.pack("<q", len(picture)) + picture)"""
 MAX_LABEL = 36
 """Maximum number of letters of a legend entry."""
-_WIDTHS = {**dict.fromkeys("MW@mw%", 16.5), **dict.fromkeys(" !'()-,./:;I[]fijlrt|", 5.4)}
-_CAPITAL, _LETTER, _SYMBOL = 12.5, 9.4, 50.0
-"""Widths of wide and narrow letters, upper limits of those of other capitals and of the rest, and width of a symbol with its gaps [px]."""
+_LETTER, _SYMBOL = 12.5, 50.0
+"""Width of a letter, that of a capital, and of a symbol with its gaps [px]."""
 WIDTH = 700
 """Width of a chart [px]."""
 _PANEL, _LEFT, _GAP = 605, 56, 16
@@ -171,13 +170,8 @@ class Legend:
         return {"datum": self._shown[name], "type": "nominal", "scale": self._scale, "legend": legend}
 
     def _columns(self) -> int:
-        """Number of columns, each as wide as its widest entry, that fit above a panel."""
-        widths = [
-            _SYMBOL + sum(_WIDTHS.get(letter, _CAPITAL if letter.isupper() or ord(letter) > 127 else _LETTER) for letter in shown)
-            for shown in self._shown.values()
-        ]
-        fit = [count for count in range(1, len(widths) + 1) if sum(max(widths[at::count]) for at in range(count)) <= _PANEL]
-        return max(fit, default=1)
+        """Number of columns that fit above a panel, as wide as the longest entry."""
+        return max(1, int(_PANEL / (_SYMBOL + _LETTER * max(map(len, self._shown.values()), default=0))))
 
 
 def panel(y: Spec, height: int, layers: Sequence[Spec]) -> Spec:
