@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.report.album import BUDGET, Album, Picture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.album import BUDGET, Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
 
 
 def test_ids_are_exact_and_photos_similar():
@@ -29,14 +29,14 @@ def test_shrinking_keeps_ids_and_never_enlarges():
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 1000])
 def test_the_size_of_a_picture_is_that_of_its_base64(size):
-    picture = Picture("png", bytes(size))
+    picture = EncodedPicture("png", bytes(size))
     assert picture.size == len(base64.b64encode(picture.data))
 
 
 def test_pictures_are_added_together_or_not_at_all():
     album = Album(budget=4000)
     share = int(4000 * Section.ATTEMPTS.value)
-    small = Picture("png", bytes(300))
+    small = EncodedPicture("png", bytes(300))
     assert album.add(Section.ATTEMPTS, [small]) == [0]
     assert album.add(Section.ATTEMPTS, [small, small]) is None
     assert album.left(Section.ATTEMPTS) == share - 400

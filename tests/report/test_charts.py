@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.report.charts import Source, make_charts, object_labels
-from synpick_warp.apps.report.sampling import Brightness, Episodes, find_content, measure_brightness, read_episodes, sample_views
+from synpick_warp.apps.report.charts import ChartData, make_charts, object_labels
+from synpick_warp.apps.report.sampling import Brightness, SampledEpisodes, find_content, measure_brightness, read_episodes, sample_views
 from synpick_warp.apps.statistics import compute_statistics
 from synpick_warp.apps.statistics.figures import TimePoint
 from synpick_warp.configs.files.load import load_config
@@ -27,7 +27,7 @@ def charts(statistics):
     """Plots of the set as if it had two modes."""
     group = statistics.groups[0]
     other = replace(group, mode="move", objects_over_time=(TimePoint(0.0, 2, 5.0),))
-    source = Source(replace(statistics, groups=(group, other)), [Brightness(0, 0, 0, 0.31), Brightness(0, 0, 1, 1.0)], load_config())
+    source = ChartData(replace(statistics, groups=(group, other)), [Brightness(0, 0, 0, 0.31), Brightness(0, 0, 1, 1.0)], load_config())
     return {chart.name: chart for chart in make_charts(source)}
 
 
@@ -60,12 +60,12 @@ def test_the_last_tick_of_an_axis_is_where_its_bars_or_rules_end(charts, statist
 
 def _exposed(statistics):
     lights = replace(statistics.lights, exposure={-0.3: 2, 0.1: 1})
-    return next(each for each in make_charts(Source(replace(statistics, lights=lights), [], load_config())) if each.name == "exposure")
+    return next(each for each in make_charts(ChartData(replace(statistics, lights=lights), [], load_config())) if each.name == "exposure")
 
 
 def test_objects_over_time_last_as_long_as_the_longest_episode(statistics):
     group = replace(statistics.groups[0], objects_over_time=(TimePoint(0.0, 30, 5.0), TimePoint(2.0, 9, 3.0)))
-    source = Source(replace(statistics, groups=(group,)), [], load_config(), {group.mode: 3.4})
+    source = ChartData(replace(statistics, groups=(group,)), [], load_config(), {group.mode: 3.4})
     spec = next(chart for chart in make_charts(source) if chart.name == "timeline").spec
     assert [(row["time"], row["objects"]) for row in spec["data"]["values"]] == [(0.0, 5.0), (2.0, 3.0), (3.4, 3.0)]
     assert spec["encoding"]["x"]["scale"]["domain"] == [0, 3.4]
@@ -82,7 +82,7 @@ def test_every_plot_compiles(charts):
 def test_names_stand_in_values_only(statistics):
     evil = "datum['x'] + signal"
     objects = tuple(replace(each, name=evil) for each in statistics.objects)
-    charts = make_charts(Source(replace(statistics, objects=objects), [], load_config()))
+    charts = make_charts(ChartData(replace(statistics, objects=objects), [], load_config()))
     for chart in charts:
         rest = {key: value for key, value in chart.spec.items() if key not in ("data", "params")}
         rest.get("encoding", {}).get("y", {}).pop("sort", None)
@@ -101,7 +101,7 @@ def sampled(rows: dict[int, Namespace], count: int) -> list[tuple[int, int, int]
         def __getitem__(self, index: int) -> Namespace:
             return Namespace(view=lambda frame, camera: (index, frame, camera), frames=lambda camera: range(10**6))
 
-    return sample_views(Set(), Episodes(rows, {}, len(rows)), count)
+    return sample_views(Set(), SampledEpisodes(rows, {}, len(rows)), count)
 
 
 def test_views_are_sampled_evenly_and_distinct(data):

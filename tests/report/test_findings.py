@@ -7,18 +7,17 @@ from dataclasses import replace
 import pytest
 
 from synpick_warp.apps.report.findings import NOTE, WARNING, Figures, find
-from synpick_warp.apps.report.sampling import Brightness, Episodes, spread
+from synpick_warp.apps.report.sampling import Brightness, SampledEpisodes, spread
 from synpick_warp.apps.statistics import GroupStatistics, ObjectStatistics, Statistics
 from synpick_warp.apps.statistics.columns import EpisodeFacts
-from synpick_warp.apps.statistics.figures import Annotations, Coverage, Depth, Lights
-from synpick_warp.apps.statistics.figures import Episodes as EpisodeFigures
+from synpick_warp.apps.statistics.figures import Annotations, Coverage, Depth, EpisodeFigures, LightFigures
 
 ANNOTATIONS = Annotations(600, 6000, 0.7, 200, (0,) * 20, {1: 3000, 2: 2000, 3: 1000})
 EPISODES = EpisodeFigures(
     20, 2000, {"emptied": 19, "gave_up": 1}, 200, 180, 5, 100, {"target_picked": 80, "dropped": 20}, 90, 95, 5.0, (0,) * 30
 )
 COVERAGE = Coverage(5000, 0.8, 0.9, ())
-LIGHTS = Lights(20, {"day": 8, "lamp": 7, "night": 5}, (0,) * 12, {})
+LIGHTS = LightFigures(20, {"day": 8, "lamp": 7, "night": 5}, (0,) * 12, {})
 ROWS = {index: EpisodeFacts("pick", 100, "emptied", 10) for index in range(20)}
 
 
@@ -30,7 +29,7 @@ def figures(**more) -> Figures:
     depth = Depth(64, 10**6, 0.01, {})
     own = {key: more.pop(key) for key in ("brightness", "planned", "rows", "attempts") if key in more}
     statistics = replace(Statistics(3, (group,), group, objects, depth, LIGHTS, (), ()), **more)
-    known = Episodes(own.get("rows", ROWS), own.get("attempts", dict.fromkeys(ROWS, 5)), 20)
+    known = SampledEpisodes(own.get("rows", ROWS), own.get("attempts", dict.fromkeys(ROWS, 5)), 20)
     brightness = own.get("brightness", [Brightness(0, 0, frame, 0.4) for frame in range(20)])
     return Figures(statistics, known, brightness, own.get("planned", 20))
 

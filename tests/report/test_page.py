@@ -20,6 +20,7 @@ from synpick_warp.apps.report import page as page_module
 from synpick_warp.apps.report.markup import content_hash
 from synpick_warp.cli.main import main
 from synpick_warp.errors import OutputError
+from tests.builders import mistake
 from tests.harness import scripted_bake
 from tests.report.conftest import EVIL
 
@@ -58,14 +59,10 @@ class Parsed(HTMLParser):
     def content(self) -> dict:
         return json.loads(next(text for (_, each), text in zip(self.elements, self.texts, strict=True) if each.get("id") == "content"))
 
-
-def refused(capsys, *arguments: object) -> str:
-    """Message of a command that is refused."""
-    assert main(["report", *map(str, arguments)]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = captured.err.splitlines()
-    return line.removeprefix("synpick-warp: error: ")
+    def pictures(self) -> dict[str, str]:
+        """Base64 text of each picture by the id of its element."""
+        found = zip(self.elements, self.texts, strict=True)
+        return {each["id"]: text for (_, each), text in found if str(each.get("id")).startswith("picture-")}
 
 
 def test_the_page_has_all_sections_and_their_content(page):
@@ -77,11 +74,10 @@ def test_the_page_has_all_sections_and_their_content(page):
     frame = content["frames"][0]
     assert {"rgb", "ids", "depth"} <= frame["pictures"].keys()
     assert [one["object"] for one in frame["instances"]] == [3, 7, 3]
-    stored = {attributes["id"] for _, attributes in parsed.elements if str(attributes.get("id")).startswith("picture-")}
     named = {each["picture"] for one in content["frames"] for each in one["pictures"].values()}
     named |= {picture for strip in content["strips"] for camera in strip["cameras"] for picture in camera}
     named |= {attempt["picture"] for attempt in content["attempts"]}
-    assert stored == {f"picture-{index}" for index in named}
+    assert parsed.pictures().keys() == {f"picture-{index}" for index in named}
     assert {"objects", "visibility", "outcomes", "forces"} <= {chart["name"] for chart in content["charts"]}
 
 
@@ -119,9 +115,7 @@ def test_the_same_set_gives_the_same_bytes(data, page, tmp_path):
 def test_the_budget_of_pictures_holds(data, tmp_path, monkeypatch):
     monkeypatch.setattr(compose, "Album", lambda: album.Album(budget=4000))
     path = write_report(synpick_warp.open(data), tmp_path / "small.html")
-    parsed = Parsed(path)
-    sizes = [len(text) for (_, each), text in zip(parsed.elements, parsed.texts, strict=True) if str(each.get("id")).startswith("picture-")]
-    assert sum(sizes) <= 4000
+    assert sum(map(len, Parsed(path).pictures().values())) <= 4000
     assert "did not fit" in path.read_text()
 
 
@@ -144,10 +138,7 @@ def test_sets_of_several_sensors_have_the_same_pictures(tmp_path):
         config = scripted_bake.settings(2, ("bop",))
         scripted_bake.bake(tmp_path / layout, dataclasses.replace(config, bop=dataclasses.replace(config.bop, layout=layout)))
         parsed = Parsed(write_report(synpick_warp.open(tmp_path / layout), tmp_path / f"{layout}.html"))
-        pictures = [
-            text for (_, each), text in zip(parsed.elements, parsed.texts, strict=True) if str(each.get("id")).startswith("picture-")
-        ]
-        found.append((parsed.content()["frames"], pictures))
+        found.append((parsed.content()["frames"], parsed.pictures()))
     assert found[0] == found[1]
     assert all("ids" in frame["pictures"] for frame in found[0][0])
 
@@ -157,8 +148,7 @@ def test_amodal_masks_are_planes_of_ids(data, page):
     parsed = Parsed(page)
     frame = parsed.content()["frames"][0]
     place = frame["pictures"]["amodal"]["picture"]
-    texts = {each.get("id"): text for (_, each), text in zip(parsed.elements, parsed.texts, strict=True)}
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(texts[f"picture-{place}"]), np.uint8), cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(parsed.pictures()[f"picture-{place}"]), np.uint8), cv2.IMREAD_UNCHANGED)
     width, height = frame["size"]
     planes = image.reshape(-1, height, width)
     masks = synpick_warp.open(data)[frame["episode"]].view(frame["frame"], frame["camera"]).amodal_masks
@@ -176,18 +166,18 @@ def test_a_damaged_manifest_is_a_finding(data, tmp_path):
     assert "The manifest cannot be read" in path.read_text()
 
 
-def test_bad_input_is_one_line_and_nothing_is_written(data, tmp_path, capsys):
+def test_bad_input_is_one_line_and_nothing_is_written(data, tmp_path):
     (tmp_path / "folder.html").mkdir()
-    assert refused(capsys, data, "--out", tmp_path / "page.pdf").endswith("its name must end in .html, .htm")
-    assert refused(capsys, data, "--out", tmp_path / "folder.html").endswith("it is a folder")
-    assert refused(capsys, data, "--views", 0) == "--views is 0; allowed: 1 to 200"
-    assert refused(capsys, data, "--split", "west", "--out", tmp_path / "x.html").endswith("splits: train")
-    assert "is not a data set" in refused(capsys, tmp_path, "--out", tmp_path / "x.html")
+    assert mistake("report", data, "--out", tmp_path / "page.pdf").endswith("its name must end in .html, .htm")
+    assert mistake("report", data, "--out", tmp_path / "folder.html").endswith("it is a folder")
+    assert mistake("report", data, "--views", 0) == "--views is 0; allowed: 1 to 200"
+    assert mistake("report", data, "--split", "west", "--out", tmp_path / "x.html").endswith("splits: train")
+    assert "is not a data set" in mistake("report", tmp_path, "--out", tmp_path / "x.html")
     broken = tmp_path / "broken"
     shutil.copytree(data, broken)
     for image in broken.glob("train/000000/rgb/*"):
         image.write_bytes(b"no image")
-    assert str(broken / "train" / "000000" / "rgb") in refused(capsys, broken)
+    assert str(broken / "train" / "000000" / "rgb") in mistake("report", broken)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken", "folder.html"]
     assert not (broken / "report.html").exists()
 
@@ -200,11 +190,11 @@ def test_a_link_is_replaced_and_never_followed(data, tmp_path):
     assert not (tmp_path / "report.html").is_symlink()
 
 
-def test_a_library_that_cannot_run_is_one_line(data, tmp_path, capsys, monkeypatch):
+def test_a_library_that_cannot_run_is_one_line(data, tmp_path, monkeypatch):
     (tmp_path / "vl_convert.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(compose, "read_vega", page_module.read_vega.__wrapped__)
-    assert refused(capsys, data, "--out", tmp_path / "x.html") == (
+    assert mistake("report", data, "--out", tmp_path / "x.html") == (
         "the charts' library vl-convert-python ended with exit code 1; free memory, or raise the limits of memory and open files"
         " (ulimit -v, ulimit -n), or install the package again"
     )

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.apps.statistics.figures import Annotations, Episodes, GroupStatistics
+from synpick_warp.apps.statistics.figures import Annotations, EpisodeFigures, GroupStatistics
 from synpick_warp.apps.statistics.paper import compare, object_distance, read_paper, total_variation
 
 COUNTS = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 1000)).filter(lambda counts: sum(counts.values()) > 0)
@@ -53,7 +53,7 @@ def test_the_papers_own_set_has_no_difference():
     ours = []
     for each in paper.groups:
         objects = {ids[name]: count for name, count in each.objects.items()}
-        episodes = Episodes(each.sequences, 0, {}, 0, 0, 0, 0, {}, 0, 0, None, ())
+        episodes = EpisodeFigures(each.sequences, 0, {}, 0, 0, 0, 0, {}, 0, 0, None, ())
         ours.append(
             GroupStatistics(each.split, each.mode, episodes, Annotations(each.views, each.instances, each.visibility, 0, (), objects), ())
         )

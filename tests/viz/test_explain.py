@@ -20,7 +20,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, Perception, Pick, Target
 from synpick_warp.dataset.view import View
-from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.types import Camera
@@ -235,19 +235,16 @@ def test_why_it_was_chosen(objects, target, mode, said):
     assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target, Config().pick)[0] == said
 
 
-def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
-    drawn_one = attempt((FIRST, SECOND, THIRD), {}, 0, mode="target")
-    released = Config(target=Target(random_after_failure=True))
-    assert (
-        choice_words(drawn_one, NAMES, released.target, released.pick)[0]
-        == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
-    )
-
-
-def test_a_target_after_failures_of_others_is_named_where_the_settings_have_it():
-    another = Config(pick=Pick(retry="another"))
-    said = choice_words(attempt((FIRST, SECOND, THIRD), {}, 0), NAMES, another.target, another.pick)[0]
-    assert said == "target: 1 tin: 0 objects above; attempts have failed at 2 box"
+@pytest.mark.parametrize(
+    ("mode", "settings", "said"),
+    [
+        ("target", Config(target=Target(random_after_failure=True)), "chosen at random after a failed attempt"),
+        ("pick", Config(pick=Pick(retry="another")), "attempts have failed at 2 box"),
+    ],
+)
+def test_a_choice_after_failures_is_named_where_the_settings_have_it(mode, settings, said):
+    words = choice_words(attempt((FIRST, SECOND, THIRD), {}, 0, mode=mode), NAMES, settings.target, settings.pick)
+    assert words[0] == f"target: 1 tin: 0 objects above; {said}"
 
 
 @pytest.mark.parametrize(
@@ -372,15 +369,6 @@ def test_what_is_missing_is_named_in_one_line(dataset, tmp_path, harm, said):
     assert not (tmp_path / "picture.png").exists()
 
 
-def test_what_does_not_exist_is_answered_with_what_does(dataset):
-    with pytest.raises(DatasetError, match=r"has no attempt of episode 2; episodes that have: 1, 4$"):
-        write_explanation(dataset, dataset / "picture.png", 2, None)
-    with pytest.raises(DatasetError, match=r"has no attempt 3 of episode 1; attempts: 0 to 2$"):
-        write_explanation(dataset, dataset / "picture.png", 1, 3)
-    with pytest.raises(OutputError, match=r"picture\.bmp is not an image file; its name must end in \.png, \.jpg, \.jpeg"):
-        write_explanation(dataset, dataset / "picture.bmp", 1, None)
-
-
 def test_settings_decide_which_votes_make_edges(dataset):
     before = drawn(dataset)
     (dataset / "config.toml").write_text(
@@ -403,7 +391,7 @@ def test_the_command(dataset, tmp_path, capsys):
     ("arguments", "said"),
     [
         (["--episode", "2"], "attempts.jsonl has no attempt of episode 2; episodes that have: 1, 4"),
-        (["--episode", "1", "--attempt", "-1"], "attempts.jsonl has no attempt -1 of episode 1; attempts: 0 to 2"),
+        (["--episode", "1", "--attempt", "3"], "attempts.jsonl has no attempt 3 of episode 1; attempts: 0 to 2"),
         (["--episode", "1", "--out", "a.txt"], "a.txt is not an image file; its name must end in .png, .jpg, .jpeg"),
         (["--attempt", "1"], "--attempt is 1, but no episode is named; add --episode"),
     ],

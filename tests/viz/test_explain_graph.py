@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.explain_graph import CYCLIC, KEPT, OUTVOTED, RADIUS, Edge, clutter_edges, draw_graph, lay_out
-from synpick_warp.apps.viz.explain_record import Attempt
+from synpick_warp.apps.viz.explain_record import SeenAttempt
 from tests.worlds.attempt_records import attempt, seen
 
 SIZE = (500, 600)
 LEAST = 5.0
 
 
-def from_votes(count: int, kept: list[tuple[int, int]], votes: dict[tuple[int, int], float], columns: list[float]) -> Attempt:
+def from_votes(count: int, kept: list[tuple[int, int]], votes: dict[tuple[int, int], float], columns: list[float]) -> SeenAttempt:
     """An attempt whose graph has the edges (upper, lower) that are given."""
     graph = nx.DiGraph(kept)
     graph.add_nodes_from(range(count))
@@ -29,7 +29,7 @@ def from_votes(count: int, kept: list[tuple[int, int]], votes: dict[tuple[int, i
 
 
 @st.composite
-def piles(draw: st.DrawFn) -> Attempt:
+def piles(draw: st.DrawFn) -> SeenAttempt:
     count = draw(st.integers(1, 32))
     order = draw(st.permutations(range(count)))
     pairs = list(itertools.combinations(order, 2))

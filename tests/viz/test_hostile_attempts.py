@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.apps.viz.explain_graph import clutter_edges, draw_graph, lay_out
 from synpick_warp.apps.viz.explain_panels import draw_words, load_chart
-from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, Attempt, read_attempts
+from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, SeenAttempt, read_attempts
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.records import MAX_OBSERVED
 from synpick_warp.errors import DatasetError
@@ -31,7 +31,7 @@ VALUES = (
 )
 
 
-def draw(attempt: Attempt) -> None:
+def draw(attempt: SeenAttempt) -> None:
     """Draw all panels that need no image."""
     draw_words(attempt, {7: "tin"}, (CONFIG.target, CONFIG.pick), CONFIG.suction)
     assert picture_of(load_chart(attempt, CONFIG.suction, CONFIG.physics.tick_time, 800, 200), 1.0).shape == (200, 800, 3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.apps.viz.explain_record import Attempt
+from synpick_warp.apps.viz.explain_record import SeenAttempt
 from synpick_warp.dataset.records import InstanceObservation, Observation
 
 
@@ -69,11 +69,13 @@ def nothing_seen(**other: Any) -> dict[str, Any]:
     return record([]) | gone | other
 
 
-def attempt(seen: tuple[InstanceObservation, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any) -> Attempt:
+def attempt(
+    seen: tuple[InstanceObservation, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any
+) -> SeenAttempt:
     """An attempt as `read_attempts` returns it, with the graph that is given."""
     observation = Observation((96, 72), list(seen), [(*edge, number) for edge, number in votes.items()])
     values: dict[str, Any] = {"sentence": "s", "target": target, "tilt": None, "hits": 10, "good_seal": True}
-    return Attempt(**record([], **values | other, observation=observation))
+    return SeenAttempt(**record([], **values | other, observation=observation))
 
 
 def seen(instance: int, above: frozenset[int] = frozenset(), ancestors: frozenset[int] | None = None, **other: Any) -> InstanceObservation:

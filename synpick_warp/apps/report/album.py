@@ -28,7 +28,7 @@ class Section(enum.Enum):
     ATTEMPTS = 0.15
 
 
-class Picture(NamedTuple):
+class EncodedPicture(NamedTuple):
     """Encoded image (WebP or PNG) of a report."""
 
     kind: str
@@ -46,7 +46,7 @@ class Album:
     """Encoded pictures of a page in the order in which they were added, within a budget of bytes."""
 
     budget: int = BUDGET
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[EncodedPicture] = field(default_factory=list)
     spent: Counter[Section] = field(default_factory=Counter)
     """Bytes of each section."""
 
@@ -54,7 +54,7 @@ class Album:
         """Bytes that a section may still add to the album's budget."""
         return int(section.value * self.budget) - self.spent[section]
 
-    def add(self, section: Section, pictures: Sequence[Picture]) -> list[int] | None:
+    def add(self, section: Section, pictures: Sequence[EncodedPicture]) -> list[int] | None:
         """Add pictures that belong together; returns their indices, or None, and adds none, if the section's share is too small."""
         size = sum(picture.size for picture in pictures)
         if size > self.left(section):
@@ -77,14 +77,14 @@ def shrink(image: np.ndarray, width: int, *, smooth: bool = True) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth else cv2.INTER_NEAREST)
 
 
-def encode_photo(image: np.ndarray, quality: int = PHOTO_QUALITY) -> Picture:
+def encode_photo(image: np.ndarray, quality: int = PHOTO_QUALITY) -> EncodedPicture:
     """Encode an image (H, W, 3) uint8, blue first, as WebP."""
-    return Picture("webp", _encode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality]))
+    return EncodedPicture("webp", _encode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality]))
 
 
-def encode_ids(image: np.ndarray) -> Picture:
+def encode_ids(image: np.ndarray) -> EncodedPicture:
     """Encode an id image (H, W) uint8 as a lossless PNG."""
-    return Picture("png", _encode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
+    return EncodedPicture("png", _encode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
 
 
 def _encode(suffix: str, image: np.ndarray, options: list[int]) -> bytes:

@@ -49,7 +49,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class Source:
+class ChartData:
     """Data that the charts show."""
 
     statistics: Statistics
@@ -60,7 +60,7 @@ class Source:
     """Mode -> time from the first frame to the end of the last, of its longest episode [s]."""
 
 
-def make_charts(source: Source) -> list[Chart]:
+def make_charts(source: ChartData) -> list[Chart]:
     """Make all charts of the report that have data."""
     makers = (_objects, _visibility, _timeline, _forces, _coverage, _outcomes, _endings, _exposure, _luma, _lights, _bins)
     return [chart for make in makers for chart in make(source)]
@@ -198,7 +198,7 @@ def _edges(rows: Rows, width: float, top: float) -> list[float]:
 # ---- charts: each yields itself, or nothing without data ----
 
 
-def _objects(source: Source) -> Iterator[Chart]:
+def _objects(source: ChartData) -> Iterator[Chart]:
     """Annotated instances by object and mode, the most frequent objects first."""
     names = object_labels(source.statistics.objects)
     counts = _by_mode(
@@ -215,7 +215,7 @@ def _objects(source: Source) -> Iterator[Chart]:
         yield Chart("objects", "Annotations per object", caption, spec, wide=True)
 
 
-def _visibility(source: Source) -> Iterator[Chart]:
+def _visibility(source: ChartData) -> Iterator[Chart]:
     """Histogram of the visible fraction of instances, by mode."""
     rows = _binned_by_mode(source.statistics, lambda group: group.annotations.histogram, 1 / VISIBILITY_BINS)
     mean = source.statistics.total.annotations.visibility
@@ -225,7 +225,7 @@ def _visibility(source: Source) -> Iterator[Chart]:
         yield Chart("visibility", "Visibility", caption, spec)
 
 
-def _outcomes(source: Source) -> Iterator[Chart]:
+def _outcomes(source: ChartData) -> Iterator[Chart]:
     """Attempts by outcome and mode."""
     episodes = source.statistics.total.episodes
     caption = f"How {episodes.attempts:,} attempts to pick ended; {episodes.good_seals:,} had a good seal."
@@ -233,7 +233,7 @@ def _outcomes(source: Source) -> Iterator[Chart]:
     yield from _in_words("outcomes", "Attempts by outcome", caption, counts, ("outcome", "attempts"))
 
 
-def _endings(source: Source) -> Iterator[Chart]:
+def _endings(source: ChartData) -> Iterator[Chart]:
     """Episodes by ending and mode."""
     caption = "Why the episodes ended: bin empty, corners visited, or too many failures."
     counts = _by_mode(source.statistics, lambda group: group.episodes.endings)
@@ -247,7 +247,7 @@ def _in_words(name: str, title: str, caption: str, counts: Mapping[str, Counter[
         yield Chart(name, title, caption, _bars(rows, _ranked(readable), "what", titles[1], titles))
 
 
-def _forces(source: Source) -> Iterator[Chart]:
+def _forces(source: ChartData) -> Iterator[Chart]:
     """Histogram of the largest seal force of attempts [N], with the break forces of the settings."""
     rows = _binned_by_mode(source.statistics, lambda group: group.episodes.force_histogram, FORCE_BIN)
     if not rows or source.config is None:
@@ -271,7 +271,7 @@ def _limit(force: float, text: str, side: str) -> Spec:
     return limit({"x": _field("limit", "quantitative", _FORCE)}, force, text, {"strokeDash": [4, 3], "color": "gray"}, label)
 
 
-def _timeline(source: Source) -> Iterator[Chart]:
+def _timeline(source: ChartData) -> Iterator[Chart]:
     """Mean number of objects over time, by mode."""
     sums: dict[tuple[str, float], tuple[int, float]] = {}
     for group in source.statistics.groups:
@@ -308,7 +308,7 @@ def _timeline(source: Source) -> Iterator[Chart]:
     yield Chart("timeline", "Objects over time", caption, _colored(spec))
 
 
-def _coverage(source: Source) -> Iterator[Chart]:
+def _coverage(source: ChartData) -> Iterator[Chart]:
     """Heat map of viewing directions, for an object that the reader selects."""
     seen = sorted((each for each in source.statistics.objects if each.coverage.views), key=lambda each: -each.coverage.views)[:MAX_LINES]
     if not seen:
@@ -348,7 +348,7 @@ def _coverage(source: Source) -> Iterator[Chart]:
     yield Chart("coverage", "Pose coverage", caption, spec)
 
 
-def _lights(source: Source) -> Iterator[Chart]:
+def _lights(source: ChartData) -> Iterator[Chart]:
     """Episodes by environment map, the most frequent maps."""
     if lights := source.statistics.lights:
         plural = "" if len(lights.maps) == 1 else "s"
@@ -356,7 +356,7 @@ def _lights(source: Source) -> Iterator[Chart]:
         yield Chart("lights", "Light maps", caption, _episodes_by_name(lights.maps, "map"))
 
 
-def _bins(source: Source) -> Iterator[Chart]:
+def _bins(source: ChartData) -> Iterator[Chart]:
     """Episodes by bin, the most frequent bins, if there are several."""
     uses = {name: use.episodes for name, use in source.statistics.bins.items()}
     if len(uses) > 1:
@@ -370,7 +370,7 @@ def _episodes_by_name(counts: Mapping[str, int], noun: str) -> Spec:
     return _bars(rows, list(shown), "what", "count", (noun, "episodes"))
 
 
-def _exposure(source: Source) -> Iterator[Chart]:
+def _exposure(source: ChartData) -> Iterator[Chart]:
     """Histogram of the episodes' exposure compensation [EV], if at least two bins have episodes."""
     lights = source.statistics.lights
     if lights is not None and len(lights.exposure) > 1:
@@ -379,7 +379,7 @@ def _exposure(source: Source) -> Iterator[Chart]:
         yield Chart("exposure", "Exposure", "Exposure compensation of the episodes' light.", spec)
 
 
-def _luma(source: Source) -> Iterator[Chart]:
+def _luma(source: ChartData) -> Iterator[Chart]:
     """Histogram of the mean luma of views."""
     bins = Counter(min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1) for view in source.brightness)
     if bins:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,17 +9,17 @@ from typing import Any
 
 from synpick_warp._version import __version__
 from synpick_warp.apps.report.album import Album
-from synpick_warp.apps.report.charts import Source, make_charts
+from synpick_warp.apps.report.charts import ChartData, make_charts
 from synpick_warp.apps.report.explained import choose_attempts, make_attempt
-from synpick_warp.apps.report.findings import WARNING, Figures, Finding, find
+from synpick_warp.apps.report.findings import WARNING, Figures, Remark, find
 from synpick_warp.apps.report.frames import make_frame
 from synpick_warp.apps.report.markup import Html, element, join
-from synpick_warp.apps.report.page import Page, Part, read_vega, render, summary
+from synpick_warp.apps.report.page import Page, PageSection, read_vega, render, summary
 from synpick_warp.apps.report.picks import DRAWS, PICKS_LEAD, calibration_chart, picks_section
 from synpick_warp.apps.report.sampling import (
     SURVEY_VIEWS,
     Brightness,
-    Episodes,
+    SampledEpisodes,
     find_content,
     measure_brightness,
     read_episodes,
@@ -31,13 +29,13 @@ from synpick_warp.apps.report.strips import choose_episodes, make_strip
 from synpick_warp.apps.report.tables import changed_settings, findings_list, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.picks import find_picks
-from synpick_warp.apps.viz.depth_colors import bin_scale
+from synpick_warp.apps.viz.false_colors import bin_scale
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.folders import make_folder
 from synpick_warp.system.progress import Report
 
@@ -49,7 +47,7 @@ MAX_FRAMES = 200
 
 @dataclass(frozen=True)
 class Samples:
-    """Frames, strips and attempts that the page shows, how many were asked for, and measured brightness of views."""
+    """Samples of a data set that the page shows."""
 
     data: dict[str, list[dict[str, Any]]]
     """Frames, strips and attempts, as the page's scripts expect them."""
@@ -92,7 +90,7 @@ def write_report(
     shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
     config = data_set.config if data_set.found is None else None
     picks = find_picks(data_set, DRAWS)
-    tried = [] if picks is None else [Part("picks", "Picks", PICKS_LEAD, picks_section(data_set, picks))]
+    tried = [] if picks is None else [PageSection("picks", "Picks", PICKS_LEAD, picks_section(data_set, picks))]
     parts = _parts(data_set, shown, samples, findings, versions)
     calibration = [calibration_chart(picks)] if picks is not None and picks.scores else []
     page = Page(
@@ -102,7 +100,7 @@ def write_report(
         parts=[*parts[:3], *tried, *parts[3:]],
         findings=findings,
         data=samples.data,
-        charts=[*calibration, *make_charts(Source(statistics, samples.brightness, config, _durations(data_set, episodes)))],
+        charts=[*calibration, *make_charts(ChartData(statistics, samples.brightness, config, _durations(data_set, episodes)))],
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )
@@ -110,7 +108,9 @@ def write_report(
     return out
 
 
-def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, album: Album, frames: int, report: Report) -> Samples:
+def take_samples(
+    data_set: DataSet, statistics: Statistics, episodes: SampledEpisodes, album: Album, frames: int, report: Report
+) -> Samples:
     """Read all pictures of a report; none if the data set has no images.
 
     Raises:
@@ -143,7 +143,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
     return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
 
 
-def _durations(data_set: DataSet, episodes: Episodes) -> dict[str, float]:
+def _durations(data_set: DataSet, episodes: SampledEpisodes) -> dict[str, float]:
     """Time of the longest episode of each mode [s]."""
     longest = dict[str, int]()
     for row in episodes.rows.values():
@@ -165,17 +165,17 @@ def _measure(views: list[View], report: Report) -> list[Brightness]:
     return measured
 
 
-def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
+def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Remark]]:
     """Versions of the packages that baked the set; a damaged manifest is a finding, as everything else can still be shown."""
     if data_set.found is not None:
         return {}, []
     try:
         return read_manifest(data_set.folder)["versions"], []
     except DatasetError as error:
-        return {}, [Finding(WARNING, "The manifest cannot be read", f"{error}.")]
+        return {}, [Remark(WARNING, "The manifest cannot be read", f"{error}.")]
 
 
-def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) -> Html:
+def _lead(data_set: DataSet, statistics: Statistics, findings: list[Remark]) -> Html:
     """Opening sentence of the report: modes, splits, resolution and seed, and a link to the findings."""
     modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
     splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
@@ -187,7 +187,9 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
     return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
 
 
-def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]) -> list[Part]:
+def _parts(
+    data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Remark], versions: Mapping[str, str]
+) -> list[PageSection]:
     """Sections of the report in order: frames, episodes, attempts (each says what did not fit the budget), figures, findings, settings."""
     views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
     leads = {
@@ -200,20 +202,20 @@ def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings
         cut = samples.asked[name] - shown[name]
         lead += f" {cut} more did not fit the {samples_budget()} of pictures." if cut else ""
         empty = element("p", _EMPTY[name], class_="empty") if not shown[name] else element("div", id=f"{name}-host")
-        parts.append(Part(name, title, lead, empty))
+        parts.append(PageSection(name, title, lead, empty))
     figures = join([element("div", id="charts-host"), statistics_tables(statistics)])
     return [
         *parts,
-        Part(
+        PageSection(
             "figures",
             "Figures",
             "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.",
             figures,
         ),
-        Part(
+        PageSection(
             "findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)
         ),
-        Part(
+        PageSection(
             "settings",
             "Configuration",
             "Settings that differ from the preset synpick, which has the paper's values.",
@@ -258,19 +260,9 @@ def write_text(out: Path, pieces: Iterable[str]) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    partial = out.with_name(f".{out.name}.{os.getpid()}")
     try:
-        make_folder(out.parent)
-        try:
-            # A link of the name is replaced, never followed.
-            with open(partial, "x", encoding="utf-8", newline="\n") as file:
-                file.writelines(pieces)
-            partial.replace(out)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                partial.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise output_error(out, error) from error
+        with output_errors(out):
+            make_folder(out.parent)
+            write_atomically(out, (piece.encode() for piece in pieces))
     except ValueError as error:
         raise OutputError(f"cannot write {out}: {error}") from error

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.apps.report.album import Album, Section, encode_photo
-from synpick_warp.apps.report.sampling import Content, Episodes, spread
+from synpick_warp.apps.report.sampling import Content, SampledEpisodes, spread
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.explain import draw_observation, planning_camera
 from synpick_warp.apps.viz.explain_graph import KEPT, clutter_edges, lay_out
 from synpick_warp.apps.viz.explain_record import (
     CANDIDATES,
-    Attempt,
+    SeenAttempt,
     break_force,
     choice_words,
     labels,
@@ -39,7 +39,7 @@ GRAPH_SIZE = (440, 420)
 
 @dataclass(frozen=True)
 class Found:
-    """Reference to a chosen attempt: episode, position in the episode's list, outcome."""
+    """Reference to a chosen attempt."""
 
     episode: int
     place: int
@@ -47,7 +47,7 @@ class Found:
     outcome: str
 
 
-def choose_attempts(data_set: DataSet, episodes: Episodes) -> list[Found]:
+def choose_attempts(data_set: DataSet, episodes: SampledEpisodes) -> list[Found]:
     """Choose attempts: of each outcome in turn, the most frequent first, from different episodes where there are some."""
     found: dict[str, list[Found]] = {}
     for index in spread([index for index, count in episodes.attempts.items() if count], MAX_SEARCHED):
@@ -97,7 +97,7 @@ def make_attempt(data_set: DataSet, found: Found, content: Content, names: Mappi
     }
 
 
-def _objects(attempt: Attempt, names: Mapping[int, str]) -> list[dict[str, Any]]:
+def _objects(attempt: SeenAttempt, names: Mapping[int, str]) -> list[dict[str, Any]]:
     """Observed instances for the page, in the order in which the choice rule ranks them."""
     short = labels(attempt)
     return [
@@ -115,7 +115,7 @@ def _objects(attempt: Attempt, names: Mapping[int, str]) -> list[dict[str, Any]]
     ]
 
 
-def _graph(attempt: Attempt, min_votes: float) -> dict[str, Any] | None:
+def _graph(attempt: SeenAttempt, min_votes: float) -> dict[str, Any] | None:
     """Clutter graph: nodes and curves [px]; None: nothing was seen."""
     if not attempt.seen:
         return None
@@ -139,7 +139,7 @@ def _graph(attempt: Attempt, min_votes: float) -> dict[str, Any] | None:
     return {"size": list(GRAPH_SIZE), "nodes": nodes, "edges": curves, "kept": KEPT}
 
 
-def _force(attempt: Attempt, suction: Suction, tick_time: float) -> dict[str, Any] | None:
+def _force(attempt: SeenAttempt, suction: Suction, tick_time: float) -> dict[str, Any] | None:
     """Seal force over time [s, N], and the force at which the seal breaks; None: nothing was engaged."""
     if not attempt.peak_force or not attempt.hits:
         return None

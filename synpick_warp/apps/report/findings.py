@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import statistics as mean_of
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from synpick_warp.apps.report.sampling import Brightness, Episodes
+from synpick_warp.apps.report.sampling import Brightness, SampledEpisodes
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.codes import Ending, Outcome
 
@@ -41,8 +41,12 @@ MAX_NAMED = 6
 """Most objects or episodes that a finding names."""
 
 
-class Finding(NamedTuple):
-    """Finding of the report on the quality of a data set: level (WARNING, or NOTE: may be meant), title, detail."""
+Rule = Iterator[tuple[str, str, str]]
+"""Level, title and detail of each remark of a rule."""
+
+
+class Remark(NamedTuple):
+    """Remark of the report on the quality of a data set."""
 
     level: str
     """WARNING, or NOTE: may be meant."""
@@ -52,61 +56,48 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures that findings are derived from: statistics, sampled episodes, brightness, number of planned episodes."""
+    """Figures that remarks are derived from."""
 
     statistics: Statistics
-    episodes: Episodes
+    episodes: SampledEpisodes
     brightness: Sequence[Brightness]
     planned: int
     """Episodes that the settings plan."""
 
 
-def find(figures: Figures) -> list[Finding]:
+def find(figures: Figures) -> list[Remark]:
     """Apply all rules to the figures; returns the findings, warnings first."""
-    rules: tuple[Callable[[Figures], Iterable[Finding]], ...] = (
-        _unfinished,
-        _never_drawn,
-        _rare,
-        _failures,
-        _without_attempt,
-        _endings,
-        _lost,
-        _brightness,
-        _invisible,
-        _depth,
-        _lights,
-        _coverage,
-        _missing,
-    )
-    found = [finding for rule in rules for finding in rule(figures)]
-    return sorted(found, key=lambda finding: finding.level != WARNING)
+    causes = (_unfinished, _never_drawn, _rare, _failures, _without_attempt, _endings, _lost)
+    looks = (_brightness, _invisible, _depth, _lights, _coverage, _missing)
+    found = [Remark(*each) for rule in (*causes, *looks) for each in rule(figures)]
+    return sorted(found, key=lambda remark: remark.level != WARNING)
 
 
-def _unfinished(figures: Figures) -> Iterator[Finding]:
+def _unfinished(figures: Figures) -> Rule:
     """Warn of planned episodes that are missing."""
     present = figures.episodes.total
     if present < figures.planned:
-        yield Finding(
+        yield (
             WARNING,
             f"{figures.planned - present:,} of {figures.planned:,} planned episodes are missing",
             "The bake is not finished, or gave them up; the command that started it resumes it.",
         )
 
 
-def _never_drawn(figures: Figures) -> Iterator[Finding]:
+def _never_drawn(figures: Figures) -> Rule:
     """Warn of objects that have a model but occur in no view."""
     never = [each for each in figures.statistics.objects if not each.instances]
     if never and figures.statistics.total.annotations.views:
         listed = _listed(each.name or f"object {each.object_id}" for each in never)
         count = len(never)
-        yield Finding(
+        yield (
             WARNING,
             f"{count} object{' was' if count == 1 else 's were'} never drawn",
             f"{listed}: in the models folder, but in no view. More episodes, or a larger arrangement.volume, draw more objects.",
         )
 
 
-def _rare(figures: Figures) -> Iterator[Finding]:
+def _rare(figures: Figures) -> Rule:
     """Note objects with fewer annotations than RARE times the median."""
     counts = [each.instances for each in figures.statistics.objects if each.instances]
     if len(counts) < 3:
@@ -115,12 +106,10 @@ def _rare(figures: Figures) -> Iterator[Finding]:
     rare = [each for each in figures.statistics.objects if 0 < each.instances < RARE * median]
     if rare:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.instances:,})" for each in rare)
-        yield Finding(
-            NOTE, f"{len(rare)} object{'' if len(rare) == 1 else 's'} with few annotations", f"{listed}; the median is {median:,.0f}."
-        )
+        yield NOTE, f"{len(rare)} object{'' if len(rare) == 1 else 's'} with few annotations", f"{listed}; the median is {median:,.0f}."
 
 
-def _failures(figures: Figures) -> Iterator[Finding]:
+def _failures(figures: Figures) -> Rule:
     """Warn of each failed outcome that makes up FAILURE_SHARE of the attempts or more."""
     episodes = figures.statistics.total.episodes
     sentences = {outcome.name.lower(): outcome for outcome in Outcome}
@@ -131,49 +120,47 @@ def _failures(figures: Figures) -> Iterator[Finding]:
         share = count / episodes.attempts
         if share >= FAILURE_SHARE and episodes.attempts >= MIN_ATTEMPTS:
             reason = outcome.sentence if outcome is not None else name
-            yield Finding(
+            yield (
                 WARNING,
                 f"{share:.0%} of the attempts failed for one reason: {name.replace('_', ' ')}",
                 f"{count:,} of {episodes.attempts:,}: {reason}. The explained attempts show some of them.",
             )
 
 
-def _without_attempt(figures: Figures) -> Iterator[Finding]:
+def _without_attempt(figures: Figures) -> Rule:
     """Warn of picking episodes without an attempt."""
     rows = figures.episodes.rows
     idle = [index for index, row in rows.items() if row.mode in ("pick", "target") and not figures.episodes.attempts[index]]
     if idle:
         listed = _listed(map(str, idle))
-        yield Finding(
-            WARNING, f"{_number(len(idle), 'picking episode')} without an attempt", f"Episodes {listed} have images but no attempt."
-        )
+        yield WARNING, f"{_number(len(idle), 'picking episode')} without an attempt", f"Episodes {listed} have images but no attempt."
 
 
-def _endings(figures: Figures) -> Iterator[Finding]:
+def _endings(figures: Figures) -> Rule:
     """Warn if GIVEN_UP_SHARE of the picking episodes or more were given up, and of episodes of one frame."""
     endings = figures.statistics.total.episodes.endings
     given_up = endings.get(Ending.GAVE_UP.name.lower(), 0)
     picking = sum(group.episodes.episodes for group in figures.statistics.groups if group.mode != "move")
     if picking >= MIN_EPISODES and given_up / picking >= GIVEN_UP_SHARE:
-        yield Finding(
+        yield (
             WARNING,
             f"{given_up / picking:.0%} of the picking episodes were given up",
             f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their bins are not empty at the end.",
         )
     short = [index for index, row in figures.episodes.rows.items() if row.frames <= 1]
     if short:
-        yield Finding(WARNING, f"{_number(len(short), 'episode')} of one frame or none", f"Episodes {_listed(map(str, short))}.")
+        yield WARNING, f"{_number(len(short), 'episode')} of one frame or none", f"Episodes {_listed(map(str, short))}."
 
 
-def _lost(figures: Figures) -> Iterator[Finding]:
+def _lost(figures: Figures) -> Rule:
     """Warn if LOST_SHARE of the objects or more fell out of the scene."""
     episodes = figures.statistics.total.episodes
     if episodes.objects and episodes.lost / episodes.objects >= LOST_SHARE:
         share = episodes.lost / episodes.objects
-        yield Finding(WARNING, f"{share:.0%} of the objects fell out of the scene", f"{episodes.lost:,} of {episodes.objects:,} were lost.")
+        yield WARNING, f"{share:.0%} of the objects fell out of the scene", f"{episodes.lost:,} of {episodes.objects:,} were lost."
 
 
-def _brightness(figures: Figures) -> Iterator[Finding]:
+def _brightness(figures: Figures) -> Rule:
     """Warn if EXTREME_SHARE of the measured views or more are too dark, or too bright."""
     views = figures.brightness
     extremes = (("dark", [each for each in views if each.mean < DARK]), ("bright", [each for each in views if each.mean > BRIGHT]))
@@ -181,33 +168,33 @@ def _brightness(figures: Figures) -> Iterator[Finding]:
         if views and len(found) / len(views) >= EXTREME_SHARE:
             listed = _listed(f"episode {each.episode}, camera {each.camera}, frame {each.frame}" for each in found)
             title = f"{len(found)} of {len(views)} measured views are too {word}"
-            yield Finding(
+            yield (
                 WARNING,
                 title,
                 f"Mean brightness {'below' if word == 'dark' else 'above'} {DARK if word == 'dark' else BRIGHT:.0%}: {listed}.",
             )
 
 
-def _invisible(figures: Figures) -> Iterator[Finding]:
+def _invisible(figures: Figures) -> Rule:
     """Note if INVISIBLE_SHARE of the instances or more have no visible pixel."""
     counted = figures.statistics.total.annotations
     if counted.instances and counted.invisible / counted.instances >= INVISIBLE_SHARE:
         share = counted.invisible / counted.instances
-        yield Finding(
+        yield (
             NOTE,
             f"{share:.0%} of the instances have no visible pixel",
             "They lie below others or outside of the image; targets leave them out.",
         )
 
 
-def _depth(figures: Figures) -> Iterator[Finding]:
+def _depth(figures: Figures) -> Rule:
     """Warn if MISSING_DEPTH of the depth pixels or more have no measurement."""
     depth = figures.statistics.depth
     if depth is not None and depth.missing >= MISSING_DEPTH:
-        yield Finding(WARNING, f"{depth.missing:.0%} of the depth pixels have no measurement", f"In {depth.views:,} sampled views.")
+        yield WARNING, f"{depth.missing:.0%} of the depth pixels have no measurement", f"In {depth.views:,} sampled views."
 
 
-def _lights(figures: Figures) -> Iterator[Finding]:
+def _lights(figures: Figures) -> Rule:
     """Note if one environment map lights more than ONE_MAP_SHARE of the episodes."""
     lights = figures.statistics.lights
     if lights is None or lights.episodes < MIN_EPISODES:
@@ -216,24 +203,22 @@ def _lights(figures: Figures) -> Iterator[Finding]:
     if count / lights.episodes > ONE_MAP_SHARE:
         others = len(lights.maps) - 1
         detail = f"{name}; {_number(others, 'other map')} for the rest." if others else f"{name}; --lights takes a folder of more."
-        yield Finding(NOTE, f"{count / lights.episodes:.0%} of the episodes have the same light map", detail)
+        yield NOTE, f"{count / lights.episodes:.0%} of the episodes have the same light map", detail
 
 
-def _coverage(figures: Figures) -> Iterator[Finding]:
+def _coverage(figures: Figures) -> Rule:
     """Note objects that were often seen, but from less than COVERED of the sphere of viewing directions."""
     poor = [each for each in figures.statistics.objects if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED]
     if poor:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.coverage.occupied:.0%})" for each in poor)
-        yield Finding(
-            NOTE, f"{_number(len(poor), 'object')} seen from few directions", f"Seen part of the sphere of viewing directions: {listed}."
-        )
+        yield NOTE, f"{_number(len(poor), 'object')} seen from few directions", f"Seen part of the sphere of viewing directions: {listed}."
 
 
-def _missing(figures: Figures) -> Iterator[Finding]:
+def _missing(figures: Figures) -> Rule:
     """Note what the statistics could not read."""
     for sentence in figures.statistics.missing:
         title, _, detail = sentence.partition(": ")
-        yield Finding(NOTE, title[:1].upper() + title[1:], f"{detail[:1].upper()}{detail[1:]}." if detail else "")
+        yield NOTE, title[:1].upper() + title[1:], f"{detail[:1].upper()}{detail[1:]}." if detail else ""
 
 
 def _number(count: int, noun: str) -> str:
@@ -248,6 +233,6 @@ def _listed(items: Iterable[str]) -> str:
     return ", ".join(listed[:MAX_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
-def count_levels(findings: Sequence[Finding]) -> Mapping[str, int]:
+def count_levels(findings: Sequence[Remark]) -> Mapping[str, int]:
     """Number of findings of each level."""
     return {level: sum(finding.level == level for finding in findings) for level in (WARNING, NOTE)}

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.apps.report.album import Album, Picture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.album import Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
 from synpick_warp.apps.report.sampling import Content
 from synpick_warp.apps.statistics.columns import MAX_NAME
-from synpick_warp.apps.viz.depth_colors import DepthScale, color_depth, describe_depth, pooled_scale
 from synpick_warp.apps.viz.drawing import instance_color
-from synpick_warp.apps.viz.preview_layers import draw_layer
+from synpick_warp.apps.viz.false_colors import DepthScale, color_depth, describe_depth, draw_layer, pooled_scale
 from synpick_warp.dataset.view import MILLIMETERS, View
 
 WIDTH = 960
@@ -40,7 +39,7 @@ def make_frame(
         DatasetError: A file is missing or damaged.
     """
     color = show(view, scale)
-    panels: list[tuple[str, str, Picture]] = [("rgb", "colour", encode_photo(shrink(color, WIDTH)))]
+    panels: list[tuple[str, str, EncodedPicture]] = [("rgb", "colour", encode_photo(shrink(color, WIDTH)))]
     ids = _instance_ids(view, content, color.shape[:2])
     if ids is not None:
         panels.append(("ids", "visible masks", encode_ids(shrink(ids, WIDTH, smooth=False))))

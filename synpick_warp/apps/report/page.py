@@ -11,7 +11,7 @@ from typing import Any
 
 from synpick_warp.apps.report.album import Album
 from synpick_warp.apps.report.charts import Chart
-from synpick_warp.apps.report.findings import NOTE, WARNING, Finding, count_levels
+from synpick_warp.apps.report.findings import NOTE, WARNING, Remark, count_levels
 from synpick_warp.apps.report.markup import Html, content_hash, element, embed_json, join
 from synpick_warp.system.codecs.charts import ChartError, read_bundle
 
@@ -21,8 +21,8 @@ SCRIPTS = ("base.js", "frames.js", "strips.js", "attempts.js", "charts.js")
 
 
 @dataclass(frozen=True)
-class Part:
-    """Section of the page: name, title, lead (a sentence or two), body."""
+class PageSection:
+    """Section of the page."""
 
     name: str
     title: str
@@ -33,15 +33,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a report's page: title, lead, key figures (tiles), sections, findings, data and charts for the scripts,
-    pictures, footer.
-    """
+    """Content of a report's page."""
 
     title: str
     lead: str
     tiles: Html
-    parts: Sequence[Part]
-    findings: Sequence[Finding]
+    parts: Sequence[PageSection]
+    findings: Sequence[Remark]
     data: Mapping[str, Any]
     """What the scripts show: frames, strips, attempts."""
     charts: Sequence[Chart]
@@ -105,12 +103,12 @@ def _navigation(page: Page) -> Html:
     return join(element("a", part.title, badge if part.name == "findings" else "", href=f"#{part.name}") for part in page.parts)
 
 
-def _section(part: Part) -> Html:
+def _section(part: PageSection) -> Html:
     """Section of the page: heading, lead, body."""
     return element("section", element("h2", part.title), element("p", part.lead), part.body, id=part.name)
 
 
-def summary(findings: Sequence[Finding]) -> str:
+def summary(findings: Sequence[Remark]) -> str:
     """Numbers of warnings and notes, in words."""
     counts = count_levels(findings)
     words = [f"{counts[level]} {level}{'' if counts[level] == 1 else 's'}" for level in (WARNING, NOTE) if counts[level]]

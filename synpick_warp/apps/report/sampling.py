@@ -24,11 +24,11 @@ _WEIGHTS = LUMINANCE.astype(np.float32)
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """Manifest rows and numbers of attempts of the sampled episodes, by index, and the number of all episodes."""
+class SampledEpisodes:
+    """Episodes of which the report tells more than counts."""
 
     rows: dict[int, EpisodeFacts]
-    """Row of each episode by its index."""
+    """Manifest row by index of the episode."""
     attempts: dict[int, int]
     """Number of attempts by index of the episode."""
     total: int
@@ -37,7 +37,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Brightness:
-    """Mean luma of one view, from 0 to 1, of the sRGB values."""
+    """Mean luma of one view."""
 
     episode: int
     camera: int
@@ -48,10 +48,9 @@ class Brightness:
 
 @dataclass(frozen=True)
 class Content:
-    """Whether the data set has visible masks, amodal masks and depth beside colour."""
+    """Whether a data set has visible masks, amodal masks and depth beside colour."""
 
     masks: bool
-    """Visible masks."""
     amodal: bool
     depth: bool
 
@@ -70,7 +69,7 @@ def spread(items: Sequence[int], count: int) -> list[int]:
     return [items[index * (len(items) - 1) // (count - 1)] for index in range(count)]
 
 
-def read_episodes(data_set: DataSet) -> Episodes:
+def read_episodes(data_set: DataSet) -> SampledEpisodes:
     """Read the rows of at most MAX_EPISODES episodes.
 
     Raises:
@@ -82,10 +81,10 @@ def read_episodes(data_set: DataSet) -> Episodes:
         episode = data_set[index]
         rows[index] = check_content(episode.row, EpisodeFacts, data_set.folder / f"{episode_entry(index)}.json")
         attempts[index] = len(episode.attempts)
-    return Episodes(rows, attempts, len(indices))
+    return SampledEpisodes(rows, attempts, len(indices))
 
 
-def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
+def sample_views(data_set: DataSet, episodes: SampledEpisodes, count: int) -> list[View]:
     """Sample distinct views, sorted: episodes at equal steps, times at equal steps, and cameras in equal numbers.
 
     The times of an episode are the middles of as many equal parts as it has views; where it has one, the times of all of them are, in an

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from synpick_warp.apps.report.album import Album, Picture, Section, encode_photo, shrink
+from synpick_warp.apps.report.album import Album, EncodedPicture, Section, encode_photo, shrink
 from synpick_warp.apps.report.frames import show
-from synpick_warp.apps.report.sampling import Episodes, spread
+from synpick_warp.apps.report.sampling import SampledEpisodes, spread
 from synpick_warp.codes import Outcome
 from synpick_warp.dataset.reading import DataSet, Episode
 
@@ -26,7 +26,7 @@ _MARGIN = 1.15
 """Factor by which other frames may be larger than the probes."""
 
 
-def choose_episodes(episodes: Episodes) -> list[int]:
+def choose_episodes(episodes: SampledEpisodes) -> list[int]:
     """Choose an episode of median length of each mode, at most MAX_STRIPS; modes in the order of their first episodes."""
     by_mode: dict[str, list[int]] = {}
     for index, row in episodes.rows.items():
@@ -51,10 +51,10 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
     """
     episode = data_set[index]
     cameras = range(min(MAX_CAMERAS, data_set.camera_count))
-    cache: dict[tuple[int, int], Picture] = {}
+    cache: dict[tuple[int, int], EncodedPicture] = {}
     most = min(MAX_FRAMES, len(episode)) * len(cameras)
 
-    def encode(frame: int, camera: int) -> Picture:
+    def encode(frame: int, camera: int) -> EncodedPicture:
         if (frame, camera) not in cache:
             cache[frame, camera] = encode_photo(
                 shrink(show(episode.view(frame - frame % episode.frames(camera).step, camera)), WIDTH), QUALITY

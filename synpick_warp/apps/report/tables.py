@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from synpick_warp.apps.report.findings import WARNING, Finding
+from synpick_warp.apps.report.findings import WARNING, Remark
 from synpick_warp.apps.report.markup import Html, element, join
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
@@ -60,7 +60,7 @@ def plain_table(names: Sequence[str], rows: Iterable[Sequence[str]], classes: Se
     return element("table", element("thead", head), element("tbody", body))
 
 
-def findings_list(findings: Sequence[Finding]) -> Html:
+def findings_list(findings: Sequence[Remark]) -> Html:
     """HTML list of what is odd in the data set's figures (`report.findings`), with level, title and detail; a sentence if nothing is."""
     if not findings:
         return element("p", "Nothing was found that a person would raise.", class_="empty")

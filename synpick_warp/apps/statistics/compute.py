@@ -26,9 +26,9 @@ from synpick_warp.apps.statistics.figures import (
     BinUse,
     Coverage,
     Depth,
-    Episodes,
+    EpisodeFigures,
     GroupStatistics,
-    Lights,
+    LightFigures,
     LookStatistics,
     ObjectStatistics,
     Range,
@@ -127,10 +127,10 @@ def _objects(data_set: DataSet, counts: Counts, total: Annotations) -> tuple[Obj
     )
 
 
-def episode_figures(counts: Counts, groups: Collection[Group]) -> Episodes:
+def episode_figures(counts: Counts, groups: Collection[Group]) -> EpisodeFigures:
     """Episodes of some groups and their attempts."""
     totals, seals, loads = (counts.of(name, groups) for name in ("episodes", "seals", "loads"))
-    return Episodes(
+    return EpisodeFigures(
         **{name: totals[name] for name in ("episodes", "frames", "objects", "picked", "lost", "attempts")},
         endings=_ranked(counts.of("endings", groups)),
         outcomes=_ranked(counts.of("outcomes", groups)),
@@ -183,13 +183,13 @@ def depth_figures(counts: Counts) -> Depth | None:
     return Depth(totals["views"], totals["pixels"], totals["missing"] / totals["pixels"], quantiles)
 
 
-def light_figures(counts: Counts) -> Lights | None:
+def light_figures(counts: Counts) -> LightFigures | None:
     """Light of all episodes; None: no episode names its light."""
     maps = counts.of("light_maps")
     if not maps:
         return None
     exposure = {round(index * EXPOSURE_BIN, 6): count for index, count in sorted(counts.of("exposures").items())}
-    return Lights(maps.total(), _ranked(maps), _histogram(counts.of("light_yaws"), YAW_BINS), exposure)
+    return LightFigures(maps.total(), _ranked(maps), _histogram(counts.of("light_yaws"), YAW_BINS), exposure)
 
 
 def look_figures(counts: Counts) -> tuple[LookStatistics, ...]:

@@ -32,7 +32,7 @@ class Annotations:
 
 
 @dataclass(frozen=True)
-class Episodes:
+class EpisodeFigures:
     """Episodes of a group, and their attempts to pick."""
 
     episodes: int
@@ -79,7 +79,7 @@ class GroupStatistics:
     """Name of the split; empty: all."""
     mode: str
     """pick, target or move; empty: all."""
-    episodes: Episodes
+    episodes: EpisodeFigures
     annotations: Annotations
     objects_over_time: tuple[TimePoint, ...]
 
@@ -123,7 +123,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class Lights:
+class LightFigures:
     """Environment light of the episodes."""
 
     episodes: int
@@ -208,7 +208,7 @@ class Statistics:
     """By obj_id: the objects that are annotated, and those of the models folder that never are."""
     depth: Depth | None
     """None: no depth image was read."""
-    lights: Lights | None
+    lights: LightFigures | None
     """None: no scene names its light."""
     paper: tuple[Comparison, ...]
     """Groups that the paper has, too."""

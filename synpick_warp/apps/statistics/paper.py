@@ -20,7 +20,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class PaperGroup(msgspec.Struct, frozen=True):
-    """Row of the paper's table, of a split and mode: sequences, views, mean visible fraction, annotated instances by object."""
+    """Row of the paper's table, of a split and mode."""
 
     split: str
     mode: str
@@ -38,7 +38,7 @@ class PaperGroup(msgspec.Struct, frozen=True):
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """Statistics that the paper publishes of its data set: cameras, views and mean visibility, and a row for each split and mode."""
+    """Statistics that the paper publishes of its data set."""
 
     cameras: int
     total_views: int

@@ -8,11 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from synpick_warp.apps.statistics.ranking import BINS, DRAWS, Calibration, Interval, Scored, calibrate, estimate, success_rate, weighted_auc
+from synpick_warp.apps.statistics.ranking import (
+    BINS,
+    DRAWS,
+    CalibrationCurve,
+    Interval,
+    Scored,
+    calibrate,
+    estimate,
+    success_rate,
+    weighted_auc,
+)
 from synpick_warp.codes import Outcome, Share
 from synpick_warp.dataset.object_names import names_of
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.codecs.tables import Column, Table
+from synpick_warp.system.codecs.tables import Table, parse_columns
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
@@ -39,7 +49,7 @@ class ScoreFigures:
     success: Interval
     """Success rate, weighted as its population."""
     auc: Interval
-    calibration: Calibration
+    calibration: CalibrationCurve
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ class ObjectFigures:
 
 @dataclass(frozen=True)
 class PickFigures:
-    """Evaluation of the picks of a data set: numbers of episodes, states, candidates and trials, figures of scores and of objects."""
+    """Evaluation of the picks of a data set."""
 
     episodes: int
     states: int
@@ -152,50 +162,35 @@ def find_picks(data_set: DataSet, draws: int = DRAWS) -> PickFigures | None:
     return picks_figures(data_set, draws)
 
 
+_RATE = "success:.1% success_low:.1%:from success_high:.1%:to"
+_AUC = "auc:.3f:AUC auc_low:.3f:from auc_high:.3f:to"
+_ERROR = "ece:.3f:calibration_error ece_low:.3f:from ece_high:.3f:to"
+"""Columns of an estimate with its interval."""
+
+
 def picks_tables(figures: PickFigures) -> tuple[Table, ...]:
     """Format the figures as tables: scores, calibration curve of SuctionNet's score, objects."""
-    interval = (Column("auc", ".3f", "AUC"), Column("auc_low", ".3f", "from"), Column("auc_high", ".3f", "to"))
-    rate = (Column("success", ".1%"), Column("success_low", ".1%", "from"), Column("success_high", ".1%", "to"))
-    error = (Column("ece", ".3f", "calibration error"), Column("ece_low", ".3f", "from"), Column("ece_high", ".3f", "to"))
     scores = [
         (each.population, each.score, each.trials, *_values(each.success), *_values(each.auc), *_values(each.calibration.error))
         for each in figures.scores
     ]
     bins = [
-        (
-            each.population,
-            f"{number / BINS:.1f} to {(number + 1) / BINS:.1f}",
-            int(each.calibration.count[number]),
-            *map(_known, (each.calibration.predicted[number], each.calibration.observed[number])),
-            *map(_known, (each.calibration.low[number], each.calibration.high[number])),
-        )
+        (each.population, f"{number / BINS:.1f} to {(number + 1) / BINS:.1f}", int(count), *map(_known, shares))
         for each in figures.scores
         if each.score == SCORES[0]
-        for number in range(BINS)
+        for number, (count, *shares) in enumerate(each.calibration.bins())
     ]
     objects = [
         (each.obj_id, each.name, each.trials, *_values(each.success), *(_values(each.auc) if each.auc else (None,) * 3))
         for each in figures.objects
     ]
+    by_score = parse_columns(f"candidates score trials:, {_RATE} {_AUC} {_ERROR}")
+    by_bin = parse_columns(f"candidates score trials:, mean_score:.3f {_RATE}")
+    by_object = parse_columns(f"obj_id:d name trials:, {_RATE} {_AUC}")
     return (
-        Table(
-            "pick_scores",
-            "Simulated success by analytic scores, 95 % intervals over states",
-            (Column("candidates"), Column("score"), Column("trials", ","), *rate, *interval, *error),
-            scores,
-        ),
-        Table(
-            "pick_calibration",
-            "Calibration of seal x wrench",
-            (Column("candidates"), Column("score"), Column("trials", ","), Column("mean_score", ".3f"), *rate),
-            bins,
-        ),
-        Table(
-            "pick_objects",
-            "By object: all candidates, seal x wrench",
-            (Column("obj_id", "d"), Column("name"), Column("trials", ","), *rate, *interval),
-            objects,
-        ),
+        Table("pick_scores", "Simulated success by analytic scores, 95 % intervals over states", by_score, scores),
+        Table("pick_calibration", "Calibration of seal x wrench", by_bin, bins),
+        Table("pick_objects", "By object: all candidates, seal x wrench", by_object, objects),
     )
 
 

@@ -5,7 +5,7 @@ Fawcett, An introduction to ROC analysis, 2006; expected calibration error: Naei
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -79,8 +79,8 @@ def success_rate(scored: Scored, weight: np.ndarray | None = None) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
-    """Calibration curve (reliability diagram): by bin of the score, sample count, mean score and success rate; and its error."""
+class CalibrationCurve:
+    """Calibration curve (reliability diagram) by bin of the score."""
 
     count: np.ndarray
     """(bin) int."""
@@ -95,8 +95,12 @@ class Calibration:
     error: Interval
     """Expected calibration error: weighted mean of |observed - predicted| over bins."""
 
+    def bins(self) -> Iterator[tuple[float, ...]]:
+        """Count, mean score, success rate, and the ends of its interval, of each bin."""
+        yield from zip(self.count, self.predicted, self.observed, self.low, self.high, strict=True)
 
-def calibrate(scored: Scored, draws: int = DRAWS) -> Calibration:
+
+def calibrate(scored: Scored, draws: int = DRAWS) -> CalibrationCurve:
     """Calibration curve of scores from 0 to 1, read as probabilities, with cluster bootstrap intervals."""
     place = np.clip((scored.score * BINS).astype(np.int64), 0, BINS - 1)
 
@@ -113,7 +117,7 @@ def calibrate(scored: Scored, draws: int = DRAWS) -> Calibration:
         mean = predicted / total
     value, low, high = bootstrap(scored, curve, draws)
     error = Interval(float(value[-1]), float(low[-1]), float(high[-1]))
-    return Calibration(np.bincount(place, minlength=BINS), mean, value[:-1], low[:-1], high[:-1], error)
+    return CalibrationCurve(np.bincount(place, minlength=BINS), mean, value[:-1], low[:-1], high[:-1], error)
 
 
 def estimate(scored: Scored, statistic: Callable[[Scored, np.ndarray], float], draws: int = DRAWS) -> Interval:

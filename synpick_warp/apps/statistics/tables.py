@@ -11,7 +11,7 @@ from synpick_warp.apps.statistics.columns import BANDS, FORCE_BIN, FORCE_BINS, S
 from synpick_warp.apps.statistics.compute import LOOK_QUANTILES
 from synpick_warp.apps.statistics.figures import GroupStatistics, Statistics
 from synpick_warp.apps.statistics.paper import read_paper
-from synpick_warp.system.codecs.tables import Column, Table, Value
+from synpick_warp.system.codecs.tables import Column, Table, Value, parse_columns
 
 ALL = "all"
 """Label of the row over all splits or modes."""
@@ -25,7 +25,7 @@ Columns = tuple[Column, ...]
 Rows = Iterator[tuple[Value, ...]]
 
 
-class _Source(NamedTuple):
+class _TableSource(NamedTuple):
     """Source of a table: a function that yields its rows, and what stands above them."""
 
     name: str
@@ -46,11 +46,6 @@ def make_tables(statistics: Statistics) -> list[Table]:
     return tables
 
 
-def _columns(names: str) -> Columns:
-    """Columns by name, each with its format and its label behind colons where it has them: "name:format:label"."""
-    return tuple(Column(*each.split(":")) for each in names.split())
-
-
 def _label(row: GroupStatistics) -> tuple[str, str]:
     """First cells of a group's row: split and mode; `ALL` where the row sums over them."""
     return row.split or ALL, row.mode or ALL
@@ -64,7 +59,7 @@ def _with_total(statistics: Statistics) -> tuple[GroupStatistics, ...]:
 def _by_group(names: str, style: str = ",") -> Callable[[Statistics], Columns]:
     """Columns `names`, and one for each group (split and mode, and all) in the format `style`."""
     return lambda statistics: (
-        *_columns(names),
+        *parse_columns(names),
         *(Column(" ".join(dict.fromkeys(_label(row))), style) for row in _with_total(statistics)),
     )
 
@@ -108,12 +103,8 @@ def _objects(statistics: Statistics) -> Rows:
 
 
 def _object_columns(statistics: Statistics) -> Columns:
-    modes = dict.fromkeys(row.mode for row in statistics.groups)
-    return (
-        *_columns("object_id name"),
-        *(Column(each, ",") for each in (*modes, ALL)),
-        *_columns("share:.1% directions_seen:.0% evenness:.2f"),
-    )
+    modes = (Column(mode, ",") for mode in (*dict.fromkeys(row.mode for row in statistics.groups), ALL))
+    return (*parse_columns("object_id name"), *modes, *parse_columns("share:.1% directions_seen:.0% evenness:.2f"))
 
 
 def _annotations(statistics: Statistics) -> Rows:
@@ -201,93 +192,99 @@ def _coverage(statistics: Statistics) -> Rows:
 
 
 _SOURCES = (
-    _Source(
+    _TableSource(
         "groups",
         "Views and mean visibility, by split and mode",
-        _columns("split mode episodes:, views:, instances:, instances_per_view:.2f mean_visibility:.3f invisible:.1%"),
+        parse_columns("split mode episodes:, views:, instances:, instances_per_view:.2f mean_visibility:.3f invisible:.1%"),
         _groups,
     ),
-    _Source(
+    _TableSource(
         PAPER,
         _paper_title,
-        _columns(
+        parse_columns(
             "split mode sequences:, sequences_paper:,:paper views:, views_paper:,:paper frames:.0f frames_paper:.0f:paper"
             " frames_difference:+.0%:diff visibility:.2f:visible visibility_paper:.2f:paper visibility_difference:+.2f:diff"
             " instances_per_view:.1f:inst. instances_per_view_paper:.1f:paper object_distance:.3f:TV object_distance_in_paper:.3f:paper"
         ),
         _paper,
     ),
-    _Source(
+    _TableSource(
         "objects",
         "Annotated instances by object and mode; viewing directions: seen bins of the sphere, and how even they are",
         _object_columns,
         _objects,
     ),
-    _Source(
+    _TableSource(
         "annotations",
         "Annotated instances by split, mode and object",
-        _columns("split mode object_id name instances:,"),
+        parse_columns("split mode object_id name instances:,"),
         _annotations,
         in_text=False,
     ),
-    _Source("visibility", "Instances by visible fraction", _by_group("from:.2f to:.2f"), _visibility),
-    _Source(
+    _TableSource("visibility", "Instances by visible fraction", _by_group("from:.2f to:.2f"), _visibility),
+    _TableSource(
         "endings",
         "Endings of episodes",
-        _columns("split mode ending episodes:, fraction:.1%"),
+        parse_columns("split mode ending episodes:, fraction:.1%"),
         _shares(lambda row: row.episodes.endings),
     ),
-    _Source(
+    _TableSource(
         "outcomes",
         "Outcomes of attempts to pick",
-        _columns("split mode outcome attempts:, fraction:.1%"),
+        parse_columns("split mode outcome attempts:, fraction:.1%"),
         _shares(lambda row: row.episodes.outcomes),
     ),
-    _Source(
+    _TableSource(
         "attempts",
         "Objects and attempts; mean over engaged attempts of the largest seal force [N]",
-        _columns("split mode objects:, picked:, lost:, attempts:, attempts_per_episode:.2f engaged:, good_seals:, mean_peak_force_N:.1f"),
+        parse_columns(
+            "split mode objects:, picked:, lost:, attempts:, attempts_per_episode:.2f engaged:, good_seals:, mean_peak_force_N:.1f"
+        ),
         _attempts,
     ),
-    _Source("seal_forces", "Attempts by largest seal force [N]", _by_group("from_N:.0f to_N:.0f"), _forces),
-    _Source(TIMELINE, "Mean number of objects in the scene, by time since the first frame [s]", _by_group("time_s:.0f", ".2f"), _timeline),
-    _Source(
+    _TableSource("seal_forces", "Attempts by largest seal force [N]", _by_group("from_N:.0f to_N:.0f"), _forces),
+    _TableSource(
+        TIMELINE, "Mean number of objects in the scene, by time since the first frame [s]", _by_group("time_s:.0f", ".2f"), _timeline
+    ),
+    _TableSource(
         "depth",
         _depth_title,
-        _columns("quantile:.0% depth_mm:.1f"),
+        parse_columns("quantile:.0% depth_mm:.1f"),
         lambda statistics: iter(statistics.depth.quantiles.items() if statistics.depth else ()),
     ),
-    _Source("lights", "Environment maps", _columns("map episodes:, fraction:.1%"), _light_maps),
-    _Source(
+    _TableSource("lights", "Environment maps", parse_columns("map episodes:, fraction:.1%"), _light_maps),
+    _TableSource(
         "light_yaw",
         "Episodes by yaw of the environment map [°]",
-        _columns("from_degrees:.0f to_degrees:.0f episodes:,"),
+        parse_columns("from_degrees:.0f to_degrees:.0f episodes:,"),
         _yaws,
         in_text=False,
     ),
-    _Source(
+    _TableSource(
         "light_exposure",
         "Episodes by exposure compensation [EV]",
-        _columns("from_EV:.1f episodes:,"),
+        parse_columns("from_EV:.1f episodes:,"),
         lambda statistics: iter(statistics.lights.exposure.items() if statistics.lights else ()),
         in_text=False,
     ),
-    _Source(
+    _TableSource(
         "looks",
         "Randomized looks: quantiles of what episodes have drawn",
-        _columns(f"part parameter draws:, {' '.join(f'quantile_{share}:.3g:{share:.0%}' for share in LOOK_QUANTILES)}"),
+        parse_columns(f"part parameter draws:, {' '.join(f'quantile_{share}:.3g:{share:.0%}' for share in LOOK_QUANTILES)}"),
         lambda statistics: ((row.part, row.parameter, row.draws, *row.quantiles) for row in statistics.looks),
     ),
-    _Source(
+    _TableSource(
         "bins",
         "Bins and where they stand",
-        _columns("bin episodes:, fraction:.1% x_from_mm:.0f x_to_mm:.0f y_from_mm:.0f y_to_mm:.0f yaw_from_degrees:.0f yaw_to_degrees:.0f"),
+        parse_columns(
+            "bin episodes:, fraction:.1% x_from_mm:.0f x_to_mm:.0f y_from_mm:.0f y_to_mm:.0f yaw_from_degrees:.0f yaw_to_degrees:.0f"
+        ),
         _bins,
     ),
-    _Source(
+    _TableSource(
         "coverage",
         "Views by object and viewing direction in its frame",
-        _columns("object_id z_from z_to longitude_from longitude_to views"),
+        parse_columns("object_id z_from z_to longitude_from longitude_to views"),
         _coverage,
         in_text=False,
     ),

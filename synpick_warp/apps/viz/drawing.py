@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import os
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,6 +11,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.writing.files import write_atomically
 from synpick_warp.system.folders import make_folder
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
@@ -45,19 +45,11 @@ def write_picture(out: Path, picture: Image) -> Path:
         raise OutputError(
             f"cannot write {out}: OpenCV cannot encode {picture.shape[1]} x {picture.shape[0]} pixels; use .png or fewer views"
         )
-    partial_file = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         make_folder(out.parent)
         if out.is_dir():
             raise OutputError(f"cannot write {out}: it is a folder")
-        try:
-            # A link of that name in the data set is replaced, never followed.
-            with open(partial_file, "xb") as file:
-                file.write(data.tobytes())
-            partial_file.replace(out)
-        except BaseException:
-            partial_file.unlink(missing_ok=True)
-            raise
+        write_atomically(out, data.tobytes())
     except (OSError, ValueError) as error:
         raise OutputError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}") from error
     return out

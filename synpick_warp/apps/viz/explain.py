@@ -14,7 +14,7 @@ import numpy as np
 from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
 from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clutter_edges, disc, draw_graph, fixed, put_boxed
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
-from synpick_warp.apps.viz.explain_record import MODE_WORDS, Attempt, choose_attempts, labels, read_attempts
+from synpick_warp.apps.viz.explain_record import MODE_WORDS, SeenAttempt, choose_attempts, labels, read_attempts
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import load_config
@@ -86,7 +86,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _open_view(dataset: Path, scenes: SceneIndex, attempt: Attempt, camera: int, every: int) -> View:
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: SeenAttempt, camera: int, every: int) -> View:
     """View of the camera of perception in which an attempt's choice was made, or the last before: it renders each `every`-th frame."""
     files, frame = scenes.files(attempt.episode, camera), attempt.frame - attempt.frame % every
     if frame not in files.frames():
@@ -133,7 +133,7 @@ def image_scale(size: tuple[int, int]) -> float:
     return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
-def _row(attempt: Attempt, view: View, planned: Camera | None, words: Image, min_votes: float) -> tuple[Image, int]:
+def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image, min_votes: float) -> tuple[Image, int]:
     """Draw one attempt: image, clutter graph, and text and table (`words`), with room at the lower left for the force's plot, whose height
     [px] is returned, too."""
     image = draw_observation(attempt, view, planned)
@@ -166,7 +166,7 @@ def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
-def draw_observation(attempt: Attempt, view: View, planned: Camera | None) -> Image:
+def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -> Image:
     """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
     Args:

@@ -15,7 +15,7 @@ import networkx as nx
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
-from synpick_warp.apps.viz.explain_record import Attempt, labels
+from synpick_warp.apps.viz.explain_record import SeenAttempt, labels
 from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
 
@@ -46,27 +46,27 @@ KEPT, OUTVOTED, CYCLIC = "kept", "outvoted by the opposite", "dropped to break a
 
 @dataclass(frozen=True)
 class Edge:
-    """Edge of the clutter graph, from the upper to the lower instance: its votes (of a kept edge minus those for the opposite one), and
-    whether it was kept or why it was removed.
-    """
+    """Edge of the clutter graph, from the upper to the lower instance."""
 
     upper: int
     lower: int
     weight: float
     """Votes minus those for the opposite edge; of a removed edge, its own votes."""
     state: str
+    """KEPT, or why it was removed."""
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Layout of the graph in the image [px]: position of each node, and polyline of each kept edge (upper, lower)."""
+class GraphLayout:
+    """Layout of the graph in the image [px]."""
 
     nodes: dict[int, tuple[float, float]]
+    """Position of each node."""
     routes: dict[tuple[int, int], np.ndarray]
     """(upper, lower) of a kept edge -> polyline from node to node (N, 2)."""
 
 
-def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
+def clutter_edges(attempt: SeenAttempt, min_votes: float) -> list[Edge]:
     """Edges of the clutter graph, sorted by lower, then upper instance: all that are kept in the acyclic graph, and of at least `min_votes`
     those removed, since the opposite has as many votes or to break a cycle.
     """
@@ -83,7 +83,7 @@ def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
     return edges
 
 
-def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> Layout:
+def lay_out(attempt: SeenAttempt, edges: Sequence[Edge], size: tuple[int, int]) -> GraphLayout:
     """Place nodes in layers such that every kept edge runs downward.
 
     Args:
@@ -108,10 +108,10 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
         for layer, row in enumerate(rows)
         for place, instance in enumerate(row)
     }
-    return Layout(nodes, {(upper, lower): _route(nodes, upper, lower, width) for upper, lower in graph.edges})
+    return GraphLayout(nodes, {(upper, lower): _route(nodes, upper, lower, width) for upper, lower in graph.edges})
 
 
-def _rows(attempt: Attempt, graph: nx.DiGraph, capacity: int) -> list[list[int]]:
+def _rows(attempt: SeenAttempt, graph: nx.DiGraph, capacity: int) -> list[list[int]]:
     """Instances of each layer from left to right: layers by longest path from above, in rows of at most `capacity`, ordered by the mean
     place of its nodes' predecessors, or of those without any by their suction points."""
     try:
@@ -148,7 +148,7 @@ def _arc(start: np.ndarray, end: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return (1 - t) ** 2 * start + 2 * t * (1 - t) * ((start + end) / 2 + offset) + t**2 * end
 
 
-def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Image:
+def draw_graph(attempt: SeenAttempt, min_votes: float, size: tuple[int, int]) -> Image:
     """Draw the clutter graph on white, without legend.
 
     Args:
@@ -208,7 +208,7 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
     cv2.fillPoly(canvas, [fixed(np.stack((tip, base + 4.5 * across, base - 4.5 * across)))], color, cv2.LINE_AA, _SHIFT)
 
 
-def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
+def _draw_bent(canvas: Image, edge: Edge, layout: GraphLayout) -> None:
     """Draw a removed edge as a dashed arc, so that it does not cover the straight line between its nodes, where the opposite
     edge may run.
     """

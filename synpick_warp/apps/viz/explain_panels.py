@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.viz.drawing import FONT, INK, Image, instance_color, put_text
 from synpick_warp.apps.viz.explain_graph import GREY, RED, disc
-from synpick_warp.apps.viz.explain_record import Attempt, break_force, choice_words, labels, seal_words, suction_kind
+from synpick_warp.apps.viz.explain_record import SeenAttempt, break_force, choice_words, labels, seal_words, suction_kind
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.system.codecs.charts import Spec, axis, limit, line, points, theme
@@ -38,7 +38,7 @@ _COLUMNS = ((0, "object"), (236, "above"), (296, "area"), (356, "pixels"), (416,
 """Position [px] and heading of the table's columns."""
 
 
-def draw_words(attempt: Attempt, names: Mapping[int, str], rules: tuple[Target, Pick], suction: Suction) -> Image:
+def draw_words(attempt: SeenAttempt, names: Mapping[int, str], rules: tuple[Target, Pick], suction: Suction) -> Image:
     """Draw the explanation in sentences, and below it the table of objects, ranked by the choice rule."""
     lines = [(line, INK) for text in choice_words(attempt, names, *rules) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     lines += [(line, INK) for text in seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)]
@@ -52,7 +52,7 @@ def draw_words(attempt: Attempt, names: Mapping[int, str], rules: tuple[Target, 
     return canvas
 
 
-def _draw_table(canvas: Image, attempt: Attempt, names: Mapping[int, str], top: int) -> None:
+def _draw_table(canvas: Image, attempt: SeenAttempt, names: Mapping[int, str], top: int) -> None:
     """Draw the table of objects, in place; the target's row is highlighted."""
     short = labels(attempt)
     for x, text in _COLUMNS:
@@ -95,7 +95,7 @@ def fitted(text: str, size: float, width: int) -> str:
     return text + ".."
 
 
-def load_chart(attempt: Attempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:
+def load_chart(attempt: SeenAttempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:
     """Chart of the seal force over time, with the break force; size in pixels, whose height is kept in its limits.
 
     `tick_time`: time between two frames [s].

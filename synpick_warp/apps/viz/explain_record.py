@@ -31,7 +31,7 @@ MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
 
 
-class Attempt(records.Attempt, dict=True):
+class SeenAttempt(records.Attempt, dict=True):
     """Pick attempt as its record, of which the target was visible, and all suction points are in the image."""
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class Attempt(records.Attempt, dict=True):
         return sorted(self.seen, key=lambda one: (sign * len(one.ancestors), -sign * one.visible_fraction, one.instance))
 
 
-def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attempt]:
+def read_attempts(dataset: Path, episode: int, number: int | None) -> list[SeenAttempt]:
     """Read the attempts of an episode, sorted, or one of them.
 
     Raises:
@@ -83,10 +83,10 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         raise DatasetError(
             f"{path} has {len(rows)} attempts of episode {episode}; a figure has at most {MAX_ATTEMPTS}: name one by --attempt"
         )
-    return [decode_json(lines[row], Attempt, _line(path, row), DatasetError, ADVICE) for count, row in rows if number in (None, count)]
+    return [decode_json(lines[row], SeenAttempt, _line(path, row), DatasetError, ADVICE) for count, row in rows if number in (None, count)]
 
 
-def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
+def choose_attempts(dataset: Path, count: int) -> list[SeenAttempt]:
     """Choose the first attempts worth seeing; if there are fewer, others from the beginning stand in. In the order of the file.
 
     Worth seeing is an attempt that chose among MIN_CHOICE objects or more, of which some lie on others, and engaged one.
@@ -95,10 +95,10 @@ def choose_attempts(dataset: Path, count: int) -> list[Attempt]:
         DatasetError: The file is missing or damaged, or has no attempt.
     """
     path, lines = _read_lines(dataset)
-    worthy: dict[int, Attempt] = {}
-    others: dict[int, Attempt] = {}
+    worthy: dict[int, SeenAttempt] = {}
+    others: dict[int, SeenAttempt] = {}
     for row, line in enumerate(lines):
-        attempt = decode_json(line, Attempt, _line(path, row), DatasetError, ADVICE)
+        attempt = decode_json(line, SeenAttempt, _line(path, row), DatasetError, ADVICE)
         chosen = attempt.target is not None and len(attempt.seen) >= MIN_CHOICE and any(one.above for one in attempt.seen)
         if chosen and attempt.engaged:
             worthy[row] = attempt
@@ -126,13 +126,13 @@ def _read_lines(dataset: Path) -> tuple[Path, list[bytes]]:
     return path, read_file(path, MAX_JSON, DatasetError).splitlines()
 
 
-def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:
+def parse_attempt(content: Mapping[str, Any], source: str) -> SeenAttempt:
     """Parse a record of `synpick_warp.dataset.reading.Episode.attempts`.
 
     Raises:
         DatasetError: It is damaged.
     """
-    return check_content(content, Attempt, source)
+    return check_content(content, SeenAttempt, source)
 
 
 def _line(path: Path, row: int) -> str:
@@ -152,12 +152,12 @@ def _which(what: str, numbers: list[int]) -> str:
     return f"{what}: {', '.join(shown) or 'none'}"
 
 
-def labels(attempt: Attempt) -> dict[int, str]:
+def labels(attempt: SeenAttempt) -> dict[int, str]:
     """Short label of every visible instance, see `short_labels`."""
     return short_labels((one.instance, one.object_id) for one in attempt.seen)
 
 
-def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
+def full_names(attempt: SeenAttempt, names: Mapping[int, str]) -> dict[int, str]:
     """Label and name of every visible instance."""
     short = labels(attempt)
     return {one.instance: f"{short[one.instance]} {names.get(one.object_id, '')}".rstrip() for one in attempt.seen}
@@ -169,7 +169,7 @@ def suction_kind(one: InstanceObservation) -> int:
     return distances.index(min(distances)) if min(distances) <= 1.0 else len(distances)
 
 
-def choice_words(attempt: Attempt, names: Mapping[int, str], target: Target, pick: Pick) -> list[str]:
+def choice_words(attempt: SeenAttempt, names: Mapping[int, str], target: Target, pick: Pick) -> list[str]:
     """Explain in sentences the chosen target, the reason, and the suction point."""
     if attempt.target is None:
         return ["target: none, nothing is visible"]
@@ -183,7 +183,7 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], target: Target, pic
     return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, target, pick)}", f"suction point: {where}{tilt}"]
 
 
-def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str], target: Target, pick: Pick) -> str:
+def _reason(attempt: SeenAttempt, one: InstanceObservation, full: Mapping[int, str], target: Target, pick: Pick) -> str:
     """Clause on why an object was chosen: number of objects above it, and its visible area if several have as many.
 
     The area is relative to the largest face of the bounding box: seen obliquely, an object can show more.
@@ -207,7 +207,7 @@ def _reason(attempt: Attempt, one: InstanceObservation, full: Mapping[int, str],
     return f"{above}; {area}, the {'smallest' if targeted else 'largest'} of {equals} such"
 
 
-def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> list[str]:
+def seal_words(attempt: SeenAttempt, names: Mapping[int, str], suction: Suction) -> list[str]:
     """Explain in sentences the rays, the seal, its force and the picked objects; none if nothing was chosen."""
     if attempt.target is None:
         return []
@@ -224,7 +224,7 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], suction: Suction) -> 
     return lines
 
 
-def break_force(attempt: Attempt, suction: Suction) -> float:
+def break_force(attempt: SeenAttempt, suction: Suction) -> float:
     """Force at which the strongest seal of the attempt breaks, or with `suction.vacuum` the weakest [N]."""
     if attempt.break_force is not None:
         return attempt.break_force

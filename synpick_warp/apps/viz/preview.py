@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.depth_colors import DepthScale, bin_scale, color_depth, describe_depth, pooled_scale
 from synpick_warp.apps.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
-from synpick_warp.apps.viz.preview_layers import layer_pictures
+from synpick_warp.apps.viz.false_colors import DepthScale, bin_scale, color_depth, describe_depth, layer_pictures, pooled_scale
 from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import load_config
@@ -44,7 +43,7 @@ _MIN_LEGEND = 120
 
 
 @dataclass(frozen=True, order=True)
-class Scene:
+class SheetScene:
     """A scene as one camera sees it: a folder, with several sensors the files of one of them, or members of shards."""
 
     folder: Path
@@ -57,9 +56,9 @@ class Scene:
 
 @dataclass(frozen=True)
 class _View:
-    """View to draw: scene, frame, its annotation records, and the files of its images."""
+    """View to draw."""
 
-    scene: Scene
+    scene: SheetScene
     frame: int
     camera: dict[str, Any]
     """Record of scene_camera."""
@@ -104,7 +103,7 @@ class Baked(NamedTuple):
     names: dict[int, str]
     """obj_id -> name of an object."""
 
-    def facts(self, scene: Scene, frame: int, camera: Mapping[str, Any]) -> list[str]:
+    def facts(self, scene: SheetScene, frame: int, camera: Mapping[str, Any]) -> list[str]:
         """Facts on a view for its legend: scene, episode, mode, time, light."""
         lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
         if self.config is not None:
@@ -135,7 +134,7 @@ def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
     return Baked(dataset, config, object_names(dataset, object_ids, known.object_rows, known.objects.diameter_tolerance))
 
 
-def find_scenes(dataset: Path) -> list[Scene]:
+def find_scenes(dataset: Path) -> list[SheetScene]:
     """Find the scenes of a data set, of each sensor, sorted; not those in hidden folders, where a running bake has unfinished ones.
 
     Raises:
@@ -149,11 +148,12 @@ def find_scenes(dataset: Path) -> list[Scene]:
         example = "a BOP data set has folders such as train_pbr/000000 with a scene_camera.json"
         raise DatasetError(f"{dataset} has no complete scene; {example}") from None
     return sorted(
-        Scene(dataset / ref.split / (ref.name or f"{ref.scene:06d}"), ref.sensor, files=partial(found.open, ref)) for ref in found.refs()
+        SheetScene(dataset / ref.split / (ref.name or f"{ref.scene:06d}"), ref.sensor, files=partial(found.open, ref))
+        for ref in found.refs()
     )
 
 
-def sample(scenes: list[Scene], views: int, cameras: int = 0) -> list[tuple[Scene, int]]:
+def sample(scenes: list[SheetScene], views: int, cameras: int = 0) -> list[tuple[SheetScene, int]]:
     """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
 
     Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence. `cameras`: number of cameras of our
@@ -163,7 +163,7 @@ def sample(scenes: list[Scene], views: int, cameras: int = 0) -> list[tuple[Scen
         DatasetError: A file is damaged, or no scene has a view.
         OutputError: More views are there and asked for than a sheet shows.
     """
-    by_camera: dict[tuple[Any, ...], list[tuple[Scene, list[int]]]] = {}
+    by_camera: dict[tuple[Any, ...], list[tuple[SheetScene, list[int]]]] = {}
     for scene in scenes:
         files = scene.files()
         frames = files.frames()
@@ -191,7 +191,7 @@ def sample(scenes: list[Scene], views: int, cameras: int = 0) -> list[tuple[Scen
     return sorted(samples)
 
 
-def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
+def _read_views(samples: list[tuple[SheetScene, int]]) -> Iterator[_View]:
     """Read the annotations of views, which are sorted by scene: those of each scene once."""
     for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
         files = scene.files()

@@ -129,7 +129,7 @@ def write_atomically(path: Path, data: bytes | Iterable[bytes]) -> None:
         temporary.unlink(missing_ok=True)  # A link of this name is not followed.
         write_synced(temporary, data)
         temporary.replace(path)
-    except OSError:
+    except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise

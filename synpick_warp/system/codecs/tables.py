@@ -23,9 +23,7 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 
 
 class Column(NamedTuple):
-    """Column of a table: header in CSV, format of the values in text and LaTeX (empty: text, at the left), header there, and
-    format in CSV.
-    """
+    """Column of a table."""
 
     name: str
     """Header in CSV."""
@@ -37,11 +35,15 @@ class Column(NamedTuple):
     """Format specification of the values in CSV; empty: full precision."""
 
 
+def parse_columns(text: str) -> tuple[Column, ...]:
+    """Columns from a list with spaces between: "name", "name:style" or "name:style:label", where underscores of a label become spaces."""
+    parts = (each.split(":") for each in text.split())
+    return tuple(Column(*each[:2], *(label.replace("_", " ") for label in each[2:])) for each in parts)
+
+
 @dataclass(frozen=True)
 class Table:
-    """Table for text, CSV and LaTeX: name of its CSV file, title, columns, rows of values; whether it is printed as text; headers above
-    several columns (`spans`); rows that begin a section.
-    """
+    """Table for text, CSV and LaTeX."""
 
     name: str
     """Name of the CSV file, without suffix."""
