@@ -19,7 +19,7 @@ from synpick_warp.configs.schema import ObjectRow
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = {"synpick_warp", "kernels", "scenes", "configs", "tests", "tools"}
-FILES = {"pyproject.toml", "README.md", "CHANGELOG.md", "LICENSE", "Makefile"}
+FILES = {"pyproject.toml", "README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "Makefile"}
 HIDDEN = (".gitignore", ".pre-commit-config.yaml", ".ci/run", ".github/CONTRIBUTING.md", ".github/workflows/ci.yml")
 LINKS = ("kernels", "scenes", "configs")
 MAX_FILE_LINES = 500
