@@ -1,6 +1,6 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
-configs/README.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
+configs/REFERENCE.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
 tools/README.md and the READMEs of tools/reports/real, sensor and store: the figures in tools/results.
 
     python -m tools.docs          # writes them
@@ -31,28 +31,32 @@ from tools.figures import figures_tables, newest_runs, pivot_table, read_runs
 from tools.options import Row
 
 ROOT = Path(__file__).resolve().parents[1]
-SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
+SETTINGS_REFERENCE = ROOT / "configs" / "REFERENCE.md"
 FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
 VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
 SENSOR = ROOT / "tools" / "reports" / "sensor" / "README.md"
 STORE = ROOT / "tools" / "reports" / "store" / "README.md"
-_SETTINGS_BEGIN = "from the schema in this folder; edit the help texts there. -->\n"
+_SETTINGS_HEAD = """# Reference of the settings
+
+<!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
+
+What they are for: the [guide](README.md).
+"""
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
 def settings_reference() -> str:
-    """The settings reference as Markdown: the prose as committed; links to the sections, and a table of all settings by section."""
-    head, begin, _ = SETTINGS_REFERENCE.read_text(encoding="utf-8").partition(_SETTINGS_BEGIN)
+    """The settings reference as Markdown: links to the sections, and a table of all settings by section."""
     parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
     parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
     lines = ["| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
-    return f"{head}{begin}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
+    return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
 
 
 def _sensors() -> list[str]:

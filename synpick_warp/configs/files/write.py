@@ -61,7 +61,7 @@ def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
 def describe_setting(item: Setting) -> str:
     """Meaning, unit and allowed values of a setting, in sentences."""
     unit = f"[{item.unit}] " if item.unit else ""
-    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.doc)  # Links lead from configs/README.md.
+    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.doc)  # Links lead from configs/REFERENCE.md.
     return f"{meaning} {unit}Allowed: {describe_allowed(item)}."
 
 
