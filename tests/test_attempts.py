@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Measure, Mode, Outcome, Task
-from synpick_warp.configs.dataset.modes import may_pick
+from synpick_warp.configs.dataset.splits import may_pick
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, ROOM, Ticks, World, bits, new_world, play, report, run
 from tests.worlds.small_worlds import settings

@@ -1,4 +1,4 @@
-"""Random numbers: known values, the twin to the bit, and evenness."""
+"""Random numbers on device and host, and low-discrepancy sequences."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Stream
 from synpick_warp.kernels import rng as kernels
+from synpick_warp.system.random_numbers import r2_points, sample_triangles
 from tests.harness.probe import probe
 from tests.twins import rng
 
@@ -143,3 +144,26 @@ def test_rotations_are_uniform(device):
             assert abs(chi_square(np.histogram(component, 40, (-1.0001, 1.0001))[0])) < SIGMA
     angle = 2 * np.arccos(np.minimum(1.0, np.abs(w)))
     assert abs(chi_square(np.histogram((angle - np.sin(angle)) / np.pi, 40, (0.0, 1.0))[0])) < SIGMA
+
+
+def test_first_points_of_r2():
+    """Fractional parts of multiples of the root p of p³ = p + 1: 1 / p = p² - 1 and 1 / p² = p - 1 / p."""
+    plastic = np.roots([1.0, 0.0, -1.0, -1.0])[0].real
+    steps = np.array([plastic**2 - 1.0, plastic - 1.0 / plastic])
+    np.testing.assert_allclose(r2_points(np.arange(3)), np.stack([np.zeros(2), steps, 2.0 * steps - 1.0]), atol=1e-12)
+    np.testing.assert_allclose(r2_points(np.arange(1), start=0.5), [[0.5, 0.5]])
+
+
+def test_each_cell_of_a_grid_gets_about_its_part():
+    cells = (8 * r2_points(np.arange(6400))).astype(int)
+    counts = np.bincount(8 * cells[:, 0] + cells[:, 1], minlength=64)
+    assert abs(counts - 100).max() <= 5
+
+
+def test_triangles_get_points_by_their_area():
+    areas = np.array([1.0, 0.0, 3.0, 6.0])
+    face, weights = sample_triangles(areas, 1000)
+    np.testing.assert_allclose(np.bincount(face, minlength=4), [100, 0, 300, 600], atol=3)
+    assert (weights >= 0.0).all()
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    assert weights[face == 3].mean(axis=0) == pytest.approx([1 / 3] * 3, abs=0.02)

@@ -1,7 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
-configs/REFERENCE.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of picks;
-tools/README.md and the READMEs of tools/reports/real, sensor and store: the figures in tools/results.
+configs/REFERENCE.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of
+picks; tools/README.md and the READMEs of tools/reports/real, sensor and store: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -23,7 +23,7 @@ from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.files.load import sections, table_lists
-from synpick_warp.configs.files.split_tables import SPLITS
+from synpick_warp.configs.files.table_lists import SPLITS
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from synpick_warp.views.picks import COLUMNS, STATES

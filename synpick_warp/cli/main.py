@@ -18,17 +18,15 @@ from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate
 from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
-from synpick_warp.cli.commands.report import write_page
-from synpick_warp.cli.commands.statistics import show_statistics
-from synpick_warp.cli.commands.validate import validate
-from synpick_warp.cli.commands.verify import verify
-from synpick_warp.cli.examples import EXAMPLES
+from synpick_warp.cli.commands.statistics import show_statistics, write_page
+from synpick_warp.cli.commands.validate import validate, verify
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
-from synpick_warp.cli.limits import describe_limit
 from synpick_warp.cli.options import (
+    EXAMPLES,
     EXIT_INCOMPLETE,
     Count,
     WholeNumber,
+    describe_limit,
     describe_misuse,
     one_line,
     parse_devices,

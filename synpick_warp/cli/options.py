@@ -1,9 +1,10 @@
-"""Shared parts of the commands: option parsers, range checks, an exit code, and the formatting of error messages in one line."""
+"""Shared parts of the commands: option parsers, range checks, an exit code, error messages in one line, and examples for `--help`."""
 
 from __future__ import annotations
 
+import errno
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -159,3 +160,69 @@ def parse_shard(text: str) -> tuple[int, int]:
     if match is None:
         raise ConfigError(f"--shard is {format_value(text)}; allowed: i/n with i from 0 to n - 1, such as 0/4")
     return int(match[1]), int(match[2])
+
+
+EXAMPLES = {
+    "bake": (
+        "bake --config smoke --episodes 1 --out DATA",
+        "bake --worlds 512 --mode mixed --models YCB --lights HDRI",
+        "bake --config cell/cell.toml --formats bop,zarr --set 'render.layers=[normals]'",
+        "bake --worlds 512 --dry-run",
+        "bake --devices all --out DATA",
+    ),
+    "merge": ("merge PART0 PART1 --out DATA",),
+    "doctor": ("doctor", "doctor --config cell/cell.toml --memory"),
+    "warmup": ("warmup --mode mixed --models YCB",),
+    "config": ("config --presets", "config --config smoke", "config --config smoke --set move.force=12"),
+    "new-cell": (
+        "new-cell cell --calibration left.yaml --bin 600x400x220mm --part bracket.stl --unit mm",
+        "new-cell cell --bin bin.stl --bin-unit mm",
+    ),
+    "preview": ("preview DATA --out sheet.png", "preview --cell cell/cell.toml --out cell.png"),
+    "explain": ("explain DATA --episode 3", "explain DATA --state 0"),
+    "eval": ("eval DATA --results results.csv",),
+    "estimate": ("estimate DATA --method refine --out results.csv",),
+    "convert": ("convert DATA --to usd,coco --out MORE",),
+    "stats": ("stats DATA", "stats DATA --paper"),
+    "validate": ("validate DATA", "validate REAL --tolerance 5,2"),
+    "verify": ("verify DATA",),
+    "report": ("report DATA",),
+}
+"""Example command lines by name of the command, without the program's name, which `--help` prints below the options."""
+
+
+_REMEDIES = {
+    errno.EMFILE: "raise the limit of open files (ulimit -n)",
+    errno.ENFILE: "close other programs: the system has too many files open",
+    errno.ENOMEM: "free memory, or raise its limit (ulimit -v)",
+    errno.EAGAIN: "close other programs, or raise the limit of processes (ulimit -u)",
+}
+_MEMORY = ("memory", "failed to map segment", "unable to allocate")
+"""Parts of the messages of other libraries that ran out of memory, in lower case."""
+_FILES = "too many open files"
+_NO_THREAD = "can't start new thread"
+
+
+def describe_limit(error: BaseException) -> str | None:
+    """Say which resource an error, or one that it follows from, is about, and what to do; None: it is about none."""
+    for each in _chain(error):
+        text = " ".join(str(each).split())
+        low = text.lower()
+        foreign = isinstance(each, ImportError) or type(each).__module__ == "cv2"
+        if isinstance(each, OSError) and each.errno in _REMEDIES:
+            return f"{text}; {_REMEDIES[each.errno]}"
+        if isinstance(each, RuntimeError) and _NO_THREAD in low:
+            return f"no thread can be started; {_REMEDIES[errno.EAGAIN]}"
+        if isinstance(each, MemoryError) or (foreign and any(part in low for part in _MEMORY)):
+            return f"memory is exhausted{f' ({text})' if text else ''}; {_REMEDIES[errno.ENOMEM]}"
+        if foreign and _FILES in low:
+            return f"{text}; {_REMEDIES[errno.EMFILE]}"
+    return None
+
+
+def _chain(error: BaseException) -> Iterator[BaseException]:
+    """Exception chain: an error, then its causes and contexts."""
+    following: BaseException | None = error
+    while following is not None:
+        yield following
+        following = following.__cause__ or following.__context__

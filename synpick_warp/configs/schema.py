@@ -18,10 +18,8 @@ from synpick_warp.configs.cell.extents import Cell
 from synpick_warp.configs.cell.gripper import Gripper, Suction
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.cell.sensors import DepthSensor, Effects
-from synpick_warp.configs.episodes.fills import COUNTS, Counts, parse_counts
-from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Target
-from synpick_warp.configs.episodes.objects import ObjectRow, Objects
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
+from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX, Color, Fraction, Within, above, setting
 from synpick_warp.views.layers import LAYER_TABLE

@@ -18,9 +18,8 @@ import warp as wp
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.gripper import describe_forces
 from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.dataset.modes import may_pick
-from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.episodes.picks import PICKS
+from synpick_warp.configs.dataset.splits import DataLayout, may_pick
+from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.schema import Config, Render
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog

@@ -27,10 +27,9 @@ from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.factory.compilation import make_compiler
 from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
-from synpick_warp.factory.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
+from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
-from synpick_warp.factory.meter import ThroughputMeter
 from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes

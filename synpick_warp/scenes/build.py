@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from scipy.stats import binom
 
-from synpick_warp.configs.dataset.modes import mode_weights
+from synpick_warp.configs.dataset.splits import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField

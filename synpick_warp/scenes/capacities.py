@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.episodes.fills import Counts
+from synpick_warp.configs.episodes.objects import Counts
 from synpick_warp.configs.schema import Physics
 from synpick_warp.scenes.bins import Bin
 from synpick_warp.scenes.fills import count_entries

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.episodes.fills import Counts
+from synpick_warp.configs.episodes.objects import Counts
 from synpick_warp.configs.schema import LAYERED, Arrangement
 from synpick_warp.errors import ConfigError, format_value, suggest
 from synpick_warp.scenes.types import Catalog

@@ -13,9 +13,9 @@ import warp as wp
 from synpick_warp.codes import Mode
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.dataset.modes import mode_weights
-from synpick_warp.configs.episodes.fills import Counts, most_objects
+from synpick_warp.configs.dataset.splits import mode_weights
 from synpick_warp.configs.episodes.manipulation import ANOTHER
+from synpick_warp.configs.episodes.objects import Counts, most_objects
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build

@@ -18,8 +18,8 @@ import warp as wp
 
 from synpick_warp import __version__
 from synpick_warp.cli.commands import doctor
-from synpick_warp.cli.examples import EXAMPLES
 from synpick_warp.cli.main import app, main
+from synpick_warp.cli.options import EXAMPLES
 from synpick_warp.codes import Ending
 from synpick_warp.configs.files.load import load_config, preset_names
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError

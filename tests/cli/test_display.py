@@ -14,8 +14,8 @@ from rich.console import Console
 from synpick_warp.cli import display
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.factory import meter
-from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory import episodes
+from synpick_warp.factory.episodes import BakeSummary, EpisodeRow, ThroughputMeter
 from synpick_warp.system.progress import Progress, SilentProgress
 
 
@@ -107,10 +107,10 @@ def test_progress_displays(kind):
 def test_the_remaining_time_is_shown_from_the_first_views_on(monkeypatch):
     """While no episode has ended, by its predicted length: 100 of 2 x 3 x 50 views in 5 s."""
     clock = iter((10.0, 15.0))
-    monkeypatch.setattr(meter.time, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(episodes.time, "perf_counter", lambda: next(clock))
     left, summary = [], BakeSummary(2, views=1)
     progress = types.SimpleNamespace(update=lambda **counts: left.append(counts["seconds_left"]))
-    shown = meter.ThroughputMeter(3, 50.0, summary, progress)
+    shown = ThroughputMeter(3, 50.0, summary, progress)
     shown.show(2)
     summary.views = 100
     shown.show(2)

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import pytest
 
-from synpick_warp.configs.dataset.modes import mode_weights
+from synpick_warp.configs.dataset.splits import mode_weights
 from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.dataset.commit.manifest import make_manifest

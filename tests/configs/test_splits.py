@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Stream
-from synpick_warp.configs.dataset.modes import may_pick
-from synpick_warp.configs.dataset.splits import DataLayout, episode_range
+from synpick_warp.configs.dataset.splits import DataLayout, episode_range, may_pick
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Split

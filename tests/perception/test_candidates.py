@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chisquare
 
 from synpick_warp.codes import Share
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.kernels.perception.candidates import POOL
 from synpick_warp.stages.buffers import LayerBuffers
 from synpick_warp.stages.perception.candidates import CandidateSampler

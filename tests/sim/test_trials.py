@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.errors import StateError
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS

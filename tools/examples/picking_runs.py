@@ -10,8 +10,7 @@ import torch  # pyright: ignore[reportMissingImports]
 import warp as wp
 
 from synpick_warp.codes import MAX_INSTANCES, Outcome
-from synpick_warp.configs.episodes.manipulation import Pick, Target
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Pick, Picks, Target
 from synpick_warp.environment.picking import PickingEnvironment, Step
 from synpick_warp.environment.settings import ATTEMPT, DISABLED, PIXEL, POINT, TARGET, TORCH, Choice, make_choice
 from synpick_warp.scenes.cameras import make_cameras

@@ -13,7 +13,7 @@ from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.environment import LUMINANCE
-from synpick_warp.system.low_discrepancy import r2_points
+from synpick_warp.system.random_numbers import r2_points
 
 MAX_EPISODES = 2000
 """Maximum number of episodes whose manifest entry is read; larger data sets are sampled at equal steps."""

@@ -20,7 +20,7 @@ from synpick_warp.scenes.assets.models_info import MAX_INFO
 from synpick_warp.scenes.assets.ply import MAX_HEADER, read_ply_vertices
 from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.system.inputs.json import decode_json
-from synpick_warp.system.low_discrepancy import sample_triangles
+from synpick_warp.system.random_numbers import sample_triangles
 
 _CHUNK = 512
 """Points whose distances to all others are computed at a time."""

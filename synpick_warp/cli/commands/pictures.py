@@ -156,7 +156,7 @@ def draw_cell(
     config = load_settings(preset_or_file)
     from synpick_warp.apps.viz.cell.rendering import CellScene
     from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
-    from synpick_warp.configs.dataset.modes import may_pick
+    from synpick_warp.configs.dataset.splits import may_pick
     from synpick_warp.scenes.cameras import describe_cameras
 
     scene = CellScene(config, progress, say, objects)

@@ -8,8 +8,7 @@ from typing import Any
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.cell.sensors import effect_ranges
-from synpick_warp.configs.dataset.modes import bake_modes
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout, bake_modes
 from synpick_warp.configs.schema import Bake, Bop, Config, Gripper, Physics, Render, Trajectory
 
 

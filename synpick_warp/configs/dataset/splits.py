@@ -1,4 +1,4 @@
-"""Splits of a data set: which episodes each one has, and where its BOP scenes are.
+"""Splits of a data set: which episodes each one has, in which modes (gripper tasks), and where its BOP scenes are.
 
 Episode indices are unique in a data set: each split is a range of them. Random streams are keyed by seed and episode index, so splits
 share none; scene ids follow from episode indices, so a scene id names one scene of the whole data set. Without splits there is one range,
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from synpick_warp.configs.check import to_index
-from synpick_warp.configs.schema import MULTISENSOR, Config, Split
+from synpick_warp.configs.schema import CYCLE, MIXED, MODES, MULTISENSOR, Bake, Config, Split
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 MAX_SHARD_SCENES = 1_000_000
@@ -185,3 +185,26 @@ class DataLayout:
 def split_kind(folder: str) -> str:
     """Name of a BOP split without its type: "train" for the folder "train_pbr"."""
     return folder.partition("_")[0]
+
+
+def mode_weights(bake: Bake, mode: str | None = None) -> dict[str, float]:
+    """Unnormalized probability of each of MODES in a bake of mode `mode` (None: bake.mode); 0: never."""
+    mode = bake.mode if mode is None else mode
+    if mode == MIXED:
+        return dict(zip(MODES, bake.mix, strict=True))
+    return {name: float(mode in (name, CYCLE)) for name in MODES}
+
+
+def bake_modes(bake: Bake, splits: Sequence[Split]) -> tuple[str, ...]:
+    """Modes of the settings, each once: those of the splits, or without splits `bake.mode`."""
+    return tuple(dict.fromkeys(split.mode for split in splits)) or (bake.mode,)
+
+
+def possible_modes(bake: Bake, splits: Sequence[Split]) -> set[str]:
+    """Modes of MODES that episodes of a data set with these settings can have."""
+    return {name for mode in bake_modes(bake, splits) for name, weight in mode_weights(bake, mode).items() if weight > 0.0}
+
+
+def may_pick(bake: Bake, splits: Sequence[Split]) -> bool:
+    """Whether a bake can have episodes in mode pick or target."""
+    return not possible_modes(bake, splits).isdisjoint({"pick", "target"})

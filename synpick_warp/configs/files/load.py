@@ -19,8 +19,7 @@ from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
 from synpick_warp.configs.check import check_value
 from synpick_warp.configs.episodes.objects import MESH
 from synpick_warp.configs.fields import Setting, settings_of
-from synpick_warp.configs.files.split_tables import SPLITS, override_table, read_tables, resolve_splits
-from synpick_warp.configs.files.table_lists import change_rows, given_values, read_rows
+from synpick_warp.configs.files.table_lists import SPLITS, change_rows, given_values, override_table, read_rows, read_tables, resolve_splits
 from synpick_warp.configs.rules.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config, Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest

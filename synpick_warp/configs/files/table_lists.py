@@ -1,4 +1,4 @@
-"""Lists of tables in the settings, such as [[camera]]: each table is a row, a dataclass of settings.
+"""Tables in the settings: lists, such as [[camera]], whose rows are dataclasses of settings, and those of splits, [splits.NAME].
 
 `Config` has a field for each list: `camera: tuple[CameraRow, ...] = ()`. The class of a row may name keys that every table needs
 (`REQUIRED`), keys of no effect beside others (`replaced`), and keys by which a row is told from others (`IDENTITY`); a list with these can
@@ -9,12 +9,15 @@ the setting's type.
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import re
 from collections.abc import Mapping
 from typing import Any
 
 from synpick_warp.configs.check import check_value, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
-from synpick_warp.configs.fields import Setting, settings_of
+from synpick_warp.configs.fields import INT32_MAX, Setting, settings_of
+from synpick_warp.configs.schema import Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 
@@ -80,3 +83,92 @@ def _plain(value: Any) -> Any:
     if is_table(type(value)):
         return given_values(value)
     return value.to_toml() if isinstance(value, Distribution) else value
+
+
+SPLITS = "splits"
+MAX_SPLITS = 64
+"""Most splits of a data set."""
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
+_NEXT = -1
+"""`Split.first` of a split that follows the one before it."""
+
+Tables = dict[str, dict[str, Any]]
+"""Name of a split -> its checked settings."""
+
+
+def read_tables(content: Any, source: str) -> Tables:
+    """Validate the content of `splits`, a table of tables; returns the values of each split.
+
+    Raises:
+        ConfigError: It is something else, a name or a key is wrong, or a value is not allowed.
+    """
+    if not isinstance(content, Mapping) or not content or not all(isinstance(table, Mapping) for table in content.values()):
+        raise ConfigError(f"{SPLITS} is {format_value(content)} {source}; allowed: tables such as [{SPLITS}.train]")
+    if len(content) > MAX_SPLITS:
+        raise ConfigError(f"{SPLITS} has {len(content)} tables {source}; allowed: up to {MAX_SPLITS}")
+    for name in content:
+        if not _NAME.fullmatch(name):
+            raise ConfigError(f"the split {shorten(name)} {source} has no name of up to 32 letters, digits and underscores")
+    return {name: {key: check_setting(name, key, value, source) for key, value in table.items()} for name, table in content.items()}
+
+
+def check_setting(name: str, key: str, value: Any, source: str) -> Any:
+    """Validate one setting of a split; returns its value.
+
+    Raises:
+        ConfigError: There is no such setting, or the value is not allowed.
+    """
+    known = settings_of(Split)
+    if key not in known:
+        keys = f"keys of {SPLITS}.{name}: {', '.join(known)}"
+        raise ConfigError(f"there is no key {SPLITS}.{name}.{shorten(key)}, set {source}; {keys}{suggest(key, list(known))}")
+    return check_value(f"{SPLITS}.{name}.{key}", value, known[key], source)
+
+
+def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:
+    """Tables with one more setting, given as NAME.key.
+
+    Raises:
+        ConfigError: There is no such split or setting, or the value is not allowed.
+    """
+    name, _, key = path.partition(".")
+    if name not in tables:
+        known = f"splits: {', '.join(tables)}" if tables else "the settings have none"
+        raise ConfigError(f"there is no split {shorten(name)}, set {source}; {known}{suggest(name, list(tables))}")
+    return tables | {name: tables[name] | {key: check_setting(name, key, value, source)}}
+
+
+def resolve_splits(tables: Tables, mode: str, color_format: str, source: str) -> tuple[Split, ...]:
+    """Splits with all defaults filled in, sorted by first episode.
+
+    Args:
+        tables: Checked tables, in the order of the file.
+        mode: bake.mode.
+        color_format: bop.color_format.
+        source: Where they come from, for messages.
+
+    Raises:
+        ConfigError: Two splits share an episode or a folder, or indices exceed 32 bits.
+    """
+    splits: list[Split] = []
+    following = 0
+    for name, table in tables.items():
+        split = Split(name, **table)
+        first = following if split.first == _NEXT else split.first
+        following = first + split.episodes
+        if following > INT32_MAX:
+            raise ConfigError(f"{SPLITS}.{name} ends with episode {following - 1} {source}; allowed: less than {INT32_MAX}")
+        suffix = "_pbr" if color_format == "jpg" and not name.endswith("_pbr") else ""
+        splits.append(Split(name, split.episodes, first, split.mode or mode, split.folder or f"{name}{suffix}"))
+    splits.sort(key=lambda split: split.first)
+    for before, after in itertools.pairwise(splits):
+        if after.first < before.first + before.episodes:
+            rule = f"at least {before.first + before.episodes}, after the episodes of {before.name}"
+            raise ConfigError(f"{SPLITS}.{after.name}.first is {after.first} {source}; allowed: {rule}")
+    # Shards go beside each folder, with _web at the end.
+    owners: dict[str, str] = {}
+    for split in splits:
+        for folder in (split.folder, f"{split.folder}_web"):
+            if owners.setdefault(folder, split.name) != split.name:
+                raise ConfigError(f"{SPLITS}.{split.name} would write to {folder}/ {source}, as would {owners[folder]}; set another folder")
+    return tuple(splits)

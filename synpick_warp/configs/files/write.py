@@ -11,8 +11,7 @@ from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import sections, table_lists
-from synpick_warp.configs.files.split_tables import SPLITS
-from synpick_warp.configs.files.table_lists import given_values
+from synpick_warp.configs.files.table_lists import SPLITS, given_values
 from synpick_warp.configs.schema import Config, Split
 
 CAMERAS = "cameras"

@@ -12,11 +12,9 @@ from collections.abc import Iterator, Sequence
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
-from synpick_warp.configs.dataset.modes import bake_modes, may_pick, possible_modes
-from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
-from synpick_warp.configs.episodes.fills import most_objects
-from synpick_warp.configs.episodes.objects import EMBEDDED
-from synpick_warp.configs.episodes.picks import PICKS
+from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout, bake_modes, may_pick, possible_modes
+from synpick_warp.configs.episodes.manipulation import PICKS
+from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.rules.camera_rules import find_camera_conflicts

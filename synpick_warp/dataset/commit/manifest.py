@@ -28,9 +28,8 @@ import msgspec
 from synpick_warp._version import __version__
 from synpick_warp.configs.cell.bins import Bins
 from synpick_warp.configs.cell.gripper import EACH, SUCTION1
-from synpick_warp.configs.episodes.manipulation import MASK, SAME
+from synpick_warp.configs.episodes.manipulation import MASK, SAME, Picks
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, Objects
-from synpick_warp.configs.episodes.picks import Picks
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.files.load import load_config, override_config, table_lists
 from synpick_warp.configs.files.table_lists import given_values

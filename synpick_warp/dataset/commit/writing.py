@@ -21,8 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.modes import may_pick
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout, may_pick
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.kernels.perception import candidates as kernels
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.launch import launch

@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.images.suction_map import score_points_kernel
 from synpick_warp.scenes.types import Catalog, TriangleMesh
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import build_meshes, face_normals
-from synpick_warp.system.low_discrepancy import sample_triangles
+from synpick_warp.system.random_numbers import sample_triangles
 
 SAMPLES = 1024
 """Sample points of an object: random ones would give the fraction a standard error of at most 1.6 %; these are more even."""

@@ -11,8 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.dataset.modes import may_pick
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset.splits import DataLayout, may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.sim import snapshot as pack

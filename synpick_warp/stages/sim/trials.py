@@ -12,8 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Task
-from synpick_warp.configs.episodes.manipulation import Pick
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Pick, Picks
 from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import warp as wp
 
-from synpick_warp.system.hardware.control_groups import list_control_groups, read_text
+from synpick_warp.system.hardware.cores import list_control_groups, read_text
 
 _UNLIMITED = 1 << 60
 """Control groups without a limit report "max", or a number above this [bytes]."""
