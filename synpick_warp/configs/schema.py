@@ -22,6 +22,7 @@ from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, P
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import INT32_MAX, Color, Fraction, Within, above, setting
+from synpick_warp.system.plugins import plugin_names
 from synpick_warp.views.layers import LAYER_TABLE
 
 MODES = ("pick", "target", "move")
@@ -47,8 +48,8 @@ COLUMN, LAYERED, SCATTERED = "column", "layers", "scattered"
 """Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
-FORMATS = ("bop", "shards", "usd", "zarr", "picks", "lerobot", "coco", "yolo")
-"""Output formats."""
+FORMATS = ("bop", "shards", "usd", "zarr", "picks", "lerobot", "coco", "yolo", *plugin_names("formats"))
+"""Output formats: of this package, and of others."""
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,9 @@ How to add a format:
 1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (`staging.py`) stages and commits for it. A format of views is a
    `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a subpackage of `bop/`: follow `bop/yolo/`. A format of ticks
    is a subpackage beside it: follow `usd/exporter.py`. Name the subpackage in the import contract of its folder in pyproject.toml.
-2. Add a row to FORMAT_TABLE.
-3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
-   the name stands there once more; a test compares both.
-4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+2. Add a row to FORMAT_TABLE, and its name to `FORMATS` in configs/schema.py: settings must not import exporters, and a test compares both.
+   In a package of your own, name the row (a `Format`) as an entry point instead: see `system/plugins.py`.
+3. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
 
 Nothing else in the package lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Tests of
 the table, of conversion and of the command line name what they expect, and `tools/compare/guard_steps.py` what it bakes. Imports no
@@ -24,6 +23,7 @@ from typing import Literal, NamedTuple
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Bop
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
+from synpick_warp.system.plugins import load_plugin, plugin_names
 
 Content = Literal["views", "masks", "poses", "gripper"]
 """Content of a stored data set: images with annotations, their masks, poses of a trajectory, states and commands of the gripper."""
@@ -76,7 +76,7 @@ class Format(NamedTuple):
     """
 
     module: str
-    """Module of its exporter, in this package; imported when the format is used."""
+    """Module of its exporter, with a dot in front relative to `synpick_warp.exporters`; imported when the format is used."""
     exporter: str
     """Class in it."""
     constants: str
@@ -156,7 +156,7 @@ def _scenes(layout: DataLayout, episode: int) -> str:
 
 FORMAT_TABLE: dict[str, Format] = {
     "bop": Format(
-        "bop.exporter",
+        ".bop.exporter",
         "BopExporter",
         _SCENE_CONSTANTS,
         _bop,
@@ -164,7 +164,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=739e3,
     ),
     "shards": Format(
-        "bop.shards.exporter",
+        ".bop.shards.exporter",
         "ShardsExporter",
         _SCENE_CONSTANTS,
         _shards,
@@ -172,7 +172,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=739e3,
     ),
     "usd": Format(
-        "usd.exporter",
+        ".usd.exporter",
         "UsdExporter",
         r"usd/assets/(?:[a-z_0-9]+\.usdc|lights/light_[0-9]{3,6}\.exr|textures/[a-z_0-9]+\.png)",
         _usd,
@@ -180,14 +180,14 @@ FORMAT_TABLE: dict[str, Format] = {
         part=PartFiles("usd", ".usdc", 1),
     ),
     "zarr": Format(
-        "trajectory.exporter",
+        ".trajectory.exporter",
         "TrajectoryExporter",
         rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))",
         _zarr,
         frame_bytes=50e3,
     ),
     "picks": Format(
-        "picks",
+        ".picks",
         "PicksExporter",
         r"(?!)",  # None.
         _picks,
@@ -196,7 +196,7 @@ FORMAT_TABLE: dict[str, Format] = {
         remedy="install it by pip install 'synpick-warp[picks]'",
     ),
     "lerobot": Format(
-        "lerobot.exporter",
+        ".lerobot.exporter",
         "LerobotExporter",
         _NOTES,
         _lerobot,
@@ -207,7 +207,7 @@ FORMAT_TABLE: dict[str, Format] = {
         remedy="install it by pip install 'synpick-warp[lerobot]'",
     ),
     "coco": Format(
-        "bop.coco.exporter",
+        ".bop.coco.exporter",
         "CocoExporter",
         rf"coco/categories\.json|{_NOTES}",
         _coco,
@@ -217,7 +217,7 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=480e3,
     ),
     "yolo": Format(
-        "bop.yolo.exporter",
+        ".bop.yolo.exporter",
         "YoloExporter",
         rf"yolo/data\.yaml|{_NOTES}",
         _yolo,
@@ -226,27 +226,32 @@ FORMAT_TABLE: dict[str, Format] = {
         view_bytes=480e3,
     ),
 }
-"""Format -> its row."""
+"""Format of this package -> its row."""
+
+
+def format_table() -> dict[str, Format]:
+    """Rows of all formats: of this package, then of others (see `system/plugins.py`)."""
+    return FORMAT_TABLE | {name: load_plugin("formats", name) for name in plugin_names("formats")}
 
 
 def indexed_files(names: Collection[str]) -> re.Pattern[str]:
     """Regular expression of the files that these formats read to write indices over all episodes."""
-    return re.compile("|".join(f"(?:{row.indexed})" for name, row in FORMAT_TABLE.items() if name in names) or r"(?!)")
+    return re.compile("|".join(f"(?:{row.indexed})" for name, row in format_table().items() if name in names) or r"(?!)")
 
 
 def convertible() -> tuple[str, ...]:
     """Names of the formats that `convert` writes."""
-    return tuple(name for name, row in FORMAT_TABLE.items() if row.sources is not None)
+    return tuple(name for name, row in format_table().items() if row.sources is not None)
 
 
 def part_files(cameras: int | None) -> list[PartFiles]:
     """Part files of all formats that have them; `cameras`: their number, None: unknown, and formats with a file per scene are left out."""
-    parts = [row.part for row in FORMAT_TABLE.values() if row.part is not None]
+    parts = [row.part for row in format_table().values() if row.part is not None]
     whole = [part for part in parts if not part.per_scene]
     return whole if cameras is None else whole + [part._replace(cameras=cameras) for part in parts if part.per_scene]
 
 
 def contents_of(name: str, bop: Bop) -> tuple[Content, ...]:
     """Content that a stored data set with these settings must have for `convert` to make a format of it."""
-    sources = FORMAT_TABLE[name].sources
+    sources = format_table()[name].sources
     return () if sources is None else sources(bop)

@@ -16,7 +16,7 @@ from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.exporters.formats import FORMAT_TABLE, Content, contents_of, convertible
+from synpick_warp.exporters.formats import Content, contents_of, convertible, format_table
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
@@ -127,7 +127,7 @@ def check_formats(names: Sequence[str], layout: str, present: Collection[str], f
         raise ConfigError(f'{folder} has bop.layout = "{layout}", which convert does not read; bake the other formats')
     for name in names:
         if name not in convertible():
-            why = f"; no other format has the physics of {name}" if name in FORMAT_TABLE else ""
+            why = f"; no other format has the physics of {name}" if name in format_table() else ""
             raise ConfigError(f"--to names {name}; allowed: {', '.join(convertible())}{why}")
         if name in present:
             raise ConfigError(f"--to names {name}, which {folder} has already; copy the folder")

@@ -11,11 +11,12 @@ from typing import Annotated
 from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import INT32_MAX, Color, Conflict, Fraction, Within, above, setting
+from synpick_warp.system.plugins import plugin_names
 
 SUCTION1 = "suction1"
 SUCTION_ARRAY = "suction_array"
-GRIPPERS = (SUCTION1, SUCTION_ARRAY)
-"""Kinds of gripper."""
+GRIPPERS = (SUCTION1, SUCTION_ARRAY, *plugin_names("grippers"))
+"""Kinds of gripper: of this package, and of others."""
 EACH = "each"
 COMMON = "common"
 MIN_RAYS = 48
@@ -167,13 +168,14 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[
         yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
     if suction.poor_force > suction.good_force:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
-    if gripper.kind != SUCTION_ARRAY:
+    if gripper.kind == SUCTION1:
         if gripper.cups:
             yield "gripper.cups", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
         if gripper.valve != EACH:
             yield "gripper.valve", f'{EACH} with gripper.kind "{gripper.kind}", which has one; set gripper.kind = "{SUCTION_ARRAY}"'
         if gripper.mesh:
             yield "gripper.mesh", f'none with gripper.kind "{gripper.kind}"; set gripper.kind = "{SUCTION_ARRAY}"'
+    if gripper.kind != SUCTION_ARRAY:
         return
     if not 1 <= len(gripper.cups) <= MAX_CUPS:
         yield "gripper.cups", f"1 to {MAX_CUPS} places [x, y] with gripper.kind {SUCTION_ARRAY}, such as [[-0.03, 0.0], [0.03, 0.0]]"

@@ -15,13 +15,13 @@ from pathlib import Path
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.formats import FORMAT_TABLE
+from synpick_warp.exporters.formats import format_table
 
 
 @functools.lru_cache(maxsize=4)
 def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
     """Regular expression of the file names that the formats write in an entry: of an episode, or the constants."""
-    formats = [FORMAT_TABLE[name] for name in dict.fromkeys(layout.formats)]
+    formats = [format_table()[name] for name in dict.fromkeys(layout.formats)]
     names = (row.constants if entry == CONSTANTS else row.episode(layout, int(entry.name)) for row in formats)
     return re.compile("|".join(dict.fromkeys(names)))
 
@@ -59,7 +59,7 @@ def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -
     """
     strays = []
     known = set(episodes)
-    for name, row in FORMAT_TABLE.items():
+    for name, row in format_table().items():
         part = row.part
         if part is not None and part.joined and name in layout.formats and (folder / part.folder).is_dir():
             count = layout.cameras if part.per_scene else 1

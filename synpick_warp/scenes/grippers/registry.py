@@ -10,14 +10,16 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.grippers import suction1, suction_array
 from synpick_warp.scenes.grippers.head import Head
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.system.plugins import load_plugin
 
 HEADS: Mapping[str, Callable[[Gripper], Head]] = {SUCTION1: suction1.make_head, SUCTION_ARRAY: suction_array.make_head}
-"""Builder of the head, by `gripper.kind`."""
+"""Builder of the head, by `gripper.kind`; other kinds are plug-ins (`system/plugins.py`)."""
 
 
 def make_head(gripper: Gripper) -> Head:
     """Build the head of the gripper that the settings name."""
-    return HEADS[gripper.kind](gripper)
+    build = HEADS.get(gripper.kind) or load_plugin("grippers", gripper.kind).make_head
+    return build(gripper)
 
 
 def check_reach(gripper: Gripper, suction: Suction, catalog: Catalog) -> None:

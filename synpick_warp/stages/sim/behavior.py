@@ -19,6 +19,7 @@ from synpick_warp.stages.sim.gripper import TWO_SPEEDS, SetpointLaw
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+from synpick_warp.system.plugins import load_plugin
 
 
 class Hold(Protocol):
@@ -52,3 +53,8 @@ BEHAVIORS: Mapping[str, Behavior] = {
     SUCTION_ARRAY: Behavior(ArrayHold, choose_grasps=GraspPlanner.align_cups),
 }
 """Behaviour, by `gripper.kind`."""
+
+
+def behavior_of(kind: str) -> Behavior:
+    """Behaviour of a kind of gripper, of this package or of a plug-in (`system/plugins.py`)."""
+    return BEHAVIORS.get(kind) or load_plugin("grippers", kind).BEHAVIOR

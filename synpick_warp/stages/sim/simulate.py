@@ -26,7 +26,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
-from synpick_warp.stages.sim.behavior import BEHAVIORS, Hold
+from synpick_warp.stages.sim.behavior import Hold, behavior_of
 from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.sleep import Sleep
 from synpick_warp.stages.sim.states import State, WorldStates, cell_checksum, checksum, copy_fresh
@@ -108,7 +108,7 @@ class Simulation:
         self.record = replace(record, physics=self.recorder and self.recorder.record)
         self.sleep = Sleep(self.scene, self.physics) if config.physics.sleep > 0.0 else None
         self._fresh = copy_fresh(self._groups, self.physics)
-        self.behavior = BEHAVIORS[config.gripper.kind]
+        self.behavior = behavior_of(config.gripper.kind)
         self.after_tick: Callable[[], None] | None = None
         """Launches kernels at the end of a tick, after perception."""
         self._is_between_ticks = False

@@ -10,9 +10,18 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.view import ViewSettings
+from synpick_warp.exporters.formats import Format
 from synpick_warp.exporters.writing.folder import open_folder
 
 FOLDER = Path("boxes")
+
+
+def episode_files(layout: DataLayout, episode: int) -> str:
+    scenes = "|".join(f"{layout.cameras * episode + camera:06d}" for camera in range(layout.cameras))
+    return rf"boxes/(?:{scenes})/.*"
+
+
+FORMAT = Format("synpick_extras.boxes", "BoxesExporter", "", episode_files, sources=lambda _: ("views", "masks"))
 
 
 def write_view(view: EncodedView, scene: Path, _: ViewSettings) -> None:

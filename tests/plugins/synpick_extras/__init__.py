@@ -1,0 +1,1 @@
+"""A package of others: a format and a gripper for synpick-warp."""
