@@ -118,10 +118,10 @@ def bake(
         devices = tuple(name.strip() for name in devices.split(","))
     out = parse_place(out)
     if isinstance(out, str):
-        from synpick_warp.cloud.start import Crew, Job, start_bake
+        from synpick_warp.cloud.workers import Job, start_bake
 
-        crew = Crew(engine, workers) if engine else None
-        return start_bake(Job(config, out), progress or SilentProgress(), shard, splits, devices, claim=claim, crew=crew)
+        given = {"claim": claim, "engine": engine, "workers": workers}
+        return start_bake(Job(config, out), progress or SilentProgress(), shard, splits, devices, **given)
     if claim or engine:
         raise ConfigError("claiming workers share out the episodes of a prefix in an object store; name one as the place of the data set")
     return run_bake(config, out, progress if progress is not None else SilentProgress(), shard, splits, devices)

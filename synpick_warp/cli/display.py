@@ -37,16 +37,15 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
 
 
-def make_progress(console: Console, remark: object = "") -> Progress:
-    """Choose the display: live on a terminal, plain lines elsewhere. `remark`: its text, at any time, ends the line of counts."""
-    return LiveProgress(console, remark) if console.is_terminal else PlainProgress(console, remark)
+def make_progress(console: Console) -> Progress:
+    """Choose the display: live on a terminal, plain lines elsewhere."""
+    return LiveProgress(console) if console.is_terminal else PlainProgress(console)
 
 
 class LiveProgress:
     """Live progress bar: stage, episodes, worlds, views, rate, remaining time."""
 
-    def __init__(self, console: Console, remark: object = "") -> None:
-        self._remark = remark
+    def __init__(self, console: Console) -> None:
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
         columns = (stage, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
         self._bar = Bar(*columns, console=console, transient=True)
@@ -67,7 +66,7 @@ class LiveProgress:
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
         """Set the bar to the episodes done, with worlds, views and time left [s] beside it; it is named so from the first view on."""
-        detail = _detail(worlds_active, views, views_per_s, seconds_left, self._remark)
+        detail = _detail(worlds_active, views, views_per_s, seconds_left)
         name = "episodes" if views or episodes_done else None
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail, description=name)
 
@@ -79,8 +78,8 @@ class LiveProgress:
 class PlainProgress:
     """Plain progress lines: one per stage and note, and rate-limited ones for counts, also for those of a stage ("name: 3 of 9")."""
 
-    def __init__(self, console: Console, remark: object = "") -> None:
-        self._console, self._remark = console, remark
+    def __init__(self, console: Console) -> None:
+        self._console = console
         self._started = time.monotonic()
         self._printed_at = float("-inf")
         self._counted_at: dict[str, float] = {}
@@ -107,7 +106,7 @@ class PlainProgress:
         now = time.monotonic()
         if now - self._printed_at >= PLAIN_INTERVAL:
             self._printed_at = now
-            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left, self._remark)}")
+            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
 
     def note(self, text: str) -> None:
         """Print a line with the time since the start."""
@@ -254,11 +253,10 @@ def _words(code: Ending | Outcome) -> str:
     return code.name.lower().replace("_", " ")
 
 
-def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None, remark: object) -> str:
-    """Worlds, views, rate, remaining time and a remark in one line."""
+def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
+    """Worlds, views, rate and remaining time in one line."""
     left = "" if seconds_left is None else f" · {format_duration(seconds_left)} left"
-    more = f" · {said}" if (said := str(remark)) else ""
-    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}{more}"
+    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}"
 
 
 def format_duration(seconds: float) -> str:

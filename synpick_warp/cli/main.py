@@ -26,11 +26,11 @@ from synpick_warp.cli.options import (
     EXIT_INCOMPLETE,
     Count,
     WholeNumber,
+    check_engine_options,
     describe_limit,
     describe_misuse,
     one_line,
     parse_devices,
-    parse_engine,
     parse_resolution,
     parse_shard,
     parse_splits,
@@ -56,7 +56,6 @@ from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt, raising_sigterm
 
 if TYPE_CHECKING:
-    from synpick_warp.cloud.crew import Crew
     from synpick_warp.factory.episodes import BakeSummary
 
 NAME = "synpick-warp"
@@ -137,9 +136,6 @@ EngineOption = Annotated[
     ),
 ]
 WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
-PriceOption = Annotated[
-    float, Parameter(help="Price an hour of a worker of --engine or --claim --devices: the progress shows the cost so far.")
-]
 DryRunOption = Annotated[bool, Parameter(negative=(), help="Bake nothing: print the expected views, size on disk, memory and time.")]
 SplitOption = Annotated[
     str | None,
@@ -168,7 +164,6 @@ def bake(
     claim: ClaimOption = False,
     engine: EngineOption = None,
     workers: WorkersOption = 0,
-    price: PriceOption = 0.0,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -201,11 +196,11 @@ def bake(
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    crew = parse_engine(engine, workers, price, out, devices or shard, claim)
+    check_engine_options(engine, workers, out, devices or shard)
     if dry_run:
         return _forecast(resolved, out, part, names)
     out = out or _default_out()
-    run = partial(_bake, resolved, out, part, names, several, claim, crew)
+    run = partial(_bake, resolved, out, part, names, several, claim, engine or "", workers)
     return _profiled(run, profile_out, out) if profiles else run()
 
 
@@ -437,9 +432,10 @@ def _bake(
     splits: Sequence[str],
     devices: Sequence[str],
     claim: bool,
-    crew: Crew | None,
+    engine: str,
+    workers: int,
 ) -> int:
-    """Check device and folders, which is cheap, then bake: in this process and its children, or by a crew of workers."""
+    """Check device and folders, which is cheap, then bake: in this process and its children, or by the workers of an engine."""
     with collection_paused():
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
@@ -447,7 +443,7 @@ def _bake(
 
     if devices:
         pick_devices(devices)
-    elif crew is None:
+    elif not engine:
         pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
     url = store_url(out)
@@ -460,16 +456,16 @@ def _bake(
 
             bake = partial(run_bake, config, out)
         else:
-            from synpick_warp.cloud.start import Job, start_bake
+            from synpick_warp.cloud.workers import Job, start_bake
 
-            bake = partial(start_bake, Job(config, url), claim=claim, crew=crew)
+            bake = partial(start_bake, Job(config, url), claim=claim, engine=engine, workers=workers)
 
     console = make_console()
-    with make_progress(console, crew or "") as progress:
+    with make_progress(console) as progress:
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
     if summary.stopped:
-        kind = "claimed episodes" if (claim or crew) and not devices else "episodes"
+        kind = "claimed episodes" if (claim or engine) and not devices else "episodes"
         done = f"{len(summary.episodes)} of {summary.total} {kind} are complete"
         rest = "completes the data set" if len(summary.episodes) == summary.total else "resumes with the others"
         print(f"{NAME}: interrupted: {done}; the same command {rest}", file=sys.stderr)

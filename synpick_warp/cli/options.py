@@ -6,15 +6,12 @@ import errno
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import CycloptsError, MissingArgumentError, Parameter, Token, UnusedCliTokensError
 
 from synpick_warp.errors import ConfigError, escape, format_value
-from synpick_warp.system.inputs.urls import store_url
-
-if TYPE_CHECKING:
-    from synpick_warp.cloud.crew import Crew
+from synpick_warp.system.inputs.urls import check_engine, store_url
 
 EXIT_INCOMPLETE = 1
 """Exit code if a data set is incomplete or damaged."""
@@ -22,8 +19,8 @@ MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
 MAX_THREADS = 1024
 """Upper bound of options such as --threads, in processes or threads."""
-MAX_CREW, MAX_PRICE = 100_000, 1e6
-"""Upper bounds of --workers and --price."""
+MAX_WORKERS = 100_000
+"""Upper bound of --workers."""
 MAX_LINE = 2000
 """Longest message [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
@@ -124,30 +121,23 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
     return tuple(name.strip() for name in devices.split(","))
 
 
-def parse_engine(engine: str | None, workers: int, price: float, out: Path | None, beside: str | None, claims: bool = False) -> Crew | None:
-    """Parse --engine, --workers and --price; None: none is named. `beside`: value of an option that an engine excludes; `claims`: --claim
-    is given, whose workers on --devices have a price, too.
+def check_engine_options(engine: str | None, workers: int, out: Path | None, beside: str | None) -> None:
+    """Check --engine and --workers. `beside`: value of an option that an engine excludes.
 
     Raises:
         ConfigError: An option is out of range, or does not go with the others.
         DeviceError: There is no such engine.
     """
-    if engine is None and (workers or (price and not (claims and beside))):
-        raise ConfigError("--workers and --price go with --engine; name one, such as ray. --price also goes with --claim --devices")
-    if engine is None and not price:
-        return None
-    check_range("--workers", workers, 0, MAX_CREW)
-    check_range("--price", price, 0.0, MAX_PRICE)
-    from synpick_warp.cloud.crew import Crew
-
-    crew = Crew(engine or "", workers, price)
     if engine is None:
-        return crew
+        if workers:
+            raise ConfigError("--workers goes with --engine; name one, such as ray")
+        return
+    check_range("--workers", workers, 0, MAX_WORKERS)
+    check_engine(engine)
     if store_url(out) is None:
         raise ConfigError("--engine has workers claim episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
     if beside is not None:
         raise ConfigError("--engine has workers claim episodes; drop --devices and --shard")
-    return crew
 
 
 def parse_shard(text: str) -> tuple[int, int]:

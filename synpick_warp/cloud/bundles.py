@@ -1,4 +1,4 @@
-"""Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode, and their concatenation per block.
+"""Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode.
 
 What an episode adds to lists of lines is made by its worker: the last worker only appends it to the parts of the lists, below LINES.
 """
@@ -12,9 +12,8 @@ import re
 import struct
 import tarfile
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import BinaryIO
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums, read_entry
@@ -30,8 +29,7 @@ MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""
 _LINES = re.compile(rf"{re.escape(LINES)}(?:/[^./][^/]*)+")
 """Names of lines in an index file: inside of LINES, which only `unpack_bundle` fills."""
-_LENGTH = struct.Struct("<Q")
-"""In a block: length prefix of each index file [B]."""
+_ADVICE = "delete it and its episode's done mark, manifest/NUMBER.json, and resume the bake without --claim"
 
 
 def make_bundle(folder: Path, episode: int, settings: ExportSettings, kinds: Sequence[type[Exporter]]) -> bytes:
@@ -84,13 +82,12 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
         stream = zlib.decompressobj(31)
         plain = stream.decompress(data, MAX_BUNDLE)
         if not stream.eof:
-            raise DatasetError(f"{source} is damaged: it is cut off or too large; delete it and its block's mark, and resume the bake")
+            raise DatasetError(f"{source} is damaged: it is cut off or too large; {_ADVICE}")
         with tarfile.open(fileobj=io.BytesIO(plain), mode="r:") as archive:
             for info in archive:
                 is_lines, content = _LINES.fullmatch(info.name), archive.extractfile(info)
                 if content is None or not (is_lines or indexed.fullmatch(info.name)):
-                    advice = "delete it and its block's mark, and resume the bake"
-                    raise DatasetError(f"{source} is damaged: it has {info.name[:80]!r}; {advice}")
+                    raise DatasetError(f"{source} is damaged: it has {info.name[:80]!r}; {_ADVICE}")
                 path = folder / info.name if is_lines else path_inside(folder, info.name, source, DatasetError)
                 if not os.path.exists(path):
                     path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,34 +96,4 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
     except OSError as error:
         raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     except (zlib.error, tarfile.TarError, struct.error, OverflowError, ValueError, RecursionError) as error:
-        raise DatasetError(f"{source} is damaged: {error}; delete it and its block's mark, and resume the bake") from None
-
-
-def join_bundles(bundles: Iterable[bytes], target: BinaryIO) -> None:
-    """Concatenate the index files of a block's episodes, each with a length prefix."""
-    for data in bundles:
-        target.write(_LENGTH.pack(len(data)))
-        target.write(data)
-
-
-def split_bundles(blocks: Iterable[bytes], episodes: Sequence[int], source: str) -> Iterator[tuple[int, bytes]]:
-    """Split a block's content into index files, lazily, each after its episode.
-
-    Args:
-        blocks: The content, in pieces of any size.
-        episodes: Episodes whose index files it must have, in this order.
-        source: Its object, for messages.
-
-    Raises:
-        DatasetError: It is truncated, or has another number.
-    """
-    held, count = bytearray(), 0
-    for block in blocks:
-        held += block
-        while len(held) >= _LENGTH.size and len(held) >= (end := _LENGTH.size + _LENGTH.unpack_from(held)[0]):
-            if count < len(episodes):
-                yield episodes[count], bytes(held[_LENGTH.size : end])
-            count += 1
-            del held[:end]
-    if held or count != len(episodes):
-        raise DatasetError(f"{source} is damaged: it is cut off, or has another number of episodes; delete it, and resume the bake")
+        raise DatasetError(f"{source} is damaged: {error}; {_ADVICE}") from None

@@ -313,8 +313,7 @@ class Chunks:
         for each in self._ranges:
             wanted += each[max(0, start) : max(0, end)]
             start, end = start - len(each), end - len(each)
-        blocks = self._ledger.blocks_of(wanted)
-        return sorted(set(wanted).difference(*(self._ledger.done(block) for block in blocks)))
+        return list(itertools.chain.from_iterable(self._ledger.remaining([sorted(wanted)])))
 
 
 def open_claims(ledger: Ledger, lease: float) -> Claims:

@@ -24,6 +24,7 @@ from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, commi
 from synpick_warp.errors import OutputError, StoreError, SynpickError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.base import TransientError, persist
@@ -221,11 +222,12 @@ def _describe(error: BaseException) -> BaseException:
 
 
 class WatchedProgress(ForwardingProgress):
-    """Decorator of a progress observer that raises the errors of an upload into the bake, which so ends early, and applies backpressure."""
+    """Decorator of a progress observer that raises the errors of an upload into the bake, which so ends early, and applies backpressure. It
+    adds the counts of earlier bakes."""
 
-    def __init__(self, progress: Progress, check: Callable[[], None]) -> None:
+    def __init__(self, progress: Progress, check: Callable[[], None], ended: BakeSummary) -> None:
         super().__init__(progress)
-        self._check = check
+        self._check, self._ended = check, ended
 
     def stage(self, text: str) -> None:
         """See `Progress`."""
@@ -235,4 +237,5 @@ class WatchedProgress(ForwardingProgress):
     def update(self, **counts: Any) -> None:
         """See `Progress`."""
         self._check()
-        super().update(**counts)
+        before = {"episodes_done": len(self._ended.episodes), "episodes": self._ended.total, "views": self._ended.views}
+        super().update(**counts | {name: count + counts[name] for name, count in before.items()})

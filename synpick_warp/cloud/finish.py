@@ -1,16 +1,16 @@
-"""Finalization of a data set in a store: batched marks of complete blocks, then the indices over all episodes, made in a local folder."""
+"""Finalization of a data set in a store: the indices over all episodes, made in a local folder from the episodes' index files."""
 
 from __future__ import annotations
 
 import contextlib
 import heapq
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from synpick_warp.cloud.bundles import MAX_BUNDLE, join_bundles, split_bundles, unpack_bundle
+from synpick_warp.cloud.bundles import MAX_BUNDLE, unpack_bundle
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, send_file
-from synpick_warp.cloud.ledger import BLOCK, DONE, FINISHED, FINISHING, INDEX, MARK_SPANS, Ledger, merge_spans, spell_spans
+from synpick_warp.cloud.ledger import FINISHED, FINISHING, INDEX, Ledger
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import (
@@ -33,36 +33,8 @@ from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.stores.store import SMALL
 
-
-def close_blocks(ledger: Ledger, folder: Path, only: Sequence[int] | None = None) -> int:
-    """Compact complete blocks: writes batched marks of each block whose episodes all have done marks, of those that are in none.
-
-    Args:
-        ledger: Ledger of the data set.
-        folder: Folder for a temporary file of a block.
-        only: Blocks to look at; None: all.
-
-    Returns:
-        Number of planned episodes without done mark, in these blocks.
-
-    Raises:
-        OutputError: The temporary folder cannot be written.
-        StoreError: An index file was deleted.
-    """
-    missing = 0
-    with _clear_errors(ledger, folder):
-        for block, unmarked in ledger.open_blocks(only):
-            if left := len(set(unmarked) - ledger.done(block)):
-                missing += left
-                continue
-            path, spans = folder / "block", merge_spans(range(episode, episode + 1) for episode in unmarked)
-            for start in range(0, len(spans), MARK_SPANS):
-                marked = spans[start : start + MARK_SPANS]
-                names = [f"{INDEX}/{episode:06d}.tar.gz" for span in marked for episode in span]
-                with path.open("wb") as file, ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:
-                    join_bundles(pool.map(lambda name: ledger.store.get(name, MAX_BUNDLE), names), file)
-                ledger.store.put_file(f"{DONE}/{block:06d}_{spell_spans(marked)}", path)
-    return missing
+AHEAD = 256
+"""Index files that are requested together, and then unpacked in the order of their episodes."""
 
 
 @contextlib.contextmanager
@@ -89,13 +61,13 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
         Number of episodes that are not done; 0: the data set is finished.
 
     Raises:
-        DatasetError: A batched mark is damaged.
+        DatasetError: An index file is damaged.
         OutputError: The temporary folder cannot be written.
         StoreError: An object was deleted that the indices are made of, another plan was finalized at once, or the store does not answer.
     """
     if ledger.finished():
         return 0
-    if missing := close_blocks(ledger, folder):
+    if missing := sum(map(len, ledger.remaining(ledger.layout.plan()))):
         return missing
     work = folder / "set"
     with _clear_errors(ledger, folder):
@@ -113,7 +85,7 @@ def _put_indices(ledger: Ledger, work: Path) -> None:
     Raises:
         StoreError: Another plan was finalized at once.
     """
-    store, plan = ledger.store, spell_spans(ledger.plan).encode()
+    store, plan = ledger.store, ledger.plan
     store.put(FINISHING, plan)
     for name, digest in read_checksums(work, INDICES).items():
         send_file(store, work / name, name, digest)
@@ -140,35 +112,10 @@ def _gather(ledger: Ledger, work: Path) -> list[int]:
     for name in filter(indexed.fullmatch, constants):
         (work / name).parent.mkdir(parents=True, exist_ok=True)
         (work / name).write_bytes(store.get(name, MAX_JSON))
-    episodes: list[int] = []
-    for episode, source, bundle in _bundles(ledger):
-        episodes.append(episode)
-        unpack_bundle(bundle, work, indexed, source)
+    episodes = list(heapq.merge(*layout.plan()))
+    with ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:
+        for first in range(0, len(episodes), AHEAD):
+            names = [f"{INDEX}/{episode:06d}.tar.gz" for episode in episodes[first : first + AHEAD]]
+            for name, bundle in zip(names, pool.map(lambda name: store.get(name, MAX_BUNDLE), names), strict=True):
+                unpack_bundle(bundle, work, indexed, f"{store.url}/{name}")
     return episodes
-
-
-def _bundles(ledger: Ledger) -> Iterator[tuple[int, str, bytes]]:
-    """Yield (episode, URL of its batched mark, index file) of all planned episodes, sorted by episode.
-
-    Raises:
-        StoreError: A planned episode is in no batched mark.
-    """
-    marks = ledger.marks()
-    for block in ledger.blocks():
-        wanted = set(ledger.planned(block))
-        found = [_read_mark(ledger, key, spans) for key, spans in marks.get(block, {}).items() if not all(map(wanted.isdisjoint, spans))]
-        for episode, source, bundle in heapq.merge(*found, key=lambda each: each[0]):
-            if episode in wanted:
-                wanted.remove(episode)
-                yield episode, source, bundle
-        if wanted:
-            raise StoreError(f"{ledger.store.url} has no batched mark of episode {min(wanted)}; the same command resumes")
-
-
-def _read_mark(ledger: Ledger, key: str, spans: Sequence[range]) -> Iterator[tuple[int, str, bytes]]:
-    """Lazily yield the items of `_bundles` for the episodes of one batched mark, sorted by episode."""
-    source = f"{ledger.store.url}/{key}"
-    for episode, bundle in split_bundles(
-        ledger.store.blocks(key, BLOCK * MAX_BUNDLE), [episode for span in spans for episode in span], source
-    ):
-        yield episode, source, bundle

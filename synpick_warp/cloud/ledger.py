@@ -1,10 +1,12 @@
-"""Commit log of a data set in a store: which episodes are committed, by done marks and batched marks. See README.md."""
+"""Commit log of a data set in a store: which episodes are committed, by their done marks. See README.md."""
 
 from __future__ import annotations
 
 import contextlib
+import heapq
+import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -26,39 +28,12 @@ from synpick_warp.system.stores.opening import CONTROL, Probe, open_store
 from synpick_warp.system.stores.store import SMALL, Store
 
 BLOCK = 1000
-"""Indices that a block, and so a batched mark, spans: as many as a page of a listing has keys."""
-MARK_SPANS = 8
-"""Most ranges of episodes that a batched mark has: its name fits into the 255 characters of a file system."""
-DONE, INDEX = f"{CONTROL}/done", f"{CONTROL}/index"
+"""Episodes whose done marks are listed at a time, from the first key to the last: within a block all numbers have as many digits."""
+INDEX = f"{CONTROL}/index"
 FINISHING, FINISHED = f"{CONTROL}/finishing", f"{CONTROL}/finished"
-_SPAN = "[0-9]{6,12}-[0-9]{6,12}"
-_MARK = re.compile(rf"{re.escape(DONE)}/([0-9]{{6,9}})_({_SPAN}(?:_{_SPAN})*)")
-_SPANS = re.compile(rf"{_SPAN}(?:_{_SPAN})*")
 ENTRY = re.compile(rf"{ENTRIES}/([0-9]{{6}}|[1-9][0-9]{{6,11}})\.json")
 """Keys of done marks."""
 _ADVICE = "resume with the same, or name another prefix with --out"
-
-
-def merge_spans(ranges: Iterable[range]) -> list[range]:
-    """Union of ranges of step 1: disjoint and ascending, none empty, none adjacent to the next."""
-    merged: list[range] = []
-    for each in sorted(filter(None, ranges), key=lambda span: span.start):
-        if merged and each.start <= merged[-1].stop:
-            merged[-1] = range(merged[-1].start, max(merged[-1].stop, each.stop))
-        else:
-            merged.append(each)
-    return merged
-
-
-def spell_spans(spans: Iterable[range]) -> str:
-    """Text of ranges of episodes by their first and last: "000000-000499_000600-000999"."""
-    return "_".join(f"{span.start:06d}-{span.stop - 1:06d}" for span in spans)
-
-
-def _parse_spans(text: str) -> list[range]:
-    """Inverse of `spell_spans`."""
-    pairs = (each.split("-") for each in text.split("_"))
-    return [range(int(first), int(last) + 1) for first, last in pairs]
 
 
 class Ledger:
@@ -111,43 +86,6 @@ class Ledger:
                 if open_store(outer).stat(MANIFEST_FILE) is not None:
                     raise OutputError(f"--out is {self.store.url}, in the data set {outer}; name a prefix outside of it")
 
-    # ---- blocks ----
-
-    def planned(self, block: int, ranges: Sequence[range] | None = None) -> list[int]:
-        """Planned episodes of a block, sorted; of `ranges` only, if given."""
-        found: set[int] = set()
-        for each in self.layout.plan() if ranges is None else ranges:
-            first = max(0, -(-(block * BLOCK - each.start) // each.step))
-            end = max(first, -(-((block + 1) * BLOCK - each.start) // each.step))
-            found.update(each[first:end])
-        return sorted(found)
-
-    def blocks(self) -> Iterator[int]:
-        """Yield the blocks that have planned episodes, ascending."""
-        last = -1
-        for each in self.layout.plan():
-            for block in range(each.start // BLOCK, (each.stop - 1) // BLOCK + 1) if each else ():
-                if block > last:
-                    last = block
-                    yield block
-
-    def open_blocks(self, only: Iterable[int] | None = None) -> Iterator[tuple[int, list[int]]]:
-        """Yield the blocks (None: out of all) that have planned episodes in none of their batched marks, with these episodes, sorted."""
-        marks = self.marks()
-        for block in self.blocks() if only is None else only:
-            if left := sorted(set(self.planned(block)).difference(*(span for spans in marks.get(block, {}).values() for span in spans))):
-                yield block, left
-
-    def marks(self) -> Mapping[int, Mapping[str, list[range]]]:
-        """List the batched marks: block -> key -> ranges of episodes. Empty ones, of an interrupted write, do not count."""
-        found: dict[int, dict[str, list[range]]] = {}
-        for key, size in self.store.list(DONE):
-            if size and (match := _MARK.fullmatch(key)):
-                block, spans = int(match[1]), _parse_spans(match[2])
-                if all(block * BLOCK <= span.start < span.stop <= (block + 1) * BLOCK for span in spans):
-                    found.setdefault(block, {})[key] = spans
-        return found
-
     def done(self, block: int) -> set[int]:
         """List the episodes of a block that have a done mark. Empty marks, of an interrupted write, do not count."""
         first, end, found = block * BLOCK, (block + 1) * BLOCK, set()
@@ -159,15 +97,10 @@ class Ledger:
                 found.add(int(match[1]))
         return found
 
-    def blocks_of(self, episodes: Iterable[int]) -> list[int]:
-        """Blocks that contain these episodes, sorted."""
-        return sorted({episode // BLOCK for episode in episodes})
-
-    def remaining(self, ranges: Sequence[range]) -> Iterator[list[int]]:
-        """Yield the episodes of these ranges that have no done mark, one sorted list per block, without empty lists."""
-        for block, unmarked in self.open_blocks():
-            wanted = set(unmarked).intersection(self.planned(block, ranges))
-            if wanted and (left := sorted(wanted - self.done(block))):
+    def remaining(self, ranges: Iterable[Sequence[int]]) -> Iterator[list[int]]:
+        """Yield the episodes of these ascending ranges that have no done mark, one sorted list per block, without empty lists."""
+        for block, wanted in itertools.groupby(heapq.merge(*ranges), lambda episode: episode // BLOCK):
+            if left := sorted(set(wanted) - self.done(block)):
                 yield left
 
     # ---- what is written once ----
@@ -205,15 +138,15 @@ class Ledger:
         self.store.put(f"{place}.json", entry)
 
     @property
-    def plan(self) -> list[range]:
-        """Union of the planned episodes."""
-        return merge_spans(self.layout.plan())
+    def plan(self) -> bytes:
+        """Record of the planned episodes, first and last of each range: "000000-000499_000600-000999"."""
+        return "_".join(f"{each.start:06d}-{each.stop - 1:06d}" for each in self.layout.plan() if each).encode()
 
     def finished(self) -> bool:
-        """Whether the indices cover all planned episodes."""
+        """Whether the indices cover all planned episodes. A damaged record covers none."""
         try:
-            text = self.store.get(FINISHED, SMALL).decode(errors="replace")
-        except FileNotFoundError:
+            pairs = [pair.split("-") for pair in self.store.get(FINISHED, SMALL).decode().split("_")]
+            covered = [range(int(first), int(last) + 1) for first, last in pairs]
+        except (FileNotFoundError, ValueError):
             return False
-        covered = _parse_spans(text) if _SPANS.fullmatch(text) else []
-        return all(any(span.start <= each.start and each.stop <= span.stop for span in covered) for each in self.plan)
+        return all(any(span.start <= each.start and each.stop <= span.stop for span in covered) for each in self.layout.plan() if each)

@@ -1,5 +1,7 @@
-"""Bake on a Ray cluster (`bake --engine ray`): a task a GPU or core runs a claiming worker; Ray places and restarts them, claims in the
-store deal the episodes out."""
+"""Launcher of claiming workers on a Ray cluster (`bake --engine ray`): a task a GPU or core.
+
+Ray places and restarts them, claims in the store deal the episodes out.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,16 @@ import secrets
 import shutil
 import socket
 import tempfile
+import textwrap
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 from synpick_warp._version import __version__
-from synpick_warp.cloud.claims import Chunks, open_claims, plan_chunks
-from synpick_warp.cloud.crew import RAY, Crew
+from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.run import Job, bake_into_store
+from synpick_warp.cloud.run import Job, PlanProgress, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError, SynpickError
@@ -30,6 +32,7 @@ from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.urls import RAY, check_engine
 from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.system.stores.opening import open_store, probe
@@ -45,7 +48,7 @@ _ANSWER = 5.0
 _ENDING, _STOPPING = 30.0, 120.0
 """Longest wait for workers: once one has found that all is done, and once they are asked to stop, and upload what is finished [s]."""
 _SAID = 300
-"""Maximum length of an error message of Ray that is shown; longer ones are cut [characters]."""
+"""Maximum length of an error message of Ray that is shown [characters]."""
 STORE_BYTES = 100 << 20
 """Size of a local cluster's object store [B]: workers return counts."""
 _PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
@@ -56,12 +59,13 @@ _LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
 15 starves them beside other CPU-bound programs."""
 
 
-def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
+def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress) -> BakeSummary:
     """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part.
 
     Args:
         job: What to bake.
-        crew: Options; receives the number of workers and their time.
+        engine: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
+        workers: Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu.
         progress: Observer.
 
     Returns:
@@ -71,7 +75,7 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
     """
     job = replace(job, config=with_measures(job.config, ()))
-    address = find_address(crew.engine)
+    address = find_address(engine)
     ray = import_ray(address)
     store = open_store(job.url)
     ledger = Ledger(store, job.config, probe(store))
@@ -80,11 +84,11 @@ def bake_with_ray(job: Job, crew: Crew, progress: Progress) -> BakeSummary:
         progress.note("all episodes are done")
         return BakeSummary()
     progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
-    with _cluster(ray, address, crew.workers):
-        device, each, count = _resources(ray, job.config.bake.device, crew.workers)
+    with _cluster(ray, address, workers):
+        device, each, count = _resources(ray, job.config.bake.device, workers)
         start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
         calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
-        return _await(ray, calls, crew, progress, plan_chunks(ledger, claims, DataLayout.of(job.config).plan(job.splits)))
+        return _await(ray, calls, PlanProgress(progress, plan_chunks(ledger, claims, DataLayout.of(job.config).plan(job.splits))))
 
 
 def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummary | str:
@@ -111,14 +115,13 @@ def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummar
         return str(error) or type(error).__name__
 
 
-def _await(ray: Any, calls: list[Any], crew: Crew, progress: Progress, chunks: Chunks) -> BakeSummary:
+def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
     """Show how many episodes are done until the calls of `run_worker` have ended; a signal stops them. Returns the sum of their summaries.
 
     Raises:
         DeviceError: A worker reports an error that the user can correct, or has died too often.
     """
-    summary, deadline, last = BakeSummary(), float("inf"), time.monotonic()
-    started, before, planned = last, chunks.count_over(), chunks.sizes.episodes
+    summary, deadline, started = BakeSummary(), float("inf"), time.monotonic()
     with StopRequest() as stop:
         while calls and time.monotonic() < deadline:
             ended, calls = ray.wait(calls, timeout=_POLL)
@@ -140,10 +143,7 @@ def _await(ray: Any, calls: list[Any], crew: Crew, progress: Progress, chunks: C
                 summary.stopped, deadline = stop.number, time.monotonic() + _STOPPING
                 for call in calls:
                     ray.cancel(call)  # An interrupt, which `StopRequest` of the running bake takes.
-            now, done = time.monotonic(), chunks.count_over()
-            crew.alive, crew.seconds, last = len(calls), crew.seconds + len(calls) * (now - last), now
-            left = (now - started) * (planned - done) / (done - before) if done > before else None
-            progress.update(episodes_done=done, episodes=planned, worlds_active=0, views=0, views_per_s=0.0, seconds_left=left)
+            progress.count()
     summary.wall_seconds = time.monotonic() - started
     return summary
 
@@ -173,8 +173,9 @@ def find_address(engine: str) -> str | None:
     """Address of the cluster that an engine names, for `ray.init`; None: one on this machine is to be started.
 
     Raises:
-        DeviceError: Nobody answers there.
+        DeviceError: There is no such engine, or nobody answers there.
     """
+    check_engine(engine)
     address = engine if engine != RAY else os.environ.get("RAY_ADDRESS") or None
     if address is not None and (match := _PLACE.search(address)) is not None:
         try:
@@ -216,8 +217,7 @@ def _cluster(ray: Any, address: str | None, workers: int) -> Iterator[None]:
 
 def _describe(error: Exception) -> str:
     """What an error of Ray says, in one line: the beginning, since it goes on for pages."""
-    text = " ".join(str(error).split())
-    return text if len(text) <= _SAID else f"{text[:_SAID]}…"
+    return textwrap.shorten(str(error), _SAID, placeholder="…")
 
 
 def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, int], int]:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, LeaseLostError, open_claims, plan_chunks
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
-from synpick_warp.cloud.finish import close_blocks, finalize_store
+from synpick_warp.cloud.finish import finalize_store
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
@@ -27,7 +27,7 @@ from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.factory.pipeline import with_measures
-from synpick_warp.system.progress import Progress
+from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
 MAX_CHUNK = 10_000
@@ -51,6 +51,29 @@ class Job:
     lease: float = LEASE
 
 
+class PlanProgress(ForwardingProgress):
+    """Observer of all of a command's claiming workers: passes on their counts as part of the plan, with the remaining time by their mean
+    rate."""
+
+    def __init__(self, progress: Progress, chunks: Chunks) -> None:
+        super().__init__(progress)
+        self._chunks, self._planned, self._before = chunks, chunks.sizes.episodes, chunks.count_over()
+        self._started = time.monotonic()
+
+    def update(self, *, episodes_done: int, episodes: int, worlds_active: int, seconds_left: float | None, **views: Any) -> None:
+        """Pass on counts since the workers' start; running episodes count as half done. See `Progress`."""
+        del episodes, seconds_left
+        done, begun = self._before + episodes_done, episodes_done + 0.5 * worlds_active
+        left = max(0.0, self._planned - self._before - begun) * (time.monotonic() - self._started) / begun if episodes_done else None
+        shown = {"episodes_done": min(self._planned, done), "episodes": self._planned, "worlds_active": worlds_active}
+        super().update(**shown, **views, seconds_left=left)
+
+    def count(self) -> None:
+        """Report the episodes of the chunks that have ended, for workers that report nothing themselves."""
+        done = self._chunks.count_over() - self._before
+        self.update(episodes_done=done, episodes=0, worlds_active=0, views=0, views_per_s=0.0, seconds_left=None)
+
+
 def bake_into_store(
     config: Config,
     url: str,
@@ -63,6 +86,7 @@ def bake_into_store(
     claim: bool = False,
     lease: float = LEASE,
     workers: int = 0,
+    summary: BakeSummary | None = None,
 ) -> BakeSummary:
     """Bake a data set into an object store: simulates, renders and uploads it, or the remaining episodes of one.
 
@@ -77,6 +101,7 @@ def bake_into_store(
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
         lease: Time to live of a claim without heartbeat [s].
         workers: Number of claiming workers, which begin at about the same time; 0: unknown.
+        summary: Receives the episodes bake by bake, for a caller that ends this by an exception; None: a new one.
 
     Returns:
         Summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their chunks.
@@ -89,14 +114,14 @@ def bake_into_store(
     store = open_store(url)
     ledger = Ledger(store, config, probe(store))
     claims = open_claims(ledger, lease) if claim else None
-    summary = BakeSummary()
+    summary = BakeSummary() if summary is None else summary
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
         if claims is None or not ledger.finished():
             baker = bake or keeping_baker()
             for work in _works(ledger, place, claims, ranges, workers, progress):
                 with work:
-                    part = _bake(ledger, place, work, progress, devices, baker)
+                    part = _bake(ledger, place, work, progress, devices, baker, summary)
                 if _take(summary, part):
                     return summary
         if not summary.total:
@@ -133,7 +158,7 @@ class _Work(EpisodeSource):
         self._numbers: dict[int, int] = {}
         """Chunk number of each episode that has no done mark, by the episode's index."""
         self._notes: list[str] = []
-        self._lock, self._closing = threading.Lock(), threading.Lock()
+        self._lock = threading.Lock()
         self._asker = ThreadPoolExecutor(1, "claim")
         self._asked: Future[tuple[Chunk | None, bool]] | None = None
         self._pauses: Iterator[float] | None = None
@@ -183,23 +208,15 @@ class _Work(EpisodeSource):
         raise lost
 
     def delivered(self, episode: int) -> None:
-        """Record that an episode has its done mark. After a chunk's last one, write the batched marks that are due, and the end mark."""
+        """Record that an episode has its done mark. After a chunk's last one, write the end mark."""
         with self._lock:
             chunk, left = self._held.get(self._numbers.pop(episode), (None, set[int]()))
             left.discard(episode)
             if left or chunk is None:
                 return
             del self._held[chunk.number]
-        with self._closing:
-            try:
-                # So that the last worker does not read the index files of all episodes, one after the other.
-                close_blocks(self._ledger, self._place, self._ledger.blocks_of(chunk.episodes))
-            except BaseException:
-                if chunk.claim is not None:
-                    chunk.claim.release()
-                raise
-            if self._chunks is not None:
-                self._chunks.done(chunk)
+        if self._chunks is not None:
+            self._chunks.done(chunk)
 
     def more(self, wait: bool) -> list[int]:
         """Claim another chunk asynchronously: returns the episodes of the claim that an earlier call began. See `EpisodeSource`."""
@@ -287,8 +304,10 @@ def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
         yield held
 
 
-def _bake(ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], bake: Baker) -> BakeSummary:
-    """Bake and upload episodes in a new temporary folder; messages of errors name the store in its place."""
+def _bake(
+    ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], bake: Baker, ended: BakeSummary
+) -> BakeSummary:
+    """Bake and upload episodes in a new temporary folder, after those of `ended`; messages of errors name the store in its place."""
     folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)
@@ -303,7 +322,7 @@ def _bake(ledger: Ledger, place: Path, work: _Work, progress: Progress, devices:
 
     try:
         with Delivery(ledger, folder, work.permit, work.delivered) as delivery:
-            summary = bake(ledger.config, folder, WatchedProgress(progress, check), work, devices, deliver)
+            summary = bake(ledger.config, folder, WatchedProgress(progress, check, ended), work, devices, deliver)
         work.report(progress)
         summary.total -= len(work.lost)
         summary.episodes = [row for row in summary.episodes if row.episode not in work.lost]

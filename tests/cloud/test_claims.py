@@ -15,10 +15,10 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cloud import claims, finish, run
-from synpick_warp.cloud.claims import Chunks, Claims, LeaseLostError, Sizes, default_chunk
-from synpick_warp.cloud.device_workers import bake_with_devices
+from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.run import Job
+from synpick_warp.cloud.run import Job, PlanProgress
+from synpick_warp.cloud.workers import bake_with_devices
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
@@ -288,6 +288,23 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
     assert store.get(finish.FINISHING, 1 << 30) == b""  # So the other would fail, too, if it still ran.
     run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
     assert stored(memory) == local
+
+
+def test_the_progress_of_workers_is_that_of_the_plan(memory, monkeypatch):
+    """A quarter of 100 episodes was done before; then 8 are done and 4 run for 20 s, so 65 are left for 130 s."""
+    now, shown, observer = [100.0], {}, SilentProgress()
+    observer.update = shown.update
+    monkeypatch.setattr(run.time, "monotonic", lambda: now[0])
+    chunks = Chunks(Ledger(open_store(memory), tiny(100), Probe(0.0, True)), Claims(open_store(memory), 0.0), [range(100)], 25)
+    chunks.done(Chunk(0, [], None))
+    progress = PlanProgress(observer, chunks)
+    now[0] += 20.0
+    progress.update(episodes_done=8, episodes=0, worlds_active=4, views=300, views_per_s=15.0, seconds_left=None)
+    expected = {"episodes_done": 33, "episodes": 100, "worlds_active": 4, "views": 300, "views_per_s": 15.0, "seconds_left": 130.0}
+    assert shown == expected
+    chunks.done(Chunk(1, [], None))
+    progress.count()
+    assert shown == dict.fromkeys(expected, 0) | {"episodes_done": 50, "episodes": 100, "seconds_left": 40.0}
 
 
 def test_claims_need_a_store(tmp_path):

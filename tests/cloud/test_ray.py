@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import subprocess
 import sys
@@ -11,10 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from rich.console import Console
 
-from synpick_warp.cli.display import make_progress
-from synpick_warp.cloud.ray_engine import Crew
 from tests.builders import mistake
 from tests.cloud.conftest import files, tiny
 from tests.cloud.mortal import stored
@@ -36,7 +32,6 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
         assert list(Path(short).iterdir()) == []
     assert list((tmp_path / "home").iterdir()) == []
     assert (tmp_path / "died").exists()
-    assert "worker · cost" in ran.stdout or "workers · cost" in ran.stdout
     assert "A worker died" in ran.stdout  # Ray's own notice.
     scripted_bake.bake(tmp_path / "local", tiny(12).with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
@@ -51,9 +46,8 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
         (("--engine", "ray://127.0.0.1:99999"), "ray://127.0.0.1:99999 does not answer ("),
         (("--engine", "ray", "--shard", "0/2"), "drop --devices and --shard"),
         (("--engine", "ray", "--out", "DATA"), "name one by --out"),
-        (("--engine", "ray", "--price", "-1"), "--price is -1; allowed: 0.0 to 1000000.0"),
         (("--engine", "ray", "--workers", "-1"), "--workers is -1; allowed: 0 to 100000"),
-        (("--workers", "2"), "--workers and --price go with --engine"),
+        (("--workers", "2"), "--workers goes with --engine"),
     ],
 )
 def test_options_that_cannot_be_used(given, said):
@@ -66,12 +60,3 @@ def test_ray_is_missing_or_of_another_version(ray, said, monkeypatch):
         monkeypatch.setenv(name, "")
     monkeypatch.setitem(sys.modules, "ray", ray and SimpleNamespace(__version__=ray))
     assert said in mistake(*S3, "--engine", "ray")
-
-
-def test_the_display_shows_workers_and_what_they_have_cost():
-    crew, out = Crew(price=2.5, alive=3), io.StringIO()
-    crew.seconds = 3600.0
-    with make_progress(Console(file=out, width=200), crew) as progress:
-        progress.update(episodes_done=1, episodes=2, worlds_active=4, views=5, views_per_s=6.0, seconds_left=7.0)
-    assert "worlds 4 · views 5 · 6.0 views/s · 0:07 left · 3 workers · cost 2.50" in out.getvalue()
-    assert str(Crew(alive=1)) == "1 worker"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cloud import run
+from synpick_warp.cloud import finish, run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
@@ -98,53 +98,30 @@ def test_a_worker_may_die_at_any_request(memory, local, monkeypatch, seed):
 
 
 def test_two_plans_of_as_many_episodes_are_told_apart(memory, tmp_path):
-    """Their numbers of episodes are equal, in all and by block; neither finishes the other, and marks are joined by episodes."""
+    """Their numbers of episodes are equal; neither finishes the other."""
 
     def split(train: int, val: int):
         return replace(tiny(), splits=(Split("train", train, 0), Split("val", val, 5)))
 
     bake(memory, split(2, 1))
     assert bake(memory, split(1, 2)).total == 1
-    assert [key for key, _ in open_store(memory).list(".store/done")] == [
-        ".store/done/000000_000000-000001_000005-000005",
-        ".store/done/000000_000006-000006",
-    ]
     rows = stored(memory)["episodes.jsonl"].decode().splitlines()
     assert [json.loads(row)["episode"] for row in rows] == [0, 5, 6]
 
 
-def test_blocks_are_listed_alone(memory, monkeypatch):
-    """A resume holds one block, and lists the marks of open ones only."""
-    store, config = open_store(memory), tiny(3_500)
-    ledger = Ledger(store, config, Probe(0.0, True))
-    for episode in range(3_400):
-        store.put(f"manifest/{episode:06d}.json", b"{}")
-        store.put(f"manifest/{episode:06d}.sha256", b"")
-    for spans in ("000000_000000-000599", "000000_000500-000999", "000002_002000-002999", "000001_001000-001998", "000003_003400-004000"):
-        store.put(f".store/done/{spans}", b"index files")  # The last is of another block, too.
-    store.put(".store/done/000001_001000-001999", b"")  # Interrupted.
-    listed = []
+def test_done_marks_are_listed_block_by_block(memory, monkeypatch):
+    """A resume holds one block. Empty marks, of an interrupted write, do not count; numbers of seven digits sort apart."""
+    store = open_store(memory)
+    ledger = Ledger(store, tiny(1_002_000), Probe(0.0, True))
+    for episode in (*range(998_990, 999_990), *range(1_000_010, 1_001_000)):
+        store.put(f"manifest/{episode:06d}.json", b"{}" if episode % 10 else b"")
+    listed, wanted = [], range(998_990, 1_001_010)
     monkeypatch.setattr(Ledger, "done", lambda self, block, done=Ledger.done: listed.append(block) or done(self, block))
-    assert list(ledger.remaining([range(3_500)])) == [list(range(3_400, 3_500))]
-    assert list(ledger.remaining([range(1, 3_500, 2)])) == [list(range(3_401, 3_500, 2))]
-    assert set(listed) == {1, 3}
-    assert list(ledger.blocks()) == [0, 1, 2, 3]
-
-
-def test_the_worker_that_ends_a_block_marks_it(memory, local, monkeypatch):
-    """So the last worker reads one object per block, not one per episode."""
-    monkeypatch.setattr("synpick_warp.cloud.ledger.BLOCK", 2)
-    store, read = open_store(memory), []
-    bake(memory, shard=(0, 4))
-    assert list(store.list(".store/done")) == []
-    bake(memory, shard=(1, 4))
-    assert [key for key, _ in store.list(".store/done")] == [".store/done/000000_000000-000001"]
-    bake(memory, shard=(0, 2))
-    real = type(store).get
-    monkeypatch.setattr(type(store), "get", lambda self, key, limit: read.append(key) or real(self, key, limit))
-    bake(memory)
-    assert stored(memory) == local
-    assert [key for key in read if ".store/index" in key] == [".store/index/000002.tar.gz", ".store/index/000003.tar.gz"]
+    there = {episode for episode in wanted if episode % 10 and (episode < 999_990 or 1_000_010 <= episode < 1_001_000)}
+    left = list(ledger.remaining([wanted[::2], wanted[1::2]]))
+    assert [episode for each in left for episode in each] == sorted(set(wanted) - there)
+    assert listed == [998, 999, 1000, 1001]
+    assert [each[0] // 1000 for each in left] == listed
 
 
 def test_another_set_or_other_settings_are_refused(memory):
@@ -181,15 +158,28 @@ def test_a_manifest_that_another_worker_wrote_meanwhile_is_compared(memory):
     assert store.get("manifest.json", 1 << 30) == b"theirs"
 
 
-def test_a_damaged_batched_mark_is_named(memory):
+def test_a_damaged_or_deleted_index_file_is_named(memory, monkeypatch):
+    monkeypatch.setattr(finish, "AHEAD", 2)
+    bake(memory)
+    store, key = open_store(memory), ".store/index/000002.tar.gz"
+    store.delete(FINISHED)
+    for data in (store.get(key, 1 << 30)[:-20], b"none"):
+        store.put(key, data)
+        with pytest.raises(DatasetError, match=rf"{key} is damaged: .*; delete it and its episode's done mark"):
+            bake(memory)
+    store.delete(key)
+    with pytest.raises(StoreError, match=rf"is missing: .*{key}.*; restore it, or delete the done mark"):
+        bake(memory)
+
+
+@pytest.mark.parametrize("record", [b"", b"000000-000002", b"000000-00000x", b"\xff"])
+def test_a_record_that_does_not_cover_the_plan_finishes_nothing(memory, local, record):
     bake(memory)
     store = open_store(memory)
-    (key,) = (key for key, _ in store.list(".store/done"))
-    store.delete(FINISHED)
-    for data in (store.get(key, 1 << 30)[:-1], b"none"):
-        store.put(key, data)
-        with pytest.raises(DatasetError, match=rf"{key} is damaged: it is cut off"):
-            bake(memory)
+    store.put(FINISHED, record)
+    store.put("manifest/joined.json", b"damaged")
+    bake(memory)
+    assert stored(memory) == local
 
 
 def test_a_prefix_in_another_set_is_refused(prefix):

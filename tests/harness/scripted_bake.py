@@ -101,7 +101,7 @@ def bake_episodes(
                 episode = queue.pop(0)
                 if progress is not None:
                     progress.stage(f"episode {episode}")
-                _write_episode(output, exporters, pool, episode, picks)
+                summary.episodes.append(_write_episode(output, exporters, pool, episode, picks))
                 if grows:
                     assert isinstance(episodes, EpisodeSource)
                     found = episodes.more(not queue)
@@ -116,7 +116,7 @@ def bake_episodes(
     return summary
 
 
-def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> None:
+def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> EpisodeRow:
     for batch in trajectories.ticks((episode,), FRAMES):
         exporters.write_ticks(batch)
     for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
@@ -127,6 +127,7 @@ def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool,
     row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
     exporters.end_episode(end, lambda: output.commit(exporters, pool, end))
+    return row
 
 
 def snapshot(folder: Path) -> dict[str, tuple[str, bytes]]:

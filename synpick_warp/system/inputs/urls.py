@@ -6,14 +6,16 @@ import re
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
 
-from synpick_warp.errors import StoreError, escape, shorten, suggest
+from synpick_warp.errors import DeviceError, StoreError, escape, shorten, suggest
 
 SCHEMES = ("s3", "gs", "az")
 """Schemes of object stores."""
 FILE = "file"
+RAY = "ray"
 _ALLOWED = "allowed: s3://bucket/prefix, gs://bucket/prefix, az://container/prefix, or a folder, also as file:///folder"
 _URL = re.compile(r"([a-z][a-z0-9+.-]+(?:::[a-z0-9+.-]+)*):(/{,2})(.*)", re.DOTALL | re.IGNORECASE)
 _WORD = re.compile(rf"(--[a-z][a-z-]*=)?((?:{'|'.join((*SCHEMES, FILE))}):.*)", re.DOTALL | re.IGNORECASE)
+_ENGINE = re.compile(rf"{RAY}(://(\[[0-9a-fA-F:]+\]|[\w.-]+):[0-9]{{1,5}})?")
 _BUCKET = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{,218}[A-Za-z0-9])?")
 _SECRET = re.compile(r"[@?#]|%(?:40|3f|23)", re.IGNORECASE)
 """Delimiters, also coded, before or behind which a URL has passwords and signatures: no message shows a URL that has one."""
@@ -82,3 +84,9 @@ def resolve_word(word: str) -> str:
     Raises as `parse_place`."""
     match = _WORD.fullmatch(word)
     return word if match is None else f"{match[1] or ''}{parse_place(match[2])}"
+
+
+def check_engine(engine: str) -> None:
+    """Check the name of a cluster of claiming workers. Raises DeviceError."""
+    if _ENGINE.fullmatch(engine) is None:
+        raise DeviceError(f"--engine is {engine}; allowed: ray, or ray://HOST:PORT of a Ray Client, such as ray://head:10001")
