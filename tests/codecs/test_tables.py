@@ -34,4 +34,5 @@ def test_latex_has_rules_and_escaped_names():
 
 def test_names_in_csv_cannot_become_formulas_unless_they_are_to_stay_exact():
     assert to_csv(TABLE) == "name,a_b,c,d\nx_1,1.23e+03,0.25,\n'=日本,,2.0,3.0\n"
+    assert to_csv(Table("names", "", (Column("name"),), [("[red]x",), ("\x1b[2J",)])) == "name\n[red]x\n\\x1b[2J\n"
     assert to_csv(TABLE, exact=True) == "name,a_b,c,d\nx_1,1.23e+03,0.25,\n=日本,,2.0,3.0\n"

@@ -1,4 +1,4 @@
-"""The page as text: what it has, what it may run, sets of every shape, and bad input in one line."""
+"""The page as text: what it has, what it may run, sets of every shape, bad input in one line; its markup, and its pictures."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.report import album, compose, write_report
+from synpick_warp.apps.report import compose, write_report
 from synpick_warp.apps.report import page as page_module
-from synpick_warp.apps.report.markup import content_hash
+from synpick_warp.apps.report.album import BUDGET, Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.markup import Html, content_hash, element, embed_json, join, printable
 from synpick_warp.cli.main import main
 from synpick_warp.errors import OutputError
 from tests.builders import mistake
@@ -113,7 +114,7 @@ def test_the_same_set_gives_the_same_bytes(data, page, tmp_path):
 
 
 def test_the_budget_of_pictures_holds(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(compose, "Album", lambda: album.Album(budget=4000))
+    monkeypatch.setattr(compose, "Album", lambda: Album(budget=4000))
     path = write_report(synpick_warp.open(data), tmp_path / "small.html")
     assert sum(map(len, Parsed(path).pictures().values())) <= 4000
     assert "did not fit" in path.read_text()
@@ -208,3 +209,90 @@ def test_a_full_disk_leaves_nothing(data, tmp_path):
     with pytest.raises(OutputError, match="No space left"):
         compose.write_text(tmp_path / "report.html", pieces())
     assert list(tmp_path.iterdir()) == []
+
+
+# ---- markup: data stays data, no text can end an element, open one, or end a script ----
+
+NAMES = [
+    "</script><script>alert(1)</script>",
+    "<!--<script>",
+    '" onload="alert(1)',
+    "&lt;b&gt;",
+    "\u2028\u2029",
+    "]]>",
+    "\ud800",
+    "\x1b[31m\x00",
+]
+
+
+def test_known_elements():
+    assert element("p", "a < b & c") == "<p>a &lt; b &amp; c</p>"
+    assert (
+        element("a", element("b", "x"), "y", href='#"', class_="q", data_kind="z")
+        == '<a href="#&quot;" class="q" data-kind="z"><b>x</b>y</a>'
+    )
+    assert element("ul", [element("li", "1"), "<"]) == "<ul><li>1</li>&lt;</ul>"
+    assert join(["<", Html("<br>")]) == "&lt;<br>"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_text(name):
+    written = element("p", name, title=name)
+    assert written.count("<") == 2
+    assert written.count('"') == 2
+    written.encode("utf-8")
+    assert all(letter.isprintable() or letter == "\n" for letter in printable(name))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_embedded_json_cannot_end_its_element_and_is_read_back(name):
+    written = embed_json({name: [name]})
+    assert not {"<", ">", "&", "\u2028", "\u2029"} & set(written)
+    assert json.loads(written) == {name: [name]}
+
+
+def test_a_hash_is_that_of_the_policy():
+    # The example of the CSP specification, level 3, section 8.4.
+    assert content_hash("alert('Hello, world.');") == "'sha256-qznLcsROx4GACP2dm0UCKCzCG+HiZ1guq6ZZDob/Tng='"
+
+
+# ---- pictures ----
+
+
+def test_ids_are_exact_and_photos_similar():
+    ids = np.arange(256, dtype=np.uint8).reshape(8, 32)
+    assert (cv2.imdecode(np.frombuffer(encode_ids(ids).data, np.uint8), cv2.IMREAD_UNCHANGED) == ids).all()
+    photo = np.full((40, 60, 3), (30, 90, 200), np.uint8)
+    picture = encode_photo(photo)
+    assert picture.kind == "webp"
+    assert np.abs(cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR).astype(int) - photo).max() < 8
+
+
+def test_shrinking_keeps_ids_and_never_enlarges():
+    ids = np.kron(np.array([[1, 7], [9, 200]], np.uint8), np.ones((50, 50), np.uint8))
+    assert set(np.unique(shrink(ids, 10, smooth=False))) == {1, 7, 9, 200}
+    assert shrink(ids, 10, smooth=False).shape == (10, 10)
+    assert shrink(ids, 1000) is ids
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 1000])
+def test_the_size_of_a_picture_is_that_of_its_base64(size):
+    picture = EncodedPicture("png", bytes(size))
+    assert picture.size == len(base64.b64encode(picture.data))
+
+
+def test_pictures_are_added_together_or_not_at_all():
+    album = Album(budget=4000)
+    share = int(4000 * Section.ATTEMPTS.value)
+    small = EncodedPicture("png", bytes(300))
+    assert album.add(Section.ATTEMPTS, [small]) == [0]
+    assert album.add(Section.ATTEMPTS, [small, small]) is None
+    assert album.left(Section.ATTEMPTS) == share - 400
+    assert album.add(Section.FRAMES, [small, small]) == [1, 2]
+    assert [kind for kind, _ in album.encoded()] == 3 * ["png"]
+    assert sum(len(data) for _, data in album.encoded()) == sum(album.spent.values())
+
+
+def test_the_shares_are_the_whole_budget():
+    assert sum(section.value for section in Section) == pytest.approx(1.0)
+    assert BUDGET == 25_000_000

@@ -23,29 +23,8 @@ from rich.console import Console
 
 import synpick_warp
 from synpick_warp.apps.statistics import collect as collecting
-from synpick_warp.apps.statistics import compute, counts
+from synpick_warp.apps.statistics import columns, compute, counts
 from synpick_warp.apps.statistics.collect import SceneTask, collect, read_episode, read_scene
-from synpick_warp.apps.statistics.columns import (
-    BANDS,
-    DEPTH_BIN,
-    DIRECTION_BINS,
-    FORCE_BIN,
-    MIN_VISIBILITY,
-    SECTORS,
-    TIME_BIN,
-    VISIBILITY_BINS,
-    AttemptFacts,
-    BinFacts,
-    EpisodeFacts,
-    Light,
-    depth_blocks,
-    direction_bins,
-    episode_blocks,
-    frame_blocks,
-    light_blocks,
-    rest_blocks,
-    scene_blocks,
-)
 from synpick_warp.apps.statistics.compute import DEPTH_QUANTILES, assemble, compute_statistics
 from synpick_warp.apps.statistics.counts import Block, Counts, Group
 from synpick_warp.apps.statistics.figures import BinUse, Coverage, Rest
@@ -116,7 +95,7 @@ def test_the_table_has_the_known_answers(statistics):
         assert row.annotations.visibility == pytest.approx(np.mean(VISIBILITY), abs=1e-9)
         assert row.annotations.objects == {BRICK: 2 * views, BOX: views, PRISM: views}
         assert row.annotations.invisible == 0
-        expected = dict.fromkeys(range(VISIBILITY_BINS), 0) | {1: views, 6: views, 12: views, VISIBILITY_BINS - 1: views}
+        expected = dict.fromkeys(range(columns.VISIBILITY_BINS), 0) | {1: views, 6: views, 12: views, columns.VISIBILITY_BINS - 1: views}
         assert dict(enumerate(row.annotations.histogram)) == expected
         assert [point.objects for point in row.objects_over_time] == [len(VISIBILITY)]
     total = statistics.total.annotations
@@ -131,7 +110,7 @@ def test_attempts_and_seal_forces_have_the_known_answers(statistics):
     assert pick.outcomes == {"target_picked": 2, "missed": 1}
     assert pick.endings == {"finished": 1}
     assert (pick.seals, pick.good_seals, pick.force) == (2, 1, pytest.approx((5.5 + 500.0) / 2))
-    assert {index: count for index, count in enumerate(pick.force_histogram) if count} == {int(5.5 / FORCE_BIN): 1, 29: 1}
+    assert {index: count for index, count in enumerate(pick.force_histogram) if count} == {int(5.5 / columns.FORCE_BIN): 1, 29: 1}
     assert statistics.total.episodes.attempts == 3
 
 
@@ -140,9 +119,10 @@ def test_attempts_and_seal_forces_have_the_known_answers(statistics):
 def test_a_line_tells_that_no_seal_came_near_its_break_force(statistics, forces, load, broken):
     """Of the settings, 40 and 2 N, or of the attempt; one that broke is near it."""
     rows = [
-        AttemptFacts("target_picked", good, [1], [0.0, force], limit) for force, good, limit in (*forces, *[(2.5, False, None)] * broken)
+        columns.AttemptFacts("target_picked", good, [1], [0.0, force], limit)
+        for force, good, limit in (*forces, *[(2.5, False, None)] * broken)
     ]
-    found = counted(episode_blocks(GROUP, EpisodeFacts("pick", 9, "finished"), rows, Suction()))
+    found = counted(columns.episode_blocks(GROUP, columns.EpisodeFacts("pick", 9, "finished"), rows, Suction()))
     episodes = compute.episode_figures(found, [GROUP])
     assert episodes.largest_load == (100 if broken else load)
     console = Console(file=io.StringIO(), width=200)
@@ -154,7 +134,11 @@ def test_bins_have_the_known_answers_and_merge(statistics):
     step = math.radians(5.0)
     assert statistics.bins == {"kanban": BinUse(1, (0.01, 0.02), (-0.02, -0.01), (-2 * step, -step))}
     one, other, third = (
-        counted(episode_blocks(GROUP, EpisodeFacts("pick", 9, "finished", bin=BinFacts(name, (x, 0.0, 0.0), 0.0)), [], None))
+        counted(
+            columns.episode_blocks(
+                GROUP, columns.EpisodeFacts("pick", 9, "finished", bin=columns.BinFacts(name, (x, 0.0, 0.0), 0.0)), [], None
+            )
+        )
         for name, x in (("a", 0.0), ("b", 0.0), ("b", 0.035))
     )
     one.merge(other)
@@ -195,7 +179,7 @@ def test_depth_is_that_of_all_pixels(statistics, folder):
     assert statistics.depth.missing == pytest.approx(np.mean(np.stack(images) == 0))
     for quantile in DEPTH_QUANTILES:
         expected = np.quantile(pixels, quantile, method="inverted_cdf")
-        assert statistics.depth.quantiles[quantile] == pytest.approx(expected, abs=DEPTH_BIN / 2 + 1e-6)
+        assert statistics.depth.quantiles[quantile] == pytest.approx(expected, abs=columns.DEPTH_BIN / 2 + 1e-6)
 
 
 def test_all_figures_are_those_of_a_twin_that_reads_view_by_view(statistics, data_set):
@@ -204,20 +188,20 @@ def test_all_figures_are_those_of_a_twin_that_reads_view_by_view(statistics, dat
         views = list(episode.views())
         visibility = np.concatenate([view.visibility for view in views])
         assert row.annotations.visibility == pytest.approx(visibility.mean(), abs=1e-9)
-        bins = [min(int(Fraction(str(value)) * VISIBILITY_BINS), VISIBILITY_BINS - 1) for value in visibility.tolist()]
-        np.testing.assert_array_equal(np.bincount(bins, minlength=VISIBILITY_BINS), row.annotations.histogram)
+        bins = [min(int(Fraction(str(value)) * columns.VISIBILITY_BINS), columns.VISIBILITY_BINS - 1) for value in visibility.tolist()]
+        np.testing.assert_array_equal(np.bincount(bins, minlength=columns.VISIBILITY_BINS), row.annotations.histogram)
         by_frame = [len(view.instance_ids) for view in views if view.camera == 0]
         assert row.objects_over_time[0].objects == pytest.approx(np.mean(by_frame))
-    counts = {each.object_id: np.zeros((BANDS, SECTORS), int) for each in statistics.objects}
+    counts = {each.object_id: np.zeros((columns.BANDS, columns.SECTORS), int) for each in statistics.objects}
     for view in data_set.views():
         for entry, info, pose in zip(view.records.gt, view.records.gt_info, view.object_to_camera, strict=True):
-            if info["visib_fract"] >= MIN_VISIBILITY:
+            if info["visib_fract"] >= columns.MIN_VISIBILITY:
                 x, y, z = np.linalg.inv(pose)[:3, 3]  # The camera in the object's frame.
                 height, longitude = z / np.sqrt(x * x + y * y + z * z), np.degrees(np.arctan2(y, x))
-                band = int(np.digitize(height, np.linspace(-1, 1, BANDS + 1))) - 1
-                counts[entry["obj_id"]][band, int(np.digitize(longitude, np.linspace(-180, 180, SECTORS + 1))) - 1] += 1
+                band = int(np.digitize(height, np.linspace(-1, 1, columns.BANDS + 1))) - 1
+                counts[entry["obj_id"]][band, int(np.digitize(longitude, np.linspace(-180, 180, columns.SECTORS + 1))) - 1] += 1
     for each in statistics.objects:
-        np.testing.assert_array_equal(np.reshape(each.coverage.bins, (BANDS, SECTORS)), counts[each.object_id])
+        np.testing.assert_array_equal(np.reshape(each.coverage.bins, (columns.BANDS, columns.SECTORS)), counts[each.object_id])
         assert each.coverage.occupied == pytest.approx((counts[each.object_id] > 0).mean())
 
 
@@ -272,8 +256,8 @@ def whole(blocks) -> Counts:
 def test_a_scene_counts_as_its_halves(visibility, cut, seed):
     random = np.random.default_rng(seed)
     ids = random.integers(1, 5, len(visibility))
-    whole = counted(scene_blocks(GROUP, scene(visibility, ids), ""))
-    halves = counted(*(scene_blocks(GROUP, scene(visibility[part], ids[part]), "") for part in (slice(0, cut), slice(cut, None))))
+    whole = counted(columns.scene_blocks(GROUP, scene(visibility, ids), ""))
+    halves = counted(*(columns.scene_blocks(GROUP, scene(visibility[part], ids[part]), "") for part in (slice(0, cut), slice(cut, None))))
     halves.sums["views"][GROUP, "views"] -= 1
     assert halves == whole
     result = compute.annotation_figures(whole, [GROUP])
@@ -312,12 +296,15 @@ def test_depth_is_sampled_evenly(frames, count):
 
 def test_bins_of_directions_have_equal_areas():
     """Even directions fill them evenly; the axes have known bins."""
-    random = np.random.default_rng(0).normal(size=(DIRECTION_BINS * 500, 3))
-    counts = np.bincount(direction_bins(random / np.linalg.norm(random, axis=1, keepdims=True)), minlength=DIRECTION_BINS)
-    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (DIRECTION_BINS - 1)) < 4.5 * np.sqrt(2.0 * DIRECTION_BINS)
-    bands = direction_bins(np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])) // SECTORS
-    assert bands.tolist() == [BANDS - 1, 0, BANDS // 2, BANDS // 2, BANDS // 2]
-    assert (direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % SECTORS).tolist() == [SECTORS // 2, 3 * SECTORS // 4]
+    random = np.random.default_rng(0).normal(size=(columns.DIRECTION_BINS * 500, 3))
+    counts = np.bincount(columns.direction_bins(random / np.linalg.norm(random, axis=1, keepdims=True)), minlength=columns.DIRECTION_BINS)
+    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (columns.DIRECTION_BINS - 1)) < 4.5 * np.sqrt(2.0 * columns.DIRECTION_BINS)
+    bands = columns.direction_bins(np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])) // columns.SECTORS
+    assert bands.tolist() == [columns.BANDS - 1, 0, columns.BANDS // 2, columns.BANDS // 2, columns.BANDS // 2]
+    assert (columns.direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % columns.SECTORS).tolist() == [
+        columns.SECTORS // 2,
+        3 * columns.SECTORS // 4,
+    ]
 
 
 def coverage(counts: Counts, object_id: int) -> Coverage:
@@ -325,32 +312,32 @@ def coverage(counts: Counts, object_id: int) -> Coverage:
 
 
 def test_evenness_is_0_for_one_direction_and_1_for_all():
-    one, even = counted(scene_blocks(GROUP, scene(np.ones(5), np.full(5, 7)), "")), Counts()
+    one, even = counted(columns.scene_blocks(GROUP, scene(np.ones(5), np.full(5, 7)), "")), Counts()
     first = coverage(one, 7)
-    assert (first.views, first.evenness, first.occupied) == (5, 0.0, 1 / DIRECTION_BINS)
-    even.sums["directions"].update({(7, index): 2 for index in range(DIRECTION_BINS)})
+    assert (first.views, first.evenness, first.occupied) == (5, 0.0, 1 / columns.DIRECTION_BINS)
+    even.sums["directions"].update({(7, index): 2 for index in range(columns.DIRECTION_BINS)})
     assert coverage(even, 7).evenness == pytest.approx(1.0)
-    assert coverage(even, 8) == dataclasses.replace(first, views=0, occupied=0.0, bins=(0,) * DIRECTION_BINS)
-    hidden = counted(scene_blocks(GROUP, scene(np.full(5, MIN_VISIBILITY - 1e-6), np.full(5, 7)), ""))
+    assert coverage(even, 8) == dataclasses.replace(first, views=0, occupied=0.0, bins=(0,) * columns.DIRECTION_BINS)
+    hidden = counted(columns.scene_blocks(GROUP, scene(np.full(5, columns.MIN_VISIBILITY - 1e-6), np.full(5, 7)), ""))
     assert coverage(hidden, 7).views == 0
 
 
 def test_objects_over_time_are_a_mean_over_those_that_last():
-    half = round(TIME_BIN / PERIOD)
+    half = round(columns.TIME_BIN / PERIOD)
     frames = ([5] * half + [3] * half, [1] * half)
-    found = counted(*(frame_blocks(GROUP, scene(np.ones(sum(each)), np.ones(sum(each), int), each), PERIOD) for each in frames))
-    assert compute.timeline_figures(found, [GROUP]) == ((0.0, 2 * half, 3.0), (TIME_BIN, half, 3.0))
+    found = counted(*(columns.frame_blocks(GROUP, scene(np.ones(sum(each)), np.ones(sum(each), int), each), PERIOD) for each in frames))
+    assert compute.timeline_figures(found, [GROUP]) == ((0.0, 2 * half, 3.0), (columns.TIME_BIN, half, 3.0))
 
 
 def test_depth_without_pixels():
     assert compute.depth_figures(Counts()) is None
-    depth = compute.depth_figures(counted(depth_blocks(np.zeros((2, 3), np.uint16), 0.1)))
+    depth = compute.depth_figures(counted(columns.depth_blocks(np.zeros((2, 3), np.uint16), 0.1)))
     assert (depth.quantiles, depth.missing) == ({}, 1.0)
 
 
 @given(yaw=st.floats(-100.0, 100.0), exposure=st.floats(-5.0, 5.0))
 def test_any_light_has_a_bin(yaw, exposure):
-    lights = compute.light_figures(counted(light_blocks(Light("sky", yaw, exposure))))
+    lights = compute.light_figures(counted(columns.light_blocks(columns.Light("sky", yaw, exposure))))
     assert sum(lights.yaw) == 1
     ((low, _),) = lights.exposure.items()
     assert low - 1e-6 <= exposure < low + 0.1 + 1e-6
@@ -359,7 +346,7 @@ def test_any_light_has_a_bin(yaw, exposure):
 def test_endlessly_many_objects_are_refused(monkeypatch):
     monkeypatch.setattr(counts, "MAX_OBJECTS", 3)
     with pytest.raises(DatasetError, match="more than 3 different obj_id"):
-        Counts().merge(counted(scene_blocks(GROUP, scene(np.ones(4), np.arange(4)), "")))
+        Counts().merge(counted(columns.scene_blocks(GROUP, scene(np.ones(4), np.arange(4)), "")))
 
 
 # ---- piles at rest ----
@@ -375,7 +362,7 @@ def rest(speed: np.ndarray, **others: Any) -> Rest | None:
     velocity = np.zeros((len(TIME), 3, 3), np.float32)
     velocity[:, 1, 0], velocity[:, 2] = speed, np.nan
     steps = {"velocity": velocity, "attached": np.zeros((len(TIME), 3), bool), "gripper_contact_load": np.zeros((len(TIME), 2))}
-    return compute.rest_figures(counted(rest_blocks(SimpleNamespace(steps={**steps, **others}), STEP)))
+    return compute.rest_figures(counted(columns.rest_blocks(SimpleNamespace(steps={**steps, **others}), STEP)))
 
 
 @pytest.mark.parametrize(

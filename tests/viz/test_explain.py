@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.viz import explain
-from synpick_warp.apps.viz.drawing import FONT, instance_color
+from synpick_warp.apps.viz.drawing import FONT, instance_color, shorten
 from synpick_warp.apps.viz.explain import object_names, planning_camera, to_color_image, to_view, write_explanation
-from synpick_warp.apps.viz.explain_panels import fitted, load_chart, wrapped
+from synpick_warp.apps.viz.explain_panels import load_chart, wrapped
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
@@ -300,9 +300,9 @@ def test_text_fits():
     lines = wrapped(text, 0.5, 200)
     assert " ".join(" ".join(lines).split()) == text
     assert all(cv2.getTextSize(line, FONT, 0.5, 1)[0][0] <= 200 for line in lines)
-    assert fitted("tin", 0.5, 200) == "tin"
-    assert fitted(text, 0.5, 200).endswith("..")
-    assert cv2.getTextSize(fitted(text, 0.5, 200), FONT, 0.5, 2)[0][0] <= 200
+    assert shorten("tin", 200, 0.5) == "tin"
+    assert shorten(text, 200, 0.5).endswith("...")
+    assert cv2.getTextSize(shorten(text, 200, 0.5), FONT, 0.5, 1)[0][0] <= 200
 
 
 def damaged(**changes: object) -> str:

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from synpick_warp.apps.report.album import encode_photo
 from synpick_warp.apps.report.charts import Chart
-from synpick_warp.apps.report.markup import Html, element, image, join
-from synpick_warp.apps.report.tables import table_html
+from synpick_warp.apps.report.markup import Html, element, image, join, table_html
 from synpick_warp.apps.statistics.picks import SCORES, PickFigures, picks_tables
 from synpick_warp.apps.viz.picks import draw_pick_maps
 from synpick_warp.dataset.reading import DataSet

@@ -12,17 +12,7 @@ from typing import NamedTuple
 
 from msgspec import UNSET
 
-from synpick_warp.apps.statistics.columns import (
-    AttemptFacts,
-    EpisodeFacts,
-    LitCameraEntry,
-    depth_blocks,
-    episode_blocks,
-    frame_blocks,
-    light_blocks,
-    rest_blocks,
-    scene_blocks,
-)
+from synpick_warp.apps.statistics import columns
 from synpick_warp.apps.statistics.counts import Block, Counts, Group
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.bop.arrays import read_arrays
@@ -113,17 +103,17 @@ def collect(data_set: DataSet, depth_views: int, threads: int, report: Report | 
     return found
 
 
-def read_facts(data_set: DataSet, episode: int) -> EpisodeFacts:
+def read_facts(data_set: DataSet, episode: int) -> columns.EpisodeFacts:
     """Read the manifest row of an episode; raises DatasetError if it is damaged."""
-    return check_content(data_set[episode].row, EpisodeFacts, data_set.folder / f"{episode_entry(episode)}.json")
+    return check_content(data_set[episode].row, columns.EpisodeFacts, data_set.folder / f"{episode_entry(episode)}.json")
 
 
 def read_episode(data_set: DataSet, episode: int) -> Iterator[Block]:
     """Tables of an episode; raises DatasetError if its manifest entry is damaged."""
     row, source = read_facts(data_set, episode), data_set.folder / f"{episode_entry(episode)}.json"
-    attempts = [check_content(attempt, AttemptFacts, source) for attempt in data_set[episode].attempts]
+    attempts = [check_content(attempt, columns.AttemptFacts, source) for attempt in data_set[episode].attempts]
     group = Group(data_set.split_of(episode), row.mode)
-    return episode_blocks(group, row, attempts, data_set.config.suction if attempts else None)
+    return columns.episode_blocks(group, row, attempts, data_set.config.suction if attempts else None)
 
 
 def read_scene(data_set: DataSet, task: SceneTask) -> Iterator[Block]:
@@ -136,23 +126,23 @@ def read_scene(data_set: DataSet, task: SceneTask) -> Iterator[Block]:
     group = Group(data_set.split_of(episode), read_facts(data_set, episode).mode)
     files = data_set.scene_files(episode, camera)
     images = files.frames() if files.lenient else data_set[episode].images(camera)
-    scene = read_arrays(files, images, LitCameraEntry, whole=True)
-    yield from scene_blocks(group, scene, files.place)
+    scene = read_arrays(files, images, columns.LitCameraEntry, whole=True)
+    yield from columns.scene_blocks(group, scene, files.place)
     if camera == 0:
         if data_set.period is not None:
-            yield from frame_blocks(group, scene, data_set.period)
+            yield from columns.frame_blocks(group, scene, data_set.period)
         if scene.cameras and (light := scene.cameras[0].light) is not UNSET:
-            yield from light_blocks(light)
+            yield from columns.light_blocks(light)
     for frame in task.depth_frames if files.has("depth") else ():
         if (scale := scene.cameras[frame].depth_scale) is not UNSET:
-            yield from depth_blocks(files.typed_image("depth", images[frame], None, "uint16"), float(scale))
+            yield from columns.depth_blocks(files.typed_image("depth", images[frame], None, "uint16"), float(scale))
 
 
 def _count_rest(data_set: DataSet, counts: Counts) -> Iterator[str]:
     """Count windows of piles at rest in the step logs of up to REST_EPISODES episodes; yields a sentence for each that cannot be read."""
     for episode in _spread(list(data_set), REST_EPISODES) if data_set.found is None and data_set.has_store else ():
         try:
-            counts.add(rest_blocks(data_set[episode], data_set.config.physics.step))
+            counts.add(columns.rest_blocks(data_set[episode], data_set.config.physics.step))
         except DatasetError as error:
             yield f"the step log of episode {episode} cannot be read: {error}"
 

@@ -7,35 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from synpick_warp.apps.statistics import columns, figures
 from synpick_warp.apps.statistics.collect import Collected, Report, collect
-from synpick_warp.apps.statistics.columns import (
-    BIN_STEPS,
-    DEPTH_BIN,
-    DIRECTION_BINS,
-    EXPOSURE_BIN,
-    FORCE_BINS,
-    FORCE_UNIT,
-    TIME_BIN,
-    VISIBILITY_BINS,
-    VISIBILITY_UNIT,
-    YAW_BINS,
-)
 from synpick_warp.apps.statistics.counts import Counts, Group
-from synpick_warp.apps.statistics.figures import (
-    Annotations,
-    BinUse,
-    Coverage,
-    Depth,
-    EpisodeFigures,
-    GroupStatistics,
-    LightFigures,
-    LookStatistics,
-    ObjectStatistics,
-    Range,
-    Rest,
-    Statistics,
-    TimePoint,
-)
 from synpick_warp.apps.statistics.paper import compare
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.configs.schema import Config
@@ -54,7 +28,9 @@ DEPTH_QUANTILES = (0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
 LOOK_QUANTILES = (0.05, 0.5, 0.95)
 
 
-def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, threads: int = 0, report: Report | None = None) -> Statistics:
+def compute_statistics(
+    data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, threads: int = 0, report: Report | None = None
+) -> figures.Statistics:
     """Compute the statistics of a data set, which is read once; memory does not grow with its size.
 
         statistics = compute_statistics(synpick_warp.open("DATA"))
@@ -74,7 +50,7 @@ def compute_statistics(data_set: DataSet, *, depth_views: int = DEPTH_VIEWS, thr
     return assemble(data_set, collect(data_set, depth_views, threads or count_cores(), report))
 
 
-def assemble(data_set: DataSet, collected: Collected) -> Statistics:
+def assemble(data_set: DataSet, collected: Collected) -> figures.Statistics:
     """Compute the statistics of a data set from the counts."""
     counts, missing = collected.counts, list(collected.missing)
     order = {name: index for index, name in enumerate(data_set.splits)}
@@ -99,16 +75,16 @@ def assemble(data_set: DataSet, collected: Collected) -> Statistics:
     if any(row.distance is None for row in paper):
         missing.append(OTHER_OBJECTS)
     drawn = look_figures(counts), bin_figures(counts), rest_figures(counts)
-    return Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), *drawn)
+    return figures.Statistics(data_set.camera_count, rows, total, objects, depth, lights, paper, tuple(missing), *drawn)
 
 
-def _group(counts: Counts, split: str, mode: str, groups: Collection[Group]) -> GroupStatistics:
+def _group(counts: Counts, split: str, mode: str, groups: Collection[Group]) -> figures.GroupStatistics:
     """Statistics of some groups together, under the name of a split and a mode."""
-    figures = episode_figures(counts, groups), annotation_figures(counts, groups), timeline_figures(counts, groups)
-    return GroupStatistics(split, mode, *figures)
+    parts = episode_figures(counts, groups), annotation_figures(counts, groups), timeline_figures(counts, groups)
+    return figures.GroupStatistics(split, mode, *parts)
 
 
-def _objects(data_set: DataSet, counts: Counts, total: Annotations) -> tuple[ObjectStatistics, ...]:
+def _objects(data_set: DataSet, counts: Counts, total: figures.Annotations) -> tuple[figures.ObjectStatistics, ...]:
     """Statistics of each object that has a model or an annotation, by obj_id."""
     try:
         known = set(data_set.models_info)
@@ -123,101 +99,107 @@ def _objects(data_set: DataSet, counts: Counts, total: Annotations) -> tuple[Obj
         names = {each.object_id: each.name for each in data_set.objects}
     directions = counts.of("directions")
     return tuple(
-        ObjectStatistics(each, names.get(each, ""), total.objects.get(each, 0), coverage_figures(directions, each)) for each in object_ids
+        figures.ObjectStatistics(each, names.get(each, ""), total.objects.get(each, 0), coverage_figures(directions, each))
+        for each in object_ids
     )
 
 
-def episode_figures(counts: Counts, groups: Collection[Group]) -> EpisodeFigures:
+def episode_figures(counts: Counts, groups: Collection[Group]) -> figures.EpisodeFigures:
     """Episodes of some groups and their attempts."""
     totals, seals, loads = (counts.of(name, groups) for name in ("episodes", "seals", "loads"))
-    return EpisodeFigures(
+    return figures.EpisodeFigures(
         **{name: totals[name] for name in ("episodes", "frames", "objects", "picked", "lost", "attempts")},
         endings=_ranked(counts.of("endings", groups)),
         outcomes=_ranked(counts.of("outcomes", groups)),
         good_seals=counts.of("good_seals", groups)["good_seals"],
         seals=seals["seals"],
-        force=seals["force"] / (FORCE_UNIT * seals["seals"]) if seals["seals"] else None,
-        force_histogram=_histogram(counts.of("forces", groups), FORCE_BINS),
+        force=seals["force"] / (columns.FORCE_UNIT * seals["seals"]) if seals["seals"] else None,
+        force_histogram=_histogram(counts.of("forces", groups), columns.FORCE_BINS),
         largest_load=max(loads, default=None),
     )
 
 
-def annotation_figures(counts: Counts, groups: Collection[Group]) -> Annotations:
+def annotation_figures(counts: Counts, groups: Collection[Group]) -> figures.Annotations:
     """Annotations of some groups."""
     totals, objects = counts.of("views", groups), counts.of("objects", groups)
-    return Annotations(
+    return figures.Annotations(
         views=totals["views"],
         instances=objects.total(),
-        visibility=totals["visibility"] / (VISIBILITY_UNIT * totals["known"]) if totals["known"] else None,
+        visibility=totals["visibility"] / (columns.VISIBILITY_UNIT * totals["known"]) if totals["known"] else None,
         invisible=totals["invisible"],
-        histogram=_histogram(counts.of("visibility", groups), VISIBILITY_BINS),
+        histogram=_histogram(counts.of("visibility", groups), columns.VISIBILITY_BINS),
         objects=dict(sorted(objects.items())),
     )
 
 
-def timeline_figures(counts: Counts, groups: Collection[Group]) -> tuple[TimePoint, ...]:
+def timeline_figures(counts: Counts, groups: Collection[Group]) -> tuple[figures.TimePoint, ...]:
     """Mean number of objects over time in some groups."""
     sums = counts.of("timeline", groups)
     bins = sorted({index for index, _ in sums})
-    return tuple(TimePoint(each * TIME_BIN, sums[each, "frames"], sums[each, "objects"] / sums[each, "frames"]) for each in bins)
+    return tuple(
+        figures.TimePoint(each * columns.TIME_BIN, sums[each, "frames"], sums[each, "objects"] / sums[each, "frames"]) for each in bins
+    )
 
 
-def coverage_figures(directions: Mapping[tuple[int, int], int], object_id: int) -> Coverage:
+def coverage_figures(directions: Mapping[tuple[int, int], int], object_id: int) -> figures.Coverage:
     """Pose coverage of an object, from the numbers of views by obj_id and bin. Symmetries are not taken into account: of a can, all
     longitudes look the same, and count as different."""
-    bins = tuple(directions.get((object_id, index), 0) for index in range(DIRECTION_BINS))
+    bins = tuple(directions.get((object_id, index), 0) for index in range(columns.DIRECTION_BINS))
     total = sum(bins)
     shares = [count / total for count in bins if count]
-    evenness = max(0.0, -math.fsum(share * math.log(share) for share in shares)) / math.log(DIRECTION_BINS)
-    return Coverage(total, len(shares) / DIRECTION_BINS, evenness, bins)
+    evenness = max(0.0, -math.fsum(share * math.log(share) for share in shares)) / math.log(columns.DIRECTION_BINS)
+    return figures.Coverage(total, len(shares) / columns.DIRECTION_BINS, evenness, bins)
 
 
-def depth_figures(counts: Counts) -> Depth | None:
+def depth_figures(counts: Counts) -> figures.Depth | None:
     """Depth of the pixels of all depth images that were read; None: none was."""
     totals = counts.of("depth_views")
     if not totals["pixels"]:
         return None
     pixels = {each: number for (each, _), number in counts.of("depths").items()}
     # Ranks count from 1 on, so that both ends are pixels.
-    quantiles = {share: (each + 0.5) * DEPTH_BIN for share, each in _quantiles(pixels, DEPTH_QUANTILES).items()}
-    return Depth(totals["views"], totals["pixels"], totals["missing"] / totals["pixels"], quantiles)
+    quantiles = {share: (each + 0.5) * columns.DEPTH_BIN for share, each in _quantiles(pixels, DEPTH_QUANTILES).items()}
+    return figures.Depth(totals["views"], totals["pixels"], totals["missing"] / totals["pixels"], quantiles)
 
 
-def light_figures(counts: Counts) -> LightFigures | None:
+def light_figures(counts: Counts) -> figures.LightFigures | None:
     """Light of all episodes; None: no episode names its light."""
     maps = counts.of("light_maps")
     if not maps:
         return None
-    exposure = {round(index * EXPOSURE_BIN, 6): count for index, count in sorted(counts.of("exposures").items())}
-    return LightFigures(maps.total(), _ranked(maps), _histogram(counts.of("light_yaws"), YAW_BINS), exposure)
+    exposure = {round(index * columns.EXPOSURE_BIN, 6): count for index, count in sorted(counts.of("exposures").items())}
+    return figures.LightFigures(maps.total(), _ranked(maps), _histogram(counts.of("light_yaws"), columns.YAW_BINS), exposure)
 
 
-def look_figures(counts: Counts) -> tuple[LookStatistics, ...]:
+def look_figures(counts: Counts) -> tuple[figures.LookStatistics, ...]:
     """What was drawn of each part and parameter, sorted; none: looks are not randomized."""
     drawn: dict[tuple[str, str], dict[float, int]] = {}
     for (part, parameter, value), count in counts.of("looks").items():
         drawn.setdefault((part, parameter), {})[value] = count
     return tuple(
-        LookStatistics(*key, sum(values.values()), tuple(_quantiles(values, LOOK_QUANTILES).values()))
+        figures.LookStatistics(*key, sum(values.values()), tuple(_quantiles(values, LOOK_QUANTILES).values()))
         for key, values in sorted(drawn.items())
     )
 
 
-def bin_figures(counts: Counts) -> dict[str, BinUse]:
+def bin_figures(counts: Counts) -> dict[str, figures.BinUse]:
     """Use of each bin, the most frequent first."""
     steps: dict[tuple[str, str], list[int]] = {}
     for name, axis, step in counts.of("bin_places"):
         steps.setdefault((name, axis), []).append(step)
-    ends: dict[tuple[str, str], Range] = {
-        (name, axis): (min(found) * BIN_STEPS[axis], (max(found) + 1) * BIN_STEPS[axis]) for (name, axis), found in steps.items()
+    ends: dict[tuple[str, str], figures.Range] = {
+        (name, axis): (min(found) * columns.BIN_STEPS[axis], (max(found) + 1) * columns.BIN_STEPS[axis])
+        for (name, axis), found in steps.items()
     }
-    return {name: BinUse(count, *(ends[name, axis] for axis in BIN_STEPS)) for name, count in _ranked(counts.of("bins")).items()}
+    return {
+        name: figures.BinUse(count, *(ends[name, axis] for axis in columns.BIN_STEPS)) for name, count in _ranked(counts.of("bins")).items()
+    }
 
 
-def rest_figures(counts: Counts) -> Rest | None:
+def rest_figures(counts: Counts) -> figures.Rest | None:
     """Windows of piles at rest; None: there is none."""
     windows = counts.of("windows")
-    return Rest(windows["at_rest"], windows["vibrating"]) if windows["at_rest"] else None
+    return figures.Rest(windows["at_rest"], windows["vibrating"]) if windows["at_rest"] else None
 
 
 def _ranked(counts: Mapping[str, int]) -> dict[str, int]:

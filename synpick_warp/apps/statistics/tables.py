@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from itertools import pairwise
-from typing import NamedTuple
 
 from synpick_warp.apps.statistics.columns import BANDS, FORCE_BIN, FORCE_BINS, SECTORS, VISIBILITY_BINS, YAW_BINS
 from synpick_warp.apps.statistics.compute import LOOK_QUANTILES
@@ -24,26 +23,33 @@ TURN = 360.0
 Columns = tuple[Column, ...]
 Rows = Iterator[tuple[Value, ...]]
 
-
-class _TableSource(NamedTuple):
-    """Source of a table: a function that yields its rows, and what stands above them."""
-
-    name: str
-    title: str | Callable[[Statistics], str]
-    columns: Columns | Callable[[Statistics], Columns]
-    rows: Callable[[Statistics], Rows]
-    in_text: bool = True
-    """Whether it is short enough for text."""
+_MAKERS: list[Callable[[Statistics], Table]] = []
+"""Functions that make the tables, in their order."""
 
 
 def make_tables(statistics: Statistics) -> list[Table]:
     """Make all tables of the statistics that have rows."""
-    tables = []
-    for name, title, columns, rows, in_text in _SOURCES:
-        if made := list(rows(statistics)):
+    return [table for make in _MAKERS if (table := make(statistics)).rows]
+
+
+def _table(
+    name: str,
+    title: str | Callable[[Statistics], str],
+    columns: str | Callable[[Statistics], Columns],
+    in_text: bool = True,
+) -> Callable[[Callable[[Statistics], Rows]], Callable[[Statistics], Rows]]:
+    """Decorator that registers a table by the function that yields its rows; columns as of `parse_columns`."""
+
+    def register(rows: Callable[[Statistics], Rows]) -> Callable[[Statistics], Rows]:
+        def make(statistics: Statistics) -> Table:
             shown = title if isinstance(title, str) else title(statistics)
-            tables.append(Table(name, shown, columns(statistics) if callable(columns) else columns, made, in_text))
-    return tables
+            named = parse_columns(columns) if isinstance(columns, str) else columns(statistics)
+            return Table(name, shown, named, list(rows(statistics)), in_text)
+
+        _MAKERS.append(make)
+        return rows
+
+    return register
 
 
 def _label(row: GroupStatistics) -> tuple[str, str]:
@@ -64,16 +70,30 @@ def _by_group(names: str, style: str = ",") -> Callable[[Statistics], Columns]:
     )
 
 
+@_table(
+    "groups",
+    "Views and mean visibility, by split and mode",
+    "split mode episodes:, views:, instances:, instances_per_view:.2f mean_visibility:.3f invisible:.1%",
+)
 def _groups(statistics: Statistics) -> Rows:
-    """Views, instances and mean visibility, by split and mode."""
     for row in _with_total(statistics):
         each = row.annotations
         hidden = each.invisible / each.instances if each.instances else None
         yield *_label(row), row.episodes.episodes, each.views, each.instances, each.instances_per_view, each.visibility, hidden
 
 
+@_table(
+    PAPER,
+    lambda _: (
+        f"Beside SynPick (CASE 2021; in all {read_paper().total_views:,} views, mean visibility {read_paper().total_visibility}): "
+        "frames of a sequence,\n"
+        "instances a view, total variation (TV) distance of the instances over objects to the paper's, and of its train to its test"
+    ),
+    "split mode sequences:, sequences_paper:,:paper views:, views_paper:,:paper frames:.0f frames_paper:.0f:paper"
+    " frames_difference:+.0%:diff visibility:.2f:visible visibility_paper:.2f:paper visibility_difference:+.2f:diff"
+    " instances_per_view:.1f:inst. instances_per_view_paper:.1f:paper object_distance:.3f:TV object_distance_in_paper:.3f:paper",
+)
 def _paper(statistics: Statistics) -> Rows:
-    """The paper's numbers beside those of the data set, by split and mode."""
     for row in statistics.paper:
         ours, theirs = row.ours, row.paper
         seen = None if ours.visibility is None or theirs.visibility is None else ours.visibility - theirs.visibility
@@ -83,16 +103,17 @@ def _paper(statistics: Statistics) -> Rows:
         yield row.split, row.mode, *pairs, frames, *rest, row.distance, row.paper_distance
 
 
-def _paper_title(statistics: Statistics) -> str:
-    paper = read_paper()
-    return (
-        f"Beside SynPick (CASE 2021; in all {paper.total_views:,} views, mean visibility {paper.total_visibility}): frames of a sequence,\n"
-        "instances a view, total variation (TV) distance of the instances over objects to the paper's, and of its train to its test"
-    )
+def _object_columns(statistics: Statistics) -> Columns:
+    modes = (Column(mode, ",") for mode in (*dict.fromkeys(row.mode for row in statistics.groups), ALL))
+    return (*parse_columns("object_id name"), *modes, *parse_columns("share:.1% directions_seen:.0% evenness:.2f"))
 
 
+@_table(
+    "objects",
+    "Annotated instances by object and mode; viewing directions: seen bins of the sphere, and how even they are",
+    _object_columns,
+)
 def _objects(statistics: Statistics) -> Rows:
-    """Annotated instances by object and mode, with the coverage of viewing directions."""
     total = statistics.total.annotations.instances
     for each in statistics.objects if total else ():
         counts = dict.fromkeys((row.mode for row in statistics.groups), 0)
@@ -102,54 +123,61 @@ def _objects(statistics: Statistics) -> Rows:
         yield each.object_id, each.name, *counts.values(), each.instances, *shares
 
 
-def _object_columns(statistics: Statistics) -> Columns:
-    modes = (Column(mode, ",") for mode in (*dict.fromkeys(row.mode for row in statistics.groups), ALL))
-    return (*parse_columns("object_id name"), *modes, *parse_columns("share:.1% directions_seen:.0% evenness:.2f"))
-
-
+@_table("annotations", "Annotated instances by split, mode and object", "split mode object_id name instances:,", in_text=False)
 def _annotations(statistics: Statistics) -> Rows:
-    """Annotated instances by split, mode and object."""
     for row in statistics.groups:
         for each in statistics.objects if row.annotations.views else ():
             yield *_label(row), each.object_id, each.name, row.annotations.objects.get(each.object_id, 0)
 
 
+@_table("visibility", "Instances by visible fraction", _by_group("from:.2f to:.2f"))
 def _visibility(statistics: Statistics) -> Rows:
-    """Histogram of the visible fraction of instances, a column for each group."""
     for index in range(VISIBILITY_BINS) if statistics.total.annotations.instances else ():
         counts = [row.annotations.histogram[index] for row in _with_total(statistics)]
         yield index / VISIBILITY_BINS, (index + 1) / VISIBILITY_BINS, *counts
 
 
-def _shares(counts: Callable[[GroupStatistics], Mapping[str, int]]) -> Callable[[Statistics], Rows]:
+@_table("endings", "Endings of episodes", "split mode ending episodes:, fraction:.1%")
+def _endings(statistics: Statistics) -> Rows:
+    yield from _shares(statistics, lambda row: row.episodes.endings)
+
+
+@_table("outcomes", "Outcomes of attempts to pick", "split mode outcome attempts:, fraction:.1%")
+def _outcomes(statistics: Statistics) -> Rows:
+    yield from _shares(statistics, lambda row: row.episodes.outcomes)
+
+
+def _shares(statistics: Statistics, counts: Callable[[GroupStatistics], Mapping[str, int]]) -> Rows:
     """Rows of split, mode, name, count, and fraction of the group."""
-
-    def rows(statistics: Statistics) -> Rows:
-        for row in statistics.groups:
-            found = counts(row)
-            yield from ((*_label(row), name, count, count / sum(found.values())) for name, count in found.items())
-
-    return rows
+    for row in statistics.groups:
+        found = counts(row)
+        yield from ((*_label(row), name, count, count / sum(found.values())) for name, count in found.items())
 
 
+@_table(
+    "attempts",
+    "Objects and attempts; mean over engaged attempts of the largest seal force [N]",
+    "split mode objects:, picked:, lost:, attempts:, attempts_per_episode:.2f engaged:, good_seals:, mean_peak_force_N:.1f",
+)
 def _attempts(statistics: Statistics) -> Rows:
-    """Objects, attempts and seals, by split and mode."""
     for row in _with_total(statistics) if statistics.total.episodes.attempts else ():
         each = row.episodes
         rate = each.attempts / each.episodes if each.episodes else None
         yield *_label(row), each.objects, each.picked, each.lost, each.attempts, rate, each.seals, each.good_seals, each.force
 
 
+@_table("seal_forces", "Attempts by largest seal force [N]", _by_group("from_N:.0f to_N:.0f"))
 def _forces(statistics: Statistics) -> Rows:
-    """Histogram of the largest seal force of attempts [N], a column for each group; the last bin has no upper end (None)."""
+    """The last bin has no upper end (None)."""
     last = max((index for index, count in enumerate(statistics.total.episodes.force_histogram) if count), default=-1)
     for index in range(last + 1):
         end = None if index == FORCE_BINS - 1 else (index + 1) * FORCE_BIN
         yield index * FORCE_BIN, end, *(row.episodes.force_histogram[index] for row in _with_total(statistics))
 
 
+@_table(TIMELINE, "Mean number of objects in the scene, by time since the first frame [s]", _by_group("time_s:.0f", ".2f"))
 def _timeline(statistics: Statistics) -> Rows:
-    """Mean number of objects in the scene by time [s], a column for each group; None: no frame at that time."""
+    """None: no frame at that time."""
     groups = [{point.time: point.objects for point in row.objects_over_time} for row in _with_total(statistics)]
     for time in sorted({time for group in groups for time in group}):
         yield time, *(group.get(time) for group in groups)
@@ -161,131 +189,60 @@ def _depth_title(statistics: Statistics) -> str:
     return f"Planar depth of pixels [mm] ({views})"
 
 
+@_table("depth", _depth_title, "quantile:.0% depth_mm:.1f")
+def _depth(statistics: Statistics) -> Rows:
+    yield from statistics.depth.quantiles.items() if statistics.depth else ()
+
+
+@_table("lights", "Environment maps", "map episodes:, fraction:.1%")
 def _light_maps(statistics: Statistics) -> Rows:
-    """Episodes by environment map."""
     if lights := statistics.lights:
         yield from ((name, count, count / lights.episodes) for name, count in lights.maps.items())
 
 
+@_table("light_yaw", "Episodes by yaw of the environment map [°]", "from_degrees:.0f to_degrees:.0f episodes:,", in_text=False)
 def _yaws(statistics: Statistics) -> Rows:
-    """Histogram of the environment map's yaw [°] over episodes."""
     step = TURN / YAW_BINS
     for index, count in enumerate(statistics.lights.yaw if statistics.lights else ()):
         yield index * step, (index + 1) * step, count
 
 
+@_table("light_exposure", "Episodes by exposure compensation [EV]", "from_EV:.1f episodes:,", in_text=False)
+def _exposures(statistics: Statistics) -> Rows:
+    yield from statistics.lights.exposure.items() if statistics.lights else ()
+
+
+@_table(
+    "looks",
+    "Randomized looks: quantiles of what episodes have drawn",
+    f"part parameter draws:, {' '.join(f'quantile_{share}:.3g:{share:.0%}' for share in LOOK_QUANTILES)}",
+)
+def _looks(statistics: Statistics) -> Rows:
+    yield from ((row.part, row.parameter, row.draws, *row.quantiles) for row in statistics.looks)
+
+
+@_table(
+    "bins",
+    "Bins and where they stand",
+    "bin episodes:, fraction:.1% x_from_mm:.0f x_to_mm:.0f y_from_mm:.0f y_to_mm:.0f yaw_from_degrees:.0f yaw_to_degrees:.0f",
+)
 def _bins(statistics: Statistics) -> Rows:
-    """Episodes by bin, with the intervals that its places span; none if bins are not named."""
     total = sum(use.episodes for use in statistics.bins.values())
     for name, use in statistics.bins.items():
         yield name, use.episodes, use.episodes / total, *(1e3 * end for end in (*use.x, *use.y)), *map(math.degrees, use.yaw)
 
 
+@_table(
+    "coverage",
+    "Views by object and viewing direction in its frame",
+    "object_id z_from z_to longitude_from longitude_to views",
+    in_text=False,
+)
 def _coverage(statistics: Statistics) -> Rows:
-    """Views by object and bin of the viewing direction in its frame, without empty bins."""
+    """Empty bins are left out."""
     heights = [2.0 * index / BANDS - 1.0 for index in range(BANDS + 1)]
     turns = [TURN * index / SECTORS - TURN / 2.0 for index in range(SECTORS + 1)]
     cells = [(*z, *turn) for z in pairwise(heights) for turn in pairwise(turns)]
     for each in statistics.objects:
         seen = zip(cells, each.coverage.bins, strict=True)
         yield from ((each.object_id, *(round(edge, 6) for edge in cell), count) for cell, count in seen if count)
-
-
-_SOURCES = (
-    _TableSource(
-        "groups",
-        "Views and mean visibility, by split and mode",
-        parse_columns("split mode episodes:, views:, instances:, instances_per_view:.2f mean_visibility:.3f invisible:.1%"),
-        _groups,
-    ),
-    _TableSource(
-        PAPER,
-        _paper_title,
-        parse_columns(
-            "split mode sequences:, sequences_paper:,:paper views:, views_paper:,:paper frames:.0f frames_paper:.0f:paper"
-            " frames_difference:+.0%:diff visibility:.2f:visible visibility_paper:.2f:paper visibility_difference:+.2f:diff"
-            " instances_per_view:.1f:inst. instances_per_view_paper:.1f:paper object_distance:.3f:TV object_distance_in_paper:.3f:paper"
-        ),
-        _paper,
-    ),
-    _TableSource(
-        "objects",
-        "Annotated instances by object and mode; viewing directions: seen bins of the sphere, and how even they are",
-        _object_columns,
-        _objects,
-    ),
-    _TableSource(
-        "annotations",
-        "Annotated instances by split, mode and object",
-        parse_columns("split mode object_id name instances:,"),
-        _annotations,
-        in_text=False,
-    ),
-    _TableSource("visibility", "Instances by visible fraction", _by_group("from:.2f to:.2f"), _visibility),
-    _TableSource(
-        "endings",
-        "Endings of episodes",
-        parse_columns("split mode ending episodes:, fraction:.1%"),
-        _shares(lambda row: row.episodes.endings),
-    ),
-    _TableSource(
-        "outcomes",
-        "Outcomes of attempts to pick",
-        parse_columns("split mode outcome attempts:, fraction:.1%"),
-        _shares(lambda row: row.episodes.outcomes),
-    ),
-    _TableSource(
-        "attempts",
-        "Objects and attempts; mean over engaged attempts of the largest seal force [N]",
-        parse_columns(
-            "split mode objects:, picked:, lost:, attempts:, attempts_per_episode:.2f engaged:, good_seals:, mean_peak_force_N:.1f"
-        ),
-        _attempts,
-    ),
-    _TableSource("seal_forces", "Attempts by largest seal force [N]", _by_group("from_N:.0f to_N:.0f"), _forces),
-    _TableSource(
-        TIMELINE, "Mean number of objects in the scene, by time since the first frame [s]", _by_group("time_s:.0f", ".2f"), _timeline
-    ),
-    _TableSource(
-        "depth",
-        _depth_title,
-        parse_columns("quantile:.0% depth_mm:.1f"),
-        lambda statistics: iter(statistics.depth.quantiles.items() if statistics.depth else ()),
-    ),
-    _TableSource("lights", "Environment maps", parse_columns("map episodes:, fraction:.1%"), _light_maps),
-    _TableSource(
-        "light_yaw",
-        "Episodes by yaw of the environment map [°]",
-        parse_columns("from_degrees:.0f to_degrees:.0f episodes:,"),
-        _yaws,
-        in_text=False,
-    ),
-    _TableSource(
-        "light_exposure",
-        "Episodes by exposure compensation [EV]",
-        parse_columns("from_EV:.1f episodes:,"),
-        lambda statistics: iter(statistics.lights.exposure.items() if statistics.lights else ()),
-        in_text=False,
-    ),
-    _TableSource(
-        "looks",
-        "Randomized looks: quantiles of what episodes have drawn",
-        parse_columns(f"part parameter draws:, {' '.join(f'quantile_{share}:.3g:{share:.0%}' for share in LOOK_QUANTILES)}"),
-        lambda statistics: ((row.part, row.parameter, row.draws, *row.quantiles) for row in statistics.looks),
-    ),
-    _TableSource(
-        "bins",
-        "Bins and where they stand",
-        parse_columns(
-            "bin episodes:, fraction:.1% x_from_mm:.0f x_to_mm:.0f y_from_mm:.0f y_to_mm:.0f yaw_from_degrees:.0f yaw_to_degrees:.0f"
-        ),
-        _bins,
-    ),
-    _TableSource(
-        "coverage",
-        "Views by object and viewing direction in its frame",
-        parse_columns("object_id z_from z_to longitude_from longitude_to views"),
-        _coverage,
-        in_text=False,
-    ),
-)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import cv2
@@ -21,6 +21,10 @@ INK = (40, 40, 40)
 WHITE = (255, 255, 255)
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
+_SMALL = 0.44
+"""Font scale of a caption (OpenCV)."""
+Color = tuple[int, int, int]
+"""Blue, green, red."""
 Image = np.ndarray
 """(H, W, 3) uint8, blue first, OpenCV's order."""
 
@@ -55,7 +59,7 @@ def write_picture(out: Path, picture: Image) -> Path:
     return out
 
 
-def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
+def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: Color, thickness: int = 1) -> None:
     """Draw text; `place` is its lower left corner [px], `size` OpenCV's font scale."""
     # Names of folders and texts of records may have characters that cannot be encoded, or that end OpenCV's string.
     shown = "".join(letter if letter.isprintable() else "?" for letter in text)
@@ -68,13 +72,52 @@ def text_size(text: str, size: float) -> tuple[int, int]:
     return width, height
 
 
-def instance_color(instance: int) -> tuple[int, int, int]:
+def put_lines(image: Image, lines: Iterable[str], place: tuple[int, int], step: int, size: float, color: Color = INK) -> None:
+    """Draw lines of text below each other, at a distance of `step` [px]; `place` is the lower left corner of the first."""
+    for number, line in enumerate(lines):
+        put_text(image, line, (place[0], place[1] + step * number), size, color)
+
+
+def shorten(text: str, width: float, size: float) -> str:
+    """Cut a text to a width [px] at a font scale."""
+    if text_size(text, size)[0] <= width:
+        return text
+    while text and text_size(f"{text}...", size)[0] > width:
+        text = text[: -1 - len(text) // 16]
+    return f"{text}..."
+
+
+def blank(width: int, height: int) -> Image:
+    """A white image."""
+    return np.full((height, width, 3), 255, np.uint8)
+
+
+def paste(sheet: Image, picture: Image, column: int, row: int) -> None:
+    """Copy a picture into a sheet; `column` and `row` are those of its upper left corner."""
+    sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
+
+
+def stacked(rows: Sequence[Image], gap: int = 0) -> Image:
+    """Images below each other, each followed by a gap, on white as wide as the widest."""
+    width = max(row.shape[1] for row in rows)
+    padded = [cv2.copyMakeBorder(row, 0, gap, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=WHITE) for row in rows]
+    return np.concatenate(padded)
+
+
+def with_text(picture: Image, lines: Sequence[str], height: int, step: int) -> Image:
+    """Picture with lines of small text in a white strip of a height [px] below it."""
+    strip = blank(picture.shape[1], height)
+    put_lines(strip, lines, (4, step - 2), step, _SMALL)
+    return np.concatenate([picture, strip])
+
+
+def instance_color(instance: int) -> Color:
     """Colour of an instance id, the same in all images of an episode; blue first."""
     red, green, blue = colorsys.hsv_to_rgb(instance * GOLDEN % 1.0, 0.85 - 0.3 * (instance % 2), 1.0)
     return round(255 * blue), round(255 * green), round(255 * red)
 
 
-def readable_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
+def readable_on(color: Color) -> Color:
     """Text colour with contrast to a background (blue first): dark or white by luma."""
     blue, green, red = color
     return INK if 0.114 * blue + 0.587 * green + 0.299 * red > 110 else WHITE

@@ -11,7 +11,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, check_picture_name, instance_color, put_text, readable_on, write_picture
+from synpick_warp.apps.viz.drawing import (
+    FONT,
+    INK,
+    WHITE,
+    Image,
+    blank,
+    check_picture_name,
+    instance_color,
+    paste,
+    put_text,
+    readable_on,
+    write_picture,
+)
 from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clutter_edges, disc, draw_graph, fixed, put_boxed
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MODE_WORDS, SeenAttempt, choose_attempts, labels, read_attempts
@@ -82,7 +94,7 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
-        _paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
+        paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
     return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
@@ -139,17 +151,17 @@ def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image,
     image = draw_observation(attempt, view, planned)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
-    sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
+    sheet = blank(IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, HEAD + height + 2 * MARGIN)
     columns = MARGIN, 2 * MARGIN + IMAGE_WIDTH, 3 * MARGIN + IMAGE_WIDTH + _GRAPH_WIDTH
     top = MARGIN + HEAD
-    _paste(sheet, image, columns[0], top)
+    paste(sheet, image, columns[0], top)
     _draw_key(sheet, columns[0], top + image.shape[0] + 24)
     states = {edge.state for edge in clutter_edges(attempt, min_votes)}
     foot = _graph_foot(states) if attempt.seen else []
-    _paste(sheet, draw_graph(attempt, min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    paste(sheet, draw_graph(attempt, min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
     for number, (text, color) in enumerate(foot):
         put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
-    _paste(sheet, words, columns[2], top)
+    paste(sheet, words, columns[2], top)
     head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
     put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
     scene = Path(view.place)
@@ -160,10 +172,6 @@ def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image,
         put_text(sheet, text, (column, top - 9), TEXT, SOFT)
     sheet[-1] = GREY
     return sheet, height - image.shape[0] - 2 * LINE - MARGIN
-
-
-def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
-    sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
 def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -> Image:

@@ -14,7 +14,7 @@ import cv2
 import networkx as nx
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, instance_color, put_text, readable_on
+from synpick_warp.apps.viz.drawing import FONT, INK, WHITE, Image, blank, instance_color, put_text, readable_on
 from synpick_warp.apps.viz.explain_record import SeenAttempt, labels
 from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
@@ -156,7 +156,7 @@ def draw_graph(attempt: SeenAttempt, min_votes: float, size: tuple[int, int]) ->
         min_votes: Minimum votes of an edge.
         size: Width and height [px].
     """
-    canvas = np.full((size[1], size[0], 3), 255, np.uint8)
+    canvas = blank(*size)
     edges = clutter_edges(attempt, min_votes)
     layout = lay_out(attempt, edges, size)
     for edge in edges:

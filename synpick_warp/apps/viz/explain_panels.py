@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import FONT, INK, Image, instance_color, put_text
+from synpick_warp.apps.viz.drawing import FONT, INK, Image, blank, instance_color, put_text, shorten
 from synpick_warp.apps.viz.explain_graph import GREY, RED, disc
 from synpick_warp.apps.viz.explain_record import SeenAttempt, break_force, choice_words, labels, seal_words, suction_kind
 from synpick_warp.configs.cell.gripper import Suction
@@ -44,7 +44,7 @@ def draw_words(attempt: SeenAttempt, names: Mapping[int, str], rules: tuple[Targ
     lines += [(line, INK) for text in seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     outcome = attempt.sentence[:1].upper() + attempt.sentence[1:]
     lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
-    canvas = np.full((LINE * (len(lines) + len(attempt.seen) + 3), WORDS_WIDTH, 3), 255, np.uint8)
+    canvas = blank(WORDS_WIDTH, LINE * (len(lines) + len(attempt.seen) + 3))
     for number, (text, color) in enumerate(lines):
         put_text(canvas, text, (0, LINE * number + 16), TEXT, color)
     if attempt.seen:
@@ -65,7 +65,7 @@ def _draw_table(canvas: Image, attempt: SeenAttempt, names: Mapping[int, str], t
             canvas[y - 15 : y + 7] = (225, 240, 225) if attempt.picked else (228, 228, 245)
         disc(canvas, (8, y - 5), 7, INK)
         disc(canvas, (8, y - 5), 6, instance_color(one.instance))
-        name = fitted(f"{short[one.instance]} {names.get(one.object_id, '')}", TEXT, _COLUMNS[1][0] - 30)
+        name = shorten(f"{short[one.instance]} {names.get(one.object_id, '')}", _COLUMNS[1][0] - 30, TEXT)
         kind = ("pole", "centr.", "half", "drawn")[suction_kind(one)]
         cells = ((22, name), (244, f"{len(one.ancestors)}"), (296, f"{one.visible_fraction:.2f}"), (356, f"{one.visible}"), (416, kind))
         for x, text in cells:
@@ -84,15 +84,6 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
         else:
             current = longer
     return [*lines, current]
-
-
-def fitted(text: str, size: float, width: int) -> str:
-    """Text truncated to a width [px]."""
-    if cv2.getTextSize(text, FONT, size, 2)[0][0] <= width:
-        return text
-    while text and cv2.getTextSize(text + "..", FONT, size, 2)[0][0] > width:
-        text = text[:-1]
-    return text + ".."
 
 
 def load_chart(attempt: SeenAttempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:

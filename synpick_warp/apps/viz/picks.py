@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from synpick_warp.apps.viz.drawing import INK, WHITE, Image, check_picture_name, put_text, write_picture
+from synpick_warp.apps.viz.drawing import INK, WHITE, Image, blank, check_picture_name, paste, put_text, write_picture
 from synpick_warp.apps.viz.explain_graph import disc, fixed
 from synpick_warp.apps.viz.explain_panels import GREEN, LINE, TEXT, wrapped
 from synpick_warp.codes import Ending, Outcome, Share
@@ -251,12 +251,12 @@ def _find_episode(data_set: DataSet, episode: int | None) -> Episode:
 def _maps_row(head: str, view: View, picks: np.ndarray) -> Image:
     """Two heat maps beside each other, with a headline and their captions above."""
     maps = draw_pick_maps(view, picks)
-    row = np.full((_HEAD + maps[0][1].shape[0] + _MARGIN, 2 * WIDTH + 3 * _MARGIN, 3), 255, np.uint8)
+    row = blank(2 * WIDTH + 3 * _MARGIN, _HEAD + maps[0][1].shape[0] + _MARGIN)
     put_text(row, head, (_MARGIN, 18), 1.3 * TEXT, INK, 2)
     for number, (caption, picture) in enumerate(maps):
         left = _MARGIN + number * (WIDTH + _MARGIN)
         put_text(row, caption, (left, _HEAD - 8), TEXT, INK)
-        row[_HEAD : _HEAD + picture.shape[0], left : left + WIDTH] = picture
+        paste(row, picture, left, _HEAD)
     return row
 
 
@@ -266,8 +266,8 @@ def _compose(view: View, picks: np.ndarray, trial: np.void, names: Mapping[int, 
     maps, crop = _maps_row(head, view, picks), draw_trial(view, trial, radius)
     name = f"{names.get(int(trial['obj_id']), 'object')} (instance {trial['instance']})"
     lines = [line for text in describe_trial(trial, name) for line in wrapped(text, 1.3 * TEXT, 2 * WIDTH - _CROP_WIDTH)]
-    below = np.full((max(_CROP_WIDTH, round(1.3 * LINE) * len(lines)) + _MARGIN, maps.shape[1], 3), 255, np.uint8)
-    below[:_CROP_WIDTH, _MARGIN : _MARGIN + _CROP_WIDTH] = crop
+    below = blank(maps.shape[1], max(_CROP_WIDTH, round(1.3 * LINE) * len(lines)) + _MARGIN)
+    paste(below, crop, _MARGIN, 0)
     for number, line in enumerate(lines):
         color = (GREEN if trial["success"] else _RED) if line.startswith("outcome") else INK
         put_text(below, line, (2 * _MARGIN + _CROP_WIDTH, round(1.3 * LINE) * (number + 1) - 8), 1.3 * TEXT, color)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import Image, instance_color, put_text, readable_on, short_labels, text_size
+from synpick_warp.apps.viz.drawing import Image, instance_color, put_lines, put_text, readable_on, short_labels, shorten, text_size
 
 LABEL = 0.42
 """Font scale of a box's label."""
@@ -149,8 +149,7 @@ def draw_legend(
         names: obj_id -> name; it may lack some.
     """
     panel = np.zeros((size[1], size[0], 3), np.uint8)
-    for row, fact in enumerate(facts):
-        put_text(panel, shorten(fact, size[0] - 12, _TEXT), (6, LINE * (row + 1) - 3), _TEXT, PAPER)
+    put_lines(panel, (shorten(fact, size[0] - 12, _TEXT) for fact in facts), (6, LINE - 3), LINE, _TEXT, PAPER)
     texts = label_texts(truth)
     order = sorted(range(len(truth)), key=lambda index: (-np.nan_to_num(truth[index][1]["visib_fract"]), index))
     top, rows, columns = LINE * len(facts) + _SPACE, _rows(size[1], len(facts)), size[0] // COLUMN
@@ -170,12 +169,3 @@ def draw_legend(
         place = (6 + COLUMN * (columns - 1), top + LINE * rows - 6)
         put_text(panel, f"and {len(order) - len(shown)} more", place, _TEXT, SOFT)
     return panel
-
-
-def shorten(text: str, width: float, size: float) -> str:
-    """Cut a text to a width [px] at a font scale."""
-    if text_size(text, size)[0] <= width:
-        return text
-    while text and text_size(f"{text}...", size)[0] > width:
-        text = text[: -1 - len(text) // 16]
-    return f"{text}..."

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import INK, WHITE, Image, put_text, write_picture
+from synpick_warp.apps.viz.drawing import Image, blank, put_text, stacked, with_text, write_picture
 from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
 from synpick_warp.scenes.symmetries.groups import describe_counts
 from synpick_warp.scenes.symmetries.surface import Surface
@@ -17,8 +17,8 @@ from synpick_warp.scenes.types import RawObject
 
 MAX_OBJECTS = 32
 """Most objects of a sheet; of more, the first are drawn, which is told."""
-_SIDE, _CAPTION, _TURNS = 260, 44, 4
-"""Size of a panel and height of its caption [px], and most rotations shown of an object."""
+_SIDE, _CAPTION, _LINE, _TURNS = 260, 44, 18, 4
+"""Size of a panel, heights of its caption and of a line [px], and most rotations shown of an object."""
 _VIEW = np.array((0.55, -0.7, 0.45)) / np.linalg.norm((0.55, -0.7, 0.45))
 _CHECKED = 7
 """Angles of a continuous symmetry of which the worst is shown."""
@@ -49,9 +49,7 @@ def write_symmetry_sheet(objects: Sequence[RawObject], tolerance: float, out: Pa
     if len(objects) > MAX_OBJECTS:
         report(f"the first {MAX_OBJECTS} of {len(objects)} objects are drawn")
     rows = [_row(raw, tolerance * raw.hull.diameter) for raw in objects[:MAX_OBJECTS]]
-    width = max(row.shape[1] for row in rows)
-    sheet = [cv2.copyMakeBorder(row, 0, 0, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=WHITE) for row in rows]
-    return write_picture(out, np.concatenate(sheet))
+    return write_picture(out, stacked(rows))
 
 
 def group_turns(raw: RawObject) -> list[Turn]:
@@ -69,7 +67,7 @@ def _row(raw: RawObject, tolerance: float) -> Image:
     for turn in turns:
         _draw_axis(first, turn, surface.center, scale, raw.hull.diameter)
     said = f"symmetries: {describe_counts(len(raw.symmetries_discrete), len(raw.symmetries_continuous))}"
-    panels = [_captioned(first, f"{raw.obj_id} {raw.name}"[:34], said)]
+    panels = [with_text(first, [f"{raw.obj_id} {raw.name}"[:34], said], _CAPTION, _LINE)]
     for turn in turns[:_TURNS]:
         angles = [2.0 * np.pi / turn.fold] if turn.fold else [2.0 * np.pi * (step + 0.5) / _CHECKED for step in range(_CHECKED)]
         matrices = [turn_matrix(turn.axis, turn.point, angle) for angle in angles]
@@ -88,11 +86,8 @@ def _overlay(surface: Surface, itself: _Drawn, turn: Turn, matrix: np.ndarray, s
     _draw_axis(image, turn, surface.center, scale, diameter)
     name = f"1/{turn.fold} turn" if turn.fold else "any angle"
     off = 1e3 * surface.deviation(matrix)
-    return _captioned(
-        image,
-        f"{name} about {' '.join(f'{value + 0.0:.2f}' for value in turn.axis.round(2))}",
-        f"{off:.2g} mm; red from {2e3 * tolerance:.2g} mm on",
-    )
+    about = " ".join(f"{value + 0.0:.2f}" for value in turn.axis.round(2))
+    return with_text(image, [f"{name} about {about}", f"{off:.2g} mm; red from {2e3 * tolerance:.2g} mm on"], _CAPTION, _LINE)
 
 
 def _frame() -> np.ndarray:
@@ -110,7 +105,7 @@ def _project(points: np.ndarray, center: np.ndarray, scale: float) -> tuple[np.n
 
 def _splat(bodies: list[_Drawn], center: np.ndarray, scale: float, lift: float = 0.0) -> Image:
     """Draw points with a depth buffer, three pixels wide, shaded by a light at the viewer; later bodies lie `lift` [m] nearer."""
-    image = np.full((_SIDE + 2, _SIDE + 2, 3), 255, np.uint8)
+    image = blank(_SIDE + 2, _SIDE + 2)
     pixels, nearness, colors = [], [], []
     for index, body in enumerate(bodies):
         place, near = _project(body.points, center, scale)
@@ -134,11 +129,3 @@ def _draw_axis(image: Image, turn: Turn, center: np.ndarray, scale: float, diame
     start, end = (tuple(int(value) for value in place.round()) for place in ends)
     cv2.line(image, start, end, color, 1, cv2.LINE_AA)
     put_text(image, str(turn.fold) if turn.fold else "any", (end[0] + 2, end[1]), 0.4, color)
-
-
-def _captioned(image: Image, *lines: str) -> Image:
-    """Panel with lines of text below it."""
-    caption = np.full((_CAPTION, _SIDE, 3), 255, np.uint8)
-    for index, line in enumerate(lines):
-        put_text(caption, line, (6, 16 + 18 * index), 0.42, INK)
-    return np.concatenate([image, caption])

@@ -123,7 +123,7 @@ def new_cell(
     _check_parts(parts := part or [], {"--unit": unit, "--density": density, "--mass": mass})
     weights = _parse_density(density), _check_mass(mass, density)
     shape = _read_bin(bin_, bin_unit, bin_up, bin_collision)
-    from synpick_warp.apps.viz.cell.poses import pose_for
+    from synpick_warp.apps.viz.cell.frusta import pose_for
     from synpick_warp.cli.display import make_console, make_progress
 
     with _staged(folder, place) as stage, make_progress(make_console()) as progress:

@@ -1,20 +1,27 @@
-"""Wireframe overlay on a rendered view, with a depth test: camera frusta to scale, their footprints and axes; hidden lines are faint."""
+"""Cameras of a cell: projection, poses to start from, and a wireframe overlay on a rendered view with a depth test: camera frusta to scale,
+their footprints and axes; hidden lines are faint."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import Image, put_text, text_size
+from synpick_warp.apps.viz.drawing import Color, Image, put_text, text_size
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.gripper import Gripper
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.episodes.manipulation import Pick
+from synpick_warp.scenes.cameras import is_in_way, make_cameras
 from synpick_warp.scenes.types import Camera
 
 if TYPE_CHECKING:
     from synpick_warp.apps.viz.cell.rendering import Picture
 
-Color = tuple[int, int, int]
-"""Blue, green, red."""
 _STEP = 4.0
 """Length of the line segments whose visibility is tested [px]."""
 _SLACK = 0.004
@@ -31,6 +38,12 @@ _WIDE = 1.3
 """Maximum ratio of edge length to depth of a drawn frustum; those of wide-angle lenses are drawn shorter."""
 _LIFT = 1e-3
 """Height of footprints over the floor [m]."""
+_DIRECTIONS = ((90.0, 90.0), (-90.0, 55.0), (90.0, 55.0), (0.0, 55.0), (180.0, 55.0), (-45.0, 55.0), (135.0, 55.0))
+"""Azimuth and elevation from which the cameras look at the bin [°]: the first from above."""
+_LOWER, _LOWEST = 5.0, 40.0
+"""Elevations at which a camera is tried that would stand in the gripper's way, and the lowest [°]."""
+_FARTHEST, _BORDER = 20.0, 0.05
+"""Largest distance of a camera [m], and free border of its image around the bin, as a fraction of its sides."""
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -66,6 +79,38 @@ def footprint(camera: Camera, height: float, most: float) -> tuple[np.ndarray, n
         depth = np.where(along[:, 2] < 0.0, (height - at[2]) / along[:, 2], np.inf)
     meets = (depth > 0.0) & (depth <= most)
     return at + along * np.where(meets, depth, most)[:, None], meets
+
+
+def pose_for(row: CameraRow, index: int, sizes: BinSizes) -> Pose:
+    """Pose from which a camera sees all of a bin, as near as it can: the first from above, the others from the sides, as steep as they can
+    without standing in the gripper's way."""
+    azimuth, elevation = _DIRECTIONS[index % len(_DIRECTIONS)]
+    up = (0.0, 1.0, 0.0) if index % len(_DIRECTIONS) == 0 else (0.0, 0.0, 1.0)
+    while True:
+        pose = _nearest(row, math.radians(azimuth), math.radians(elevation), up, sizes)
+        if elevation <= _LOWEST or not is_in_way(pose.position or (), sizes, Gripper(), Pick()):
+            return pose
+        elevation -= _LOWER
+
+
+def _nearest(row: CameraRow, azimuth: float, elevation: float, up: tuple[float, float, float], sizes: BinSizes) -> Pose:
+    """Pose in a direction [rad] from which a camera sees all of a bin, as near as it can."""
+    back = (math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation))
+    target = (0.0, 0.0, round(sizes.height / 2.0, 3))
+
+    def pose(distance: float) -> Pose:
+        x, y, z = (round(end + distance * step, 3) + 0.0 for end, step in zip(target, back, strict=True))
+        return Pose(position=(x, y, z), look_at=target, up=up)
+
+    near, far = 0.6 * math.hypot(*sizes.outer, sizes.height - sizes.base), _FARTHEST
+    while far - near > 1e-3:
+        middle = (near + far) / 2.0
+        (camera,) = make_cameras(Rig.of(Cameras(), (replace(row, pose=pose(middle)),)))
+        pixels, depth = project(camera, np.array(sizes.corners))
+        border = _BORDER * np.array((camera.width, camera.height))
+        fits = (depth > 0.0).all() and (pixels >= border).all() and (pixels <= (camera.width, camera.height) - border).all()
+        near, far = (near, middle) if fits else (middle, far)
+    return pose(far)
 
 
 class Canvas:

@@ -11,7 +11,7 @@ import numpy as np
 
 from synpick_warp.apps.viz.cell.frusta import Canvas, draw_axes, draw_camera, project, rays
 from synpick_warp.apps.viz.cell.rendering import CellScene, scaled_down
-from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, check_picture_name, put_text, write_picture
+from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, blank, check_picture_name, put_text, stacked, with_text, write_picture
 from synpick_warp.configs.cell.bins import Bins
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import Rig
@@ -31,8 +31,8 @@ _PYRAMID = 0.1
 """Depth of the camera pyramids, as a fraction of the diameter of the cell."""
 _FAR = 3.0
 """Depth to which views are drawn that meet no floor, in sizes of the cell."""
-_PANEL, _CAPTION, _GAP = 480, 62, 8
-"""Longest side of a camera's picture, height of the text below, and gaps [px]."""
+_PANEL, _CAPTION, _LINE, _GAP = 480, 62, 19, 8
+"""Longest side of a camera's picture, heights of the text below and of its lines, and gaps [px]."""
 _COLUMNS = 3
 """Cameras beside each other."""
 MAX_BINS = 4
@@ -62,9 +62,7 @@ def write_cell_sheet(scene: CellScene, rig: Rig, bins: Bins, name: str, out: Pat
     panels = [_draw_camera_view(scene, rig, index, camera) for index, camera in enumerate(cameras)]
     rows = [_row([view, _facts(scene, bins, index, name if index == 0 else "")]) for index, view in enumerate(views)]
     rows += [_row(panels[start : start + _COLUMNS]) for start in range(0, len(panels), _COLUMNS)]
-    width = max(row.shape[1] for row in rows)
-    rows = [cv2.copyMakeBorder(row, 0, _GAP, 0, width - row.shape[1], cv2.BORDER_CONSTANT, value=WHITE) for row in rows]
-    return write_picture(out, cv2.copyMakeBorder(np.concatenate(rows), _GAP, 0, _GAP, _GAP, cv2.BORDER_CONSTANT, value=WHITE))
+    return write_picture(out, cv2.copyMakeBorder(stacked(rows, _GAP), _GAP, 0, _GAP, _GAP, cv2.BORDER_CONSTANT, value=WHITE))
 
 
 def _outside_camera(scene: CellScene, cameras: tuple[Camera, ...]) -> Camera:
@@ -132,7 +130,7 @@ def _draw_camera_view(scene: CellScene, rig: Rig, index: int, camera: Camera) ->
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC if scale > 1.0 else cv2.INTER_AREA)
     cv2.rectangle(picture, (0, 0), (size[0] - 1, size[1] - 1), _color(index), 3)
     picture = cv2.copyMakeBorder(picture, 0, 0, 0, _PANEL - size[0], cv2.BORDER_CONSTANT, value=WHITE)
-    return _with_text(picture, describe_camera(camera, name, scene.sizes[0]))
+    return with_text(picture, describe_camera(camera, name, scene.sizes[0]), _CAPTION, _LINE)
 
 
 def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
@@ -154,14 +152,6 @@ def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
         f"fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}{lens}",
         f"{floor}; {inside.sum()} of {len(inside)} corners of the {bin.noun} in view",
     ]
-
-
-def _with_text(picture: Image, lines: list[str]) -> Image:
-    """Picture with lines of text below."""
-    caption = np.full((_CAPTION, picture.shape[1], 3), 255, np.uint8)
-    for index, line in enumerate(lines):
-        put_text(caption, line, (4, 17 + 19 * index), 0.46, INK)
-    return np.concatenate([picture, caption])
 
 
 def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
@@ -189,7 +179,7 @@ def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
     lines += [f"  {raw.name[:20]} {_millimetres(np.ptp(raw.mesh.vertices, axis=0))}" for raw in shown]
     if len(laid.indices) > len(shown):
         lines += [f"  and {len(laid.indices) - len(shown)} more"]
-    column = np.full((_OUTSIDE[1], _PANEL * _COLUMNS + _GAP * (_COLUMNS - 1) - _OUTSIDE[0] - _GAP, 3), 255, np.uint8)
+    column = blank(_PANEL * _COLUMNS + _GAP * (_COLUMNS - 1) - _OUTSIDE[0] - _GAP, _OUTSIDE[1])
     for row, line in enumerate(lines):
         put_text(column, line, (4, 20 + 21 * row), 0.55 if line == title else 0.46, INK)
     return column
