@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -11,7 +12,7 @@ import numpy as np
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.scenes.looks import Looks
@@ -192,8 +193,8 @@ def list_folders(out: Path, folders: Iterable[Path]) -> list[Path]:
     return found
 
 
-class Exporter(Protocol):
-    """Dataset writer of one format. It receives every view and tick of a bake.
+class Exporter(ABC):
+    """Dataset writer of one format. It receives every view and tick of a bake; what a format does not override, it does not read or write.
 
     All calls come from one thread. Each may raise `OutputError` for a write that has failed since the previous call.
 
@@ -205,29 +206,28 @@ class Exporter(Protocol):
     their parents (no `parents=True`): if the data set is removed during a bake, the bake must fail.
     """
 
-    needs_physics: ClassVar[bool]
+    needs_physics: ClassVar[bool] = False
     """Whether tick batches must carry the arrays `tick` and `steps`."""
-    needs_views: ClassVar[bool]
+    needs_views: ClassVar[bool] = False
     """Whether views must be rendered; if no exporter needs them, none are."""
-
-    needs_images: ClassVar[bool]
+    needs_images: ClassVar[bool] = False
     """Whether it reads all images of a batch; else only those that neither encoded files nor run boundaries replace."""
-    writes_depth: ClassVar[bool]
+    writes_depth: ClassVar[bool] = False
     """Whether it writes depth files, `FrameBatch.depth_idat`."""
 
     def __init__(self, context: ExportContext) -> None:
         """Writes nothing yet."""
-        ...
+        self._context = context
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """Maximum size of the images of one task in the pool's shared memory [B]."""
-        ...
+        """Maximum size of the images of one task in the pool's shared memory [B]; 0: tasks have none."""
+        return 0
 
     @staticmethod
+    @abstractmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
         """Names of constants, indices and folders, from the settings alone; no file is looked at."""
-        ...
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
@@ -243,7 +243,7 @@ class Exporter(Protocol):
         Returns:
             These files, relative to the data set.
         """
-        ...
+        return []
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
@@ -257,8 +257,9 @@ class Exporter(Protocol):
         Returns:
             Pairs of a path relative to LINES and complete lines. Lines of the same path are appended to one file, in order of the episodes.
         """
-        ...
+        return iter(())
 
+    @abstractmethod
     def write_constants(self) -> list[Path]:
         """Write the files that all episodes share, such as models; replaces what a killed bake may have left.
 
@@ -268,14 +269,12 @@ class Exporter(Protocol):
         Returns:
             These files, or folders that hold nothing else, relative to the data set.
         """
-        ...
 
     def write_views(self, batch: FrameBatch) -> None:
         """Enqueue views; copies what it keeps. Blocks while the writers are behind (back-pressure).
 
         An episode's frames come in order, all before its end.
         """
-        ...
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
         """Enqueue all views of an episode of a data set that is converted, in place of `write_views`.
@@ -286,19 +285,17 @@ class Exporter(Protocol):
             episode: Index of the episode.
             scenes: The scene of each camera.
         """
-        ...
 
     def write_ticks(self, batch: TickBatch) -> None:
         """Enqueue the frames of a tick; copies what it keeps. Blocks while the writers are behind (back-pressure).
 
         An episode's frames come in order, all before its end. They may come before or after the views of the same frame.
         """
-        ...
 
     def write_picks(self, batch: PickBatch) -> None:
         """Enqueue the grasp trials of states of an episode, before its end; states may come in any order, each once."""
-        ...
 
+    @abstractmethod
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """Complete and commit the episode's files, or discard them if its ending delivers nothing; it may then restart at frame 0.
 
@@ -306,22 +303,21 @@ class Exporter(Protocol):
             end: Result of the episode.
             on_committed: Callback; called exactly once, now or by a later call of the pool, when all files are committed or discarded.
         """
-        ...
 
+    @abstractmethod
     def files(self, episode: int) -> list[Path]:
         """List the committed files and folders that hold this episode and nothing else, relative to the data set, sorted.
 
         They may be none, some (left by a killed bake) or all. Looks at names only.
         """
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Release resources after success: all ended episodes are committed, and the pool is idle."""
-        ...
 
+    @abstractmethod
     def abort(self) -> None:
         """Release resources after an error. The pool has been aborted, and the bake removes partial files. Never raises."""
-        ...
 
 
 def view_bytes(resolution: tuple[int, int], objects: int, has_layers: bool) -> int:

@@ -178,6 +178,7 @@ FORMAT_TABLE: dict[str, Format] = {
         _usd,
         sources=lambda _: ("poses",),
         part=PartFiles("usd", ".usdc", 1),
+        packages=("openexr",),
     ),
     "zarr": Format(
         ".trajectory.exporter",

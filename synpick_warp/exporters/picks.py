@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synpick_warp.codes import Ending, names
-from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
@@ -32,11 +31,6 @@ class PicksExporter(EpisodeExporter[_Tables]):
     """`Exporter` of picks. Episode k becomes picks/k.parquet and picks/states/k.parquet, empty tables if it has no trials."""
 
     staging = FOLDER.name
-
-    @staticmethod
-    def slot_bytes(settings: ExportSettings) -> int:
-        """See `Exporter`: tasks have no images."""
-        return 0
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,10 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.exporters.base import ExportContext, StoredScene
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.files import PARTIAL, output_errors
-from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
-from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.views.picks import PickBatch
+from synpick_warp.exporters.writing.pool import WriteTask
+from synpick_warp.views.frames import EpisodeEnd
 
 _Content = TypeVar("_Content")
 
@@ -48,24 +46,19 @@ class StagedEpisode(Generic[_Content]):
         return self.end is not None and Ending(self.end.ending).delivers
 
 
-class EpisodeExporter(ABC, Generic[_Content]):
-    """Base of the `Exporter`s: each arrangement of an episode has a staging folder, which one task commits after all others are done.
+class EpisodeExporter(Exporter, Generic[_Content]):
+    """`Exporter` that stages: each arrangement of an episode has a staging folder, which one task commits after all others are done.
 
     A format makes its content of an episode (`_staged`), counts the tasks that write to its folder (`_task`), and names the task that
-    commits it (`_commit`). It overrides what else it needs: `write_views`, `write_ticks`, `finalize` and the flags are those of a format
-    that reads nothing and has no index files.
+    commits it (`_commit`).
     """
 
-    needs_physics: ClassVar[bool] = False
-    needs_views: ClassVar[bool] = False
-    needs_images: ClassVar[bool] = False
-    writes_depth: ClassVar[bool] = False
     staging: ClassVar[str]
     """Name of the format's folder in `PARTIAL`."""
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        self._context = context
+        super().__init__(context)
         self._staging = context.out / PARTIAL / self.staging
         self._episodes: dict[int, StagedEpisode[_Content]] = {}
         self._arrangements = 0
@@ -76,28 +69,6 @@ class EpisodeExporter(ABC, Generic[_Content]):
 
     def _finish(self, episode: StagedEpisode[_Content], end: EpisodeEnd) -> None:
         """Submit the tasks that wait for the end of an episode."""
-
-    @staticmethod
-    def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write nothing: there are no index files unless a format overrides this; returns an empty list. See `Exporter`."""
-        return []
-
-    @staticmethod
-    def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield nothing: `finalize` reads the files of episodes unless a format overrides this. See `Exporter`."""
-        return iter(())
-
-    def write_views(self, batch: FrameBatch) -> None:
-        """Ignore views: no images unless a format overrides this. See `Exporter`."""
-
-    def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Ignore stored scenes: no images unless a format overrides this. See `Exporter`."""
-
-    def write_ticks(self, batch: TickBatch) -> None:
-        """Ignore ticks: nothing of the simulation unless a format overrides this. See `Exporter`."""
-
-    def write_picks(self, batch: PickBatch) -> None:
-        """Ignore grasp trials unless a format overrides this. See `Exporter`."""
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """Commit or discard an episode once all its tasks are done; at once if nothing was staged of it. See `Exporter`."""

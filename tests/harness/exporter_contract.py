@@ -65,11 +65,12 @@ def export(
     processes: int = 0,
     frames: int = FRAMES,
     lenses: tuple[Camera, ...] = LENSES,
+    prepare: Callable[[FrameBatch], FrameBatch] = lambda batch: batch,
 ) -> Path:
-    """Write a complete data set of boxes."""
+    """Write a complete data set of boxes, of views changed by `prepare`."""
     with exporting(exporter_class, out, config, processes, lenses) as exporter:
         exporter.write_constants()
-        feed(exporter, episodes, frames)
+        feed(exporter, episodes, frames, prepare=prepare)
         finish(exporter)
     return out
 
@@ -106,6 +107,11 @@ def with_files(batch: FrameBatch) -> FrameBatch:
     jpeg, jpeg_size = _pad([bytes(encode_jpeg(image, 95)) for image in batch.color], batch.camera == 1)
     idat, idat_size = _pad([encode_png(image)[_IDAT] for image in batch.depth], batch.camera == 2)
     return dataclasses.replace(batch, jpeg=jpeg, jpeg_size=jpeg_size, depth_idat=idat, depth_idat_size=idat_size)
+
+
+def without_objects(batch: FrameBatch) -> FrameBatch:
+    """The batch as views of nothing."""
+    return dataclasses.replace(batch, object_id=np.full_like(batch.object_id, -1), instance=np.zeros_like(batch.instance))
 
 
 def _pad(files: list[bytes], exceeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -34,8 +34,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
 from synpick_warp.exporters.formats import contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
-from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, output_errors, write_atomically
-from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.files import PARTIAL, Buffer, check_output_folder, output_error, output_errors, write_atomically
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool

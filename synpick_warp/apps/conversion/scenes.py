@@ -12,7 +12,7 @@ import numpy as np
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
 
 

@@ -15,9 +15,15 @@ from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.picks import spool_picks
-from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders, write_layer, write_view
+from synpick_warp.exporters.bop.scene import (
+    SceneSettings,
+    commit_scenes,
+    commit_sensor_scene,
+    create_scene_folders,
+    write_layer,
+    write_view,
+)
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
-from synpick_warp.exporters.bop.sensors import commit_sensor_scene
 from synpick_warp.exporters.bop.shared.targets import (
     concatenate_targets,
     find_scenes,

@@ -21,8 +21,7 @@ from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.graph import GRAPH_FILE, FrameSupport, find_occlusions, graph_entry
 from synpick_warp.exporters.bop.picks import PICKS, format_picks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
-from synpick_warp.exporters.writing.files import sync_folder
-from synpick_warp.exporters.writing.folder import Buffer, open_folder
+from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder
 from synpick_warp.exporters.writing.png import encode_mask_png
 from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.views.layer_codec import layer_path
@@ -248,3 +247,25 @@ def _write_lines(path: Path, parts: Iterable[str]) -> None:
         file.writelines(parts)
         file.flush()
         os.fsync(file.fileno())
+
+
+def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: tuple[SceneSettings, ...]) -> None:
+    """Task of the multisensor layout of BOP-Industrial 2025: complete the scenes of an episode's cameras, which are staged in the classic
+    layout, bring them together in one folder, with folders and annotation files for each camera, and rename it to its place.
+
+    The rename of the folder is the commit: a killed bake leaves nothing at `place`.
+
+    Args:
+        scenes: Staging folder of each camera.
+        place: Folder of the scene.
+        settings: Settings of each scene, with its sensor.
+    """
+    whole = scenes[0].with_name(f"{scenes[0].name}-sensors")
+    whole.mkdir()
+    for scene, own in zip(scenes, settings, strict=True):
+        complete_scene(scene, own)
+        for path in sorted(scene.iterdir()):
+            path.rename(whole / f"{path.stem}{own.sensor}{path.suffix}")
+    sync_folder(whole)
+    whole.rename(place)
+    sync_folder(place.parent)

@@ -18,7 +18,7 @@ from synpick_warp.codes import Effect, names
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
-from synpick_warp.exporters.writing.folder import Buffer
+from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, find_runs, split_listed_runs, unpack_run_boundaries
 from synpick_warp.scenes.types import Camera

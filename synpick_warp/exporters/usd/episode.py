@@ -1,4 +1,5 @@
-"""Task that writes an episode's USD file.
+"""Spool of an episode's ticks on disk, so that memory stays constant however long and many the episodes are, and the task that makes its
+USD file of them.
 
 It runs in writer processes, so this module imports neither Warp nor Newton, and pxr only when there is an episode to write.
 """
@@ -7,10 +8,74 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.usd.spool import read_ticks
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
+from synpick_warp.views.frames import TickBatch
+
+TICKS = 64
+"""Number of ticks that are buffered in memory: about 50 kB per world."""
+_FIELDS = ("frame", "bin", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+"""Fields of `TickBatch` that are spooled, with its shapes."""
+
+
+class TickSpool:
+    """Buffered writer of one arrangement's ticks."""
+
+    def __init__(self, path: Path, instances: int) -> None:
+        """
+        Args:
+            path: File that it appends to, TICKS rows at a time.
+            instances: Instance capacity of a world.
+        """
+        self.path, self.instances = path, instances
+        self._rows = np.zeros((TICKS, tick_type(instances).itemsize), np.uint8)
+        self._count = 0
+
+    def add(self, row: np.ndarray) -> None:
+        """Append a row of `tick_rows`. Raises OSError."""
+        self._rows[self._count] = row
+        self._count += 1
+        if self._count == TICKS:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write the buffered ticks to the file. Raises OSError."""
+        with self.path.open("ab") as file:
+            file.write(self._rows[: self._count].tobytes())
+        self._count = 0
+
+
+def tick_type(instances: int) -> np.dtype:
+    """Structured type of a row of the file."""
+    return np.dtype(
+        [
+            ("frame", "<i4"),
+            ("bin", "<i4"),
+            ("object_id", "<i4", instances),
+            ("pose", "<f4", (instances, 7)),
+            ("fixture_pose", "<f4", (3, 7)),
+            ("fixture_visible", "<i4", 3),
+            ("light", "<i4"),
+            ("light_yaw", "<f4"),
+            ("light_exposure", "<f4"),
+        ]
+    )
+
+
+def tick_rows(batch: TickBatch) -> np.ndarray:
+    """Rows of `tick_type`, as bytes, of all frames of a batch (frame, byte) uint8."""
+    rows = np.empty(len(batch), tick_type(batch.object_id.shape[1]))
+    for name in _FIELDS:
+        rows[name] = getattr(batch, name)
+    return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
+
+
+def read_ticks(path: Path, instances: int) -> np.ndarray:
+    """Read all ticks of a file, in order, as rows of `tick_type` (frame)."""
+    return np.fromfile(path, tick_type(instances))
 
 
 def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMetadata, settings: EpisodeSettings) -> None:

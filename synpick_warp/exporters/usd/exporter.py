@@ -6,13 +6,11 @@ import os
 from functools import cached_property, partial
 from pathlib import Path
 
-from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.usd.episode import write_episode
+from synpick_warp.exporters.usd.episode import TickSpool, tick_rows, write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
-from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, EpisodeMetadata, EpisodeSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
@@ -35,11 +33,6 @@ class UsdExporter(EpisodeExporter[TickSpool]):
     """
 
     staging = FOLDER.name
-
-    @staticmethod
-    def slot_bytes(settings: ExportSettings) -> int:
-        """See `Exporter`: tasks have no images."""
-        return 0
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:

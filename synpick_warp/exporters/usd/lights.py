@@ -6,8 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 
-from synpick_warp.exporters.usd.exr import encode_exr
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.types import StageLight
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun, sun_fraction
@@ -47,11 +48,16 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
 def write_light_maps(library: Path, lights: tuple[EnvironmentMap, ...]) -> None:
     """Write all maps as EXR files into the asset library; `lights/` must exist.
 
-    By OpenEXR's convention, longitude grows to the left in the image and is 0 at its centre; it equals our azimuth.
+    By OpenEXR's convention, longitude grows to the left in the image and is 0 at its centre; it equals our azimuth. USD's core supports
+    EXR, PNG and JPEG textures; Radiance maps (.hdr) are supported by some renderers only. Raises OutputError.
     """
     for index, light in enumerate(lights):
-        image = separate_sun(light)[0][:, ::-1].astype(np.float32)
-        (library / light_file(index)).write_bytes(encode_exr(image))
+        image, path = np.ascontiguousarray(separate_sun(light)[0][:, ::-1], dtype=np.float32), library / light_file(index)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "envmap": OpenEXR.ENVMAP_LATLONG}
+        try:
+            OpenEXR.File(header, {"RGB": image}).write(str(path))
+        except RuntimeError as error:
+            raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}; free space or rights there") from error
 
 
 def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:

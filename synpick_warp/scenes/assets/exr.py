@@ -1,11 +1,11 @@
-"""OpenEXR images (linear light, float), by the format's own library, which is optional."""
+"""OpenEXR images (linear light, float), by the format's own library."""
 
 from __future__ import annotations
 
-import importlib
 import io
 
 import numpy as np
+import OpenEXR
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error
@@ -24,19 +24,14 @@ def decode_exr(data: bytes, source: str, most: int) -> np.ndarray:
         most: Maximum number of pixels, which is checked by the header.
 
     Raises:
-        CatalogError: The library is not installed, or the image is too large, damaged or has no such channels.
+        CatalogError: The image is too large, damaged or has no such channels.
     """
     try:
-        library = importlib.import_module("OpenEXR")
-    except ImportError:
-        advice = "pip install 'synpick-warp[exr]', or save it as PNG"
-        raise CatalogError(f"{source}: OpenEXR images need openexr, which is not installed: {advice}") from None
-    try:
-        low, high = library.File(io.BytesIO(data), header_only=True).header()["dataWindow"]
+        low, high = OpenEXR.File(io.BytesIO(data), header_only=True).header()["dataWindow"]
         width, height = (int(size) for size in np.subtract(high, low, dtype=np.int64) + 1)
         if width * height > most:
             raise CatalogError(f"{source}: too large an image, {width} x {height} pixels; allowed: {most} pixels; scale it down")
-        channels = library.File(io.BytesIO(data), separate_channels=True).channels()
+        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
     except CatalogError:
         raise
     except Exception as error:  # the library raises nearly anything on damaged files

@@ -24,8 +24,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.shared.models import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
-from synpick_warp.exporters.writing.files import check_output_folder
-from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.files import check_output_folder, open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
@@ -224,11 +223,7 @@ def test_models_are_toolkit_compatible_ply_in_millimetres(dataset, folder):
 
 
 def test_files_of_the_device_stand_for_images(dataset, tmp_path):
-    with exporting(BopExporter, tmp_path, config(), 2) as exporter:
-        exporter.write_constants()
-        feed(exporter, EPISODES, FRAMES, prepare=with_files)
-        finish(exporter)
-    assert digests(tmp_path) == digests(dataset)
+    assert digests(export(BopExporter, tmp_path, config(), EPISODES, 2, prepare=with_files)) == digests(dataset)
 
 
 def test_active_effects_are_recorded_and_jpeg_quality_is_per_view(tmp_path):

@@ -23,8 +23,8 @@ from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
-from tests.worlds.box_views import batches, cameras, config, ends
+from tests.harness.exporter_contract import ExporterContract, export, without_objects
+from tests.worlds.box_views import batches, cameras, config
 
 LENSES = cameras()
 
@@ -63,6 +63,8 @@ def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
             np.testing.assert_array_equal(read_back.annToMask(row), visible)
             rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
             assert row["bbox"] == [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
+            x_min, y_min, x_max, y_max = batch.boxes[0, row["instance_id"], 0].tolist()
+            assert row["bbox_amodal"] == [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1]
             assert (row["area"], row["category_id"]) == (visible.sum(), batch.object_id[0, row["instance_id"]])
 
 
@@ -117,14 +119,8 @@ def test_scenes_are_checked_for_completeness(tmp_path):
 
 
 def test_views_without_objects_have_no_annotations(tmp_path):
-    with exporting(CocoExporter, tmp_path, config(), 0) as exporter:
-        exporter.write_constants()
-        for batch in batches(5, (0,), 1, LENSES):
-            nothing = {"object_id": np.full_like(batch.object_id, -1), "instance": np.zeros_like(batch.instance)}
-            exporter.write_views(dataclasses.replace(batch, **nothing))
-        exporter.end_episode(ends((0,), 1)[0], lambda: None)
-        finish(exporter)
-    assert (len(read(tmp_path).imgs), len(read(tmp_path).anns)) == (3, 0)
+    out = export(CocoExporter, tmp_path, config(), (0,), frames=1, prepare=without_objects)
+    assert (len(read(out).imgs), len(read(out).anns)) == (3, 0)
 
 
 @pytest.mark.parametrize("name", [str(PARTS / "000001.jsonl"), str(CATEGORIES)])

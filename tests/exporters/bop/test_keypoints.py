@@ -12,8 +12,7 @@ from pycocotools.coco import COCO
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.keypoints import Keypoints, project_keypoints, sample_keypoints
-from tests.exporters.bop.test_bop import EPISODES, FRAMES, make
-from tests.harness.exporter_contract import digests, exporting, feed, finish, with_files
+from tests.harness.exporter_contract import digests, export, with_files
 from tests.worlds.box_sets import write_set
 from tests.worlds.box_views import SIZES, config
 
@@ -76,14 +75,13 @@ def test_pycocotools_reads_keypoints_whose_flags_agree_with_rays(folder, capsys)
 
 
 def test_depth_files_of_the_device_give_the_same_flags(tmp_path):
-    reference = make(tmp_path / "images", 0, keypoints=8)
-    with exporting(BopExporter, tmp_path / "files", config(keypoints=8), 0) as exporter:
-        exporter.write_constants()
-        feed(exporter, EPISODES, FRAMES, prepare=with_files)
-        finish(exporter)
-    assert digests(tmp_path / "files") == digests(reference)
+    images, files = (
+        export(BopExporter, tmp_path / name, config(keypoints=8), prepare=prepare)
+        for name, prepare in (("images", lambda batch: batch), ("files", with_files))
+    )
+    assert digests(files) == digests(images)
 
 
 def test_without_the_option_annotations_have_no_keypoints(tmp_path):
-    coco = json.loads((make(tmp_path, episodes=(0,)) / "train_pbr" / "000000" / "scene_gt_coco.json").read_text())
+    coco = json.loads((export(BopExporter, tmp_path, config(), (0,)) / "train_pbr" / "000000" / "scene_gt_coco.json").read_text())
     assert all("keypoints" not in entry for entry in (*coco["annotations"], *coco["categories"]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import io
 import json
 import tarfile
@@ -20,7 +19,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import tar_files
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
-from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, finish
+from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, finish, without_objects
 from tests.twins.masks import masks_of_batch
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -155,13 +154,7 @@ def test_tar_files_are_reproducible_and_well_formed(split):
 
 
 def test_views_without_objects_are_written(tmp_path):
-    with exporting(ShardsExporter, tmp_path, config()) as exporter:
-        exporter.write_constants()
-        for batch in batches(5, (1,), 1, LENSES):
-            nothing = {"object_id": np.full_like(batch.object_id, -1), "instance": np.zeros_like(batch.instance)}
-            exporter.write_views(dataclasses.replace(batch, **nothing))
-        exporter.end_episode(ends((1,), 1)[0], lambda: None)
-        finish(exporter)
+    export(ShardsExporter, tmp_path, config(), (1,), frames=1, prepare=without_objects)
     views = samples(tmp_path / "train_pbr_web")
     assert list(views) == ["000003_000000", "000004_000000", "000005_000000"]
     for view in views.values():

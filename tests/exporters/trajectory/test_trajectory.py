@@ -218,16 +218,6 @@ def test_equally_named_dimensions_have_equal_sizes(store):
         assert {name: len(sizes) for name, sizes in extents.items()} == dict.fromkeys(extents, 1)
 
 
-def test_no_array_of_several_dimensions_has_the_name_of_one_of_its_group(store):
-    """xarray would take it for the dimension's coordinate, and a selection along the dimension would fail."""
-    dims: dict[str, set[str]] = {}
-    for path, array in arrays(store).items():
-        dims.setdefault(path.rpartition("/")[0], set()).update(array.metadata.dimension_names)
-    for path in arrays(store):
-        group, _, name = path.rpartition("/")
-        assert name not in dims[group], path
-
-
 def test_the_store_is_sharded_and_compressed_by_zstd(store):
     pose = store[f"{tables.EPISODES}/000000/steps/pose"]
     assert (pose.chunks, pose.shards) == ((2 * STEP_COUNT, INSTANCES, 7), (6 * STEP_COUNT, INSTANCES, 7))

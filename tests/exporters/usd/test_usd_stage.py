@@ -6,13 +6,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import OpenEXR
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
+from synpick_warp.exporters.usd.episode import TickSpool, read_ticks, tick_rows
 from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
-from synpick_warp.exporters.usd.spool import TickSpool, read_ticks, tick_rows
 from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.scenes.cameras import make_cameras
@@ -21,7 +22,6 @@ from synpick_warp.scenes.environment import map_directions, resize_map
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT
 from synpick_warp.scenes.types import Camera, EnvironmentMap, Sun
 from synpick_warp.stages.render import light_tables
-from tests.exporters.usd.test_exr import decode
 from tests.worlds import usd_sets
 
 SETTINGS = usd_sets.settings()
@@ -278,7 +278,10 @@ def test_the_dome_light_has_the_orientation_of_the_renderer(tmp_path, rows, azim
     light = replace(sunny(azimuth, polar), sun=None)
     (tmp_path / "lights").mkdir()
     write_light_maps(tmp_path, (light, light))
-    picture = decode((tmp_path / "lights/light_001.exr").read_bytes())
+    file = OpenEXR.File(str(tmp_path / "lights/light_001.exr"))
+    assert (file.header()["compression"], file.header()["envmap"]) == (OpenEXR.ZIP_COMPRESSION, OpenEXR.ENVMAP_LATLONG)
+    picture = file.channels()["RGB"].pixels
+    np.testing.assert_array_equal(picture, light.radiance[:, ::-1])
     stage = open_episode(rows, lights=(light, light))
     # OpenEXR, "Latitude-longitude map": the first column is longitude π, the first row latitude π/2; latitude π/2 is +y,
     # longitude 0 is +z and π/2 is +x. UsdLux follows it.

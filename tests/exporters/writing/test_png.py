@@ -1,4 +1,4 @@
-"""PNG encoder: OpenCV and Pillow decode the pixels that were encoded."""
+"""PNG encoder: OpenCV and Pillow decode the pixels that were encoded. Its deflate does not depend on the stream's address."""
 
 from __future__ import annotations
 
@@ -8,17 +8,24 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from synpick_warp.exporters.writing import png
-from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
+from synpick_warp.exporters.writing.png import HEAD, Deflater, encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 
 SIDE = st.integers(1, 40)
 GREY = st.tuples(SIDE, SIDE)
+STREAMS = 200
+"""Number of streams, at different addresses. Without our workaround, one in 36 differs from the others for `flow_rows`."""
+
+
+def deflate(data: bytes | np.ndarray) -> bytes:
+    stream = Deflater()
+    return stream.compress(data) + stream.flush()
 
 
 def read(data: bytes) -> np.ndarray:
@@ -91,3 +98,45 @@ def test_masks_are_encoded_at_their_place(data):
 def test_unsupported_images_are_refused(image):
     with pytest.raises(ValueError, match="no PNG for an image of shape"):
         encode_png(image)
+
+
+def flow_rows() -> np.ndarray:
+    """PNG-filtered rows of an optical-flow image of a moving disc (720, 7680) uint8."""
+    row, column = np.mgrid[0:720, 0:1280]
+    inside = (column - 640) ** 2 + (row - 360) ** 2 < 60000
+    codes = np.zeros((720, 1280, 3), ">u2")
+    codes[inside, 0] = (32768 + 0.3 * column + 0.1 * row)[inside]
+    codes[inside, 1] = (32768 + 0.3 * column - 0.2 * row)[inside]
+    codes[inside, 2] = 1
+    rows = codes.view(np.uint8).reshape(720, -1)
+    return np.diff(rows, axis=0, prepend=np.zeros((1, rows.shape[1]), np.uint8))
+
+
+@given(st.binary(max_size=5000), st.integers(0, 5000))
+@settings(max_examples=50, deadline=None)
+def test_round_trip_by_zlib(data, cut):
+    assert zlib.decompress(deflate(data)) == data
+    stream = Deflater(-zlib.MAX_WBITS)
+    parts = stream.compress(data[:cut]), stream.compress(data[cut:]), stream.flush()
+    assert zlib.decompress(b"".join(parts), -zlib.MAX_WBITS) == data
+
+
+@pytest.mark.parametrize("shape", [(300,), (20, 15), (4, 5, 5, 3)])
+def test_arrays_of_any_shape_are_compressed_as_bytes(shape):
+    data = np.arange(300, dtype=np.uint16).astype(np.uint8).reshape(shape)
+    assert zlib.decompress(deflate(data)) == data.tobytes()
+
+
+def test_first_bytes_are_flushed_separately():
+    data = flow_rows().tobytes()
+    packed = deflate(data)
+    reader = zlib.decompressobj()
+    first = next(got for got in (reader.decompress(packed[place : place + 1]) for place in range(len(packed))) if got)
+    assert first == data[: len(first)]
+    assert len(first) <= HEAD
+
+
+def test_bytes_do_not_depend_on_the_stream_address():
+    data = flow_rows()
+    streams = [Deflater() for _ in range(STREAMS)]
+    assert len({stream.compress(data) + stream.flush() for stream in streams}) == 1

@@ -11,7 +11,7 @@ from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.formats import Format
-from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.files import open_folder
 
 FOLDER = Path("boxes")
 

@@ -24,8 +24,7 @@ from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
-from synpick_warp.exporters.writing.files import PARTIAL, output_errors, sync_folder, write_synced
-from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.files import PARTIAL, open_folder, output_errors, sync_folder, write_synced
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json, read_json

@@ -18,8 +18,7 @@ from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.outlines import join_parts, trace_outlines
 from synpick_warp.exporters.bop.view import ViewSettings
-from synpick_warp.exporters.writing.files import sync_folder, write_synced
-from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.files import open_folder, sync_folder, write_synced
 
 FOLDER = Path("yolo")
 """Folder in the data set."""
