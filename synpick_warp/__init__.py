@@ -7,6 +7,7 @@
     for batch in synpick_warp.stream("smoke", worlds=8):     # the same views on the device, without files
         ...
     env = synpick_warp.make_env(task="pick", num_envs=8)      # the same worlds, and you choose the picks
+    images = synpick_warp.render([("part.stl", pose)], [camera])    # your meshes at your poses
 
 Importing this package loads neither simulator, NumPy nor OpenCV; the functions import them when they are called.
 """
@@ -16,7 +17,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from synpick_warp._version import __version__
 from synpick_warp.errors import (
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.environment.vector import PickingVectorEnv
     from synpick_warp.factory.episodes import BakeSummary
+    from synpick_warp.online.render import Pinhole
     from synpick_warp.online.stream import ViewStream
     from synpick_warp.system.progress import Progress
 
@@ -56,6 +58,7 @@ __all__ = [
     "load_config",
     "make_env",
     "open",
+    "render",
     "stream",
 ]
 
@@ -240,6 +243,56 @@ def make_env(
     from synpick_warp.environment.vector import PickingVectorEnv
 
     return PickingVectorEnv(make_picking(choice, config, settings or {}, device, progress))
+
+
+def render(
+    objects: Sequence[tuple[Path | str | tuple[Any, Any], Any]],
+    cameras: Sequence[Pinhole],
+    *,
+    layers: Sequence[str] = (),
+    unit: float = 1.0,
+    device: str = "auto",
+    backend: str = "numpy",
+    settings: Mapping[str, object] | None = None,
+) -> dict[str, Any]:
+    """Render meshes at given poses, without simulation and files.
+
+        from synpick_warp.online.render import Pinhole
+
+        camera = Pinhole(matrix=K, resolution=(640, 480), pose=camera_to_world)
+        views = synpick_warp.render([("bracket.stl", object_to_world)], [camera], layers=("normals",), unit=1e-3)
+
+    Args:
+        objects: (mesh, object to world (4, 4) [m]) of each instance; a mesh is a file, or (vertices (V, 3), faces (F, 3)).
+        cameras: Cameras of one resolution.
+        layers: Further layers, as of `render.layers`.
+        unit: Unit of all meshes [m].
+        device: As `bake.device`.
+        backend: "numpy", or "torch": tensors on the device.
+        settings: Full key, such as "render.mode" or "bake.lights", -> value, on top of the preset "synpick".
+
+    Returns:
+        Arrays (camera, H, W, ...): color uint8 sRGB; depth float32 [m], 0: none; instance uint8, 1 for the first object, 0: none; and the
+        layers, as in `synpick_warp.views.layers`.
+
+    Raises:
+        SynpickError: An error that the user can correct.
+    """
+    with collection_paused():
+        from synpick_warp.online.render import render_scene
+
+    config = load_config(None, {"render.table": False} | dict(settings or {}))
+    scale = config.bop.depth_scale / 1000.0
+    arrays = render_scene(objects, cameras, layers, unit, device, config)
+    if backend == "torch":
+        import torch  # pyright: ignore[reportMissingImports]
+
+        views = {name: torch.from_dlpack(array) for name, array in arrays.items()}
+        return views | {"depth": views["depth"].float() * scale}
+    if backend != "numpy":
+        raise ConfigError(f'backend is "{backend}"; allowed: numpy, torch')
+    views = {name: array.numpy() for name, array in arrays.items()}
+    return views | {"depth": views["depth"].astype("float32") * scale}
 
 
 def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:
