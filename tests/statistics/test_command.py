@@ -148,10 +148,7 @@ def test_an_unfinished_set_says_how_much_is_there(copy):
         ("train/000000/scene_camera.json", '{"0": 1e999}', "{path} is damaged: "),
         ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": 3}, "attempts": []}', "{path} is damaged: "),
         ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": "pick"}, "attempts": [{}]}', "{path} is damaged: "),
-        ("manifest.json", "{", "{path} is damaged: "),
-        ("manifest.json", None, "{folder} has no manifest.json; "),
         ("config.toml", None, "{folder} has no config.toml; "),
-        ("config.toml", "splits = 3", "splits is 3 in {path}; "),
         ("train/000000/depth/000000.png", "nothing", "{path} is not an image"),
     ],
 )
@@ -162,12 +159,6 @@ def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, file, content, said
         path.write_text(content)
     assert mistake("stats", copy, "--csv", tmp_path / "tables").startswith(said.format(path=path, folder=copy))
     assert not (tmp_path / "tables").exists()
-
-
-def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path):
-    assert mistake("stats", tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set: it does not exist")
-    (tmp_path / "empty").mkdir()
-    assert mistake("stats", tmp_path / "empty").startswith(f"{tmp_path / 'empty'} is not a data set: it has neither manifest.json nor")
 
 
 def test_wrong_options_are_named_in_one_line(folder, tmp_path):

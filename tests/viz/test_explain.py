@@ -13,8 +13,7 @@ import pytest
 
 from synpick_warp.apps.viz import explain
 from synpick_warp.apps.viz.drawing import FONT, instance_color, shorten
-from synpick_warp.apps.viz.explain import object_names, planning_camera, to_color_image, to_view, write_explanation
-from synpick_warp.apps.viz.explain_panels import load_chart, wrapped
+from synpick_warp.apps.viz.explain import load_chart, object_names, planning_camera, to_color_image, to_view, wrapped, write_explanation
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml

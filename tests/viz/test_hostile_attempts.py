@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.apps.viz.explain import draw_words, load_chart
 from synpick_warp.apps.viz.explain_graph import clutter_edges, draw_graph, lay_out
-from synpick_warp.apps.viz.explain_panels import draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, SeenAttempt, read_attempts
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.records import MAX_OBSERVED

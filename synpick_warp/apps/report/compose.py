@@ -12,7 +12,7 @@ from synpick_warp.apps.report.album import Album
 from synpick_warp.apps.report.charts import ChartData, make_charts
 from synpick_warp.apps.report.explained import choose_attempts, make_attempt
 from synpick_warp.apps.report.findings import WARNING, Figures, Remark, find
-from synpick_warp.apps.report.frames import make_frame
+from synpick_warp.apps.report.frames import choose_episodes, make_frame, make_strip
 from synpick_warp.apps.report.markup import Html, changed_settings, element, findings_list, join, settings_tables, statistics_tables, tiles
 from synpick_warp.apps.report.page import Page, PageSection, read_vega, render, summary
 from synpick_warp.apps.report.picks import DRAWS, PICKS_LEAD, calibration_chart, picks_section
@@ -25,7 +25,6 @@ from synpick_warp.apps.report.sampling import (
     read_episodes,
     sample_views,
 )
-from synpick_warp.apps.report.strips import choose_episodes, make_strip
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.picks import find_picks
 from synpick_warp.apps.viz.false_colors import bin_scale

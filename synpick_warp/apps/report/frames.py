@@ -1,17 +1,21 @@
-"""Sampled frames for a page: colour, visible and amodal masks as ids, boxes, depth and layers, with a line per instance."""
+"""Pictures for a page: sampled frames with colour, visible and amodal masks as ids, boxes, depth and layers; and film strips, one episode a
+mode, evenly spread frames in up to three cameras, with its attempts on the time axis.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from synpick_warp.apps.report.album import Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
-from synpick_warp.apps.report.sampling import Content
+from synpick_warp.apps.report.sampling import Content, SampledEpisodes, spread
 from synpick_warp.apps.statistics.columns import MAX_NAME
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.false_colors import DepthScale, color_depth, describe_depth, draw_layer, pooled_scale
+from synpick_warp.codes import Outcome
+from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.dataset.view import MILLIMETERS, View
 
 WIDTH = 960
@@ -20,6 +24,19 @@ MAX_IDS = 255
 """Most instances whose masks are shown: ids are bytes, and 0 is none."""
 LAYER_WIDTH = 640
 """Largest width of depth and of layers [px]."""
+MAX_STRIPS = 4
+"""Most episodes."""
+MAX_FRAMES = 72
+"""Maximum number of frames of an episode, one a step of the slider."""
+MAX_CAMERAS = 3
+STRIP_WIDTH = 420
+"""Largest width of a picture of a film strip [px]: three stand side by side."""
+STRIP_QUALITY = 74
+"""WebP quality: pictures in motion."""
+_PROBES = 3
+"""Frames that are encoded first, to learn how many fit the budget."""
+_MARGIN = 1.15
+"""Factor by which other frames may be larger than the probes."""
 
 
 def make_frame(
@@ -129,3 +146,79 @@ def _light(view: View) -> str:
     light = view.records.camera.get("light")
     name = light.get("map") if isinstance(light, dict) else None
     return name[:MAX_NAME] if isinstance(name, str) else ""
+
+
+# ---- film strips ----
+
+
+def choose_episodes(episodes: SampledEpisodes) -> list[int]:
+    """Choose an episode of median length of each mode, at most MAX_STRIPS; modes in the order of their first episodes."""
+    by_mode: dict[str, list[int]] = {}
+    for index, row in episodes.rows.items():
+        if row.frames:
+            by_mode.setdefault(row.mode, []).append(index)
+    chosen = [sorted(group, key=lambda index: (episodes.rows[index].frames, index))[len(group) // 2] for group in by_mode.values()]
+    return chosen[:MAX_STRIPS]
+
+
+def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report: Callable[[int, int], None]) -> dict[str, Any] | None:
+    """JSON of an episode's film strip, whose pictures are added to the album; None: not even two frames fit the album's budget in bytes.
+
+    Args:
+        data_set: The data set.
+        index: Index of the episode.
+        strips: Number of strips that are still to share the budget, this one included.
+        album: Receives the pictures.
+        report: Receives the number of pictures that were encoded, and how many there are at most.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    episode = data_set[index]
+    cameras = range(min(MAX_CAMERAS, data_set.camera_count))
+    cache: dict[tuple[int, int], EncodedPicture] = {}
+    most = min(MAX_FRAMES, len(episode)) * len(cameras)
+
+    def encode(frame: int, camera: int) -> EncodedPicture:
+        if (frame, camera) not in cache:
+            cache[frame, camera] = encode_photo(
+                shrink(show(episode.view(frame - frame % episode.frames(camera).step, camera)), STRIP_WIDTH), STRIP_QUALITY
+            )
+            report(len(cache), most)
+        return cache[frame, camera]
+
+    every = range(len(episode))
+    probes = [sum(encode(frame, camera).size for camera in cameras) for frame in spread(every, _PROBES)]
+    fitting = int(album.left(Section.EPISODES) / max(1, strips) / (_MARGIN * max(probes)))
+    count = min(MAX_FRAMES, len(episode), fitting)
+    if count < min(2, len(episode)):
+        return None
+    frames = spread(every, count)
+    places = album.add(Section.EPISODES, [encode(frame, camera) for camera in cameras for frame in frames])
+    if places is None:
+        return None
+    return {
+        "episode": index,
+        "mode": episode.row["mode"],
+        "sentence": episode.row.get("sentence") or episode.row["ending"],
+        "total": len(episode),
+        "period": data_set.period or 0.0,
+        "frames": frames,
+        "cameras": [places[camera * count : (camera + 1) * count] for camera in cameras],
+        "attempts": _spans(episode),
+    }
+
+
+def _spans(episode: Episode) -> list[dict[str, Any]]:
+    """First and last frame of each attempt, and how it ended."""
+    succeeded = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
+    return [
+        {
+            "attempt": attempt["attempt"],
+            "first": attempt["frame"],
+            "last": attempt["end_frame"],
+            "sentence": attempt["sentence"],
+            "success": attempt["outcome"] in succeeded,
+        }
+        for attempt in episode.attempts
+    ]

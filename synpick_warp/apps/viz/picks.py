@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from synpick_warp.apps.viz.drawing import INK, WHITE, Image, blank, check_picture_name, paste, put_text, write_picture
+from synpick_warp.apps.viz.explain import GREEN, LINE, TEXT, wrapped
 from synpick_warp.apps.viz.explain_graph import disc, fixed
-from synpick_warp.apps.viz.explain_panels import GREEN, LINE, TEXT, wrapped
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.grasp_maps import mean_by_candidate
 from synpick_warp.dataset.object_names import names_of

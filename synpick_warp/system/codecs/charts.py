@@ -37,8 +37,8 @@ for spec in json.load(sys.stdin):
     sys.stdout.buffer.write(struct.pack("<q", len(picture)) + picture)"""
 MAX_LABEL = 36
 """Maximum number of letters of a legend entry."""
-_LETTER, _SYMBOL = 12.5, 50.0
-"""Width of a letter, that of a capital, and of a symbol with its gaps [px]."""
+_LETTER, _SYMBOL = 9.0, 50.0
+"""Widths of a letter, somewhat above the mean, and of a symbol with its gaps [px]."""
 WIDTH = 700
 """Width of a chart [px]."""
 _PANEL, _LEFT, _GAP = 605, 56, 16
