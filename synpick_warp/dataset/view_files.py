@@ -31,7 +31,7 @@ from synpick_warp.dataset.bop.layout import SceneRef
 from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file_if_present
-from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size, tiff_size
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
@@ -174,7 +174,7 @@ class SceneFiles(ABC):
         for name, index in (("rgb", None), ("depth", None), ("mask", 0), ("mask_visib", 0)):
             found = self._find(name, frame, index)
             if found is not None:
-                stated = image_size(found[1]) or tiff_size(found[1])
+                stated = image_size(found[1])
                 if stated is None:
                     raise DatasetError(f"{found[2]} is not an image: neither PNG, JPEG nor TIFF")
                 return stated
@@ -397,7 +397,7 @@ def to_color(image: np.ndarray) -> np.ndarray:
 
 def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
     """Return an image file's content; raises DatasetError if its header is no image's or states another size (None: any)."""
-    stated = image_size(data) or tiff_size(data)
+    stated = image_size(data)
     if stated is None or (size is not None and stated != size):
         there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
         raise DatasetError(f"{source} {there}")

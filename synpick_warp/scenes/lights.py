@@ -15,14 +15,13 @@ from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import LightError, SynpickError
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.assets.asset_files import check_file_name, locate
-from synpick_warp.scenes.assets.image_size import image_size
 from synpick_warp.scenes.assets.radiance import canonical_radiance, orient_radiance
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.linear_algebra import DECIMALS, dot
-from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import MAX_PIXELS, Failure, Limits, run_isolated
 
 READ_LIMITS = Limits(300.0, 2**32)
 """Limits of a map: 5 min and 4 GiB; the largest takes some seconds and 1.2 GB."""
@@ -40,8 +39,6 @@ MAX_SUN_GAIN = 1e6
 """Maximum SUNmulti; no sun outshines its sky by more."""
 MAX_MAP_FILE = 2**29
 """Largest image file [bytes]: 512 MiB."""
-MAX_MAP_PIXELS = 2**25
-"""Maximum number of pixels of a map: 8192 x 4096, which take 1.2 GB as 32-bit floats while they are read."""
 MAX_SET_FILE, MAX_SET_LINE = 2**16, 2**10
 """Largest .ibl file [bytes] and its longest line; the parser's time grows with the square of a line."""
 MAX_RADIANCE = 1e11
@@ -260,19 +257,12 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
 def _decode(path: Path) -> np.ndarray | None:
     """Decode an image in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed.
 
-    The size is read from the header first, since OpenCV allocates up to 2^30 pixels before it reads any.
-
     Raises:
         LightError: It is too large, or of a format that is known but not read.
     """
     data = read_file(path, MAX_MAP_FILE, LightError)
     if data.startswith(_EXR) or path.suffix.lower() == ".exr":
         raise LightError(f"{path}: OpenEXR maps are not read; save it as Radiance (.hdr)")
-    size = image_size(data)
-    if size is None:
-        return None
-    if size[0] * size[1] > MAX_MAP_PIXELS:
-        raise LightError(f"{path} is {size[0]} x {size[1]} pixels; allowed: up to 8192 x 4096; scale it down, {MAX_HEIGHT} rows are used")
     header = None
     if data[:2] == b"#?":
         found = canonical_radiance(data, path)
@@ -284,7 +274,10 @@ def _decode(path: Path) -> np.ndarray | None:
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:
+    except cv2.error as error:
+        if "MAX_IMAGE_PIXELS" in str(error):
+            size = f"{MAX_PIXELS} pixels; allowed: up to 8192 x 4096"
+            raise LightError(f"{path} has more than {size}; scale it down, {MAX_HEIGHT} rows are used") from None
         return None
     finally:
         logging.setLogLevel(level)

@@ -14,7 +14,7 @@ from synpick_warp.apps.validation.model_files import diameter, sample_area
 from synpick_warp.apps.validation.pictures import crop_mask, decode_mask, png_type
 from synpick_warp.apps.validation.rules.coco import run_lengths
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.image_files import decode_picture, tiff_size
+from synpick_warp.system.inputs.image_files import decode_picture, image_size
 
 masks = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).random((7, 9)) < 0.3)
 
@@ -82,7 +82,7 @@ def test_samples_are_spread_evenly_over_the_area():
 def test_tiff_images_decode_and_state_their_size(dtype):
     image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (31, 47)).astype(dtype)
     data = cv2.imencode(".tif", image)[1].tobytes()
-    assert tiff_size(data) == (47, 31)
+    assert image_size(data) == (47, 31)
     np.testing.assert_array_equal(decode_picture(data, "x.tif", DatasetError), image)
     with pytest.raises(DatasetError):
         decode_picture(data[:40], "x.tif", DatasetError)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import MissingFileError
 
@@ -48,6 +50,13 @@ class MeshPart:
     colors: np.ndarray | None
     """Vertex colours, sRGB in 0..1 (V, 3); multiply the material's base colour in linear light."""
     material: FileMaterial
+
+
+def check_indices(faces: np.ndarray, count: int, path: Path) -> None:
+    """Raise CatalogError if a triangle (F, 3) refers to another vertex than the `count` that there are."""
+    wrong = faces[(faces < 0) | (faces >= count)]
+    if len(wrong):
+        raise CatalogError(f"{path}: a triangle refers to vertex {wrong[0]}, but there are {count}; repair the mesh")
 
 
 @dataclass(eq=False)

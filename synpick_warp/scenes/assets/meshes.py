@@ -23,7 +23,7 @@ from synpick_warp.scenes.assets.appearance import (
 )
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS, quiet_decoding
 from synpick_warp.scenes.assets.gltf.parts import read_gltf
-from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes
+from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.step import STEP_SUFFIXES, read_step
@@ -205,9 +205,7 @@ def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
     """
     if not np.isfinite(part.vertices).all():
         raise CatalogError(f"{path}: {int((~np.isfinite(part.vertices)).any(axis=1).sum())} vertices are not finite; repair the mesh")
-    wrong = part.faces[(part.faces < 0) | (part.faces >= len(part.vertices))]
-    if len(wrong):
-        raise CatalogError(f"{path}: a triangle refers to vertex {wrong[0]}, but there are {len(part.vertices)}; repair the mesh")
+    check_indices(part.faces, len(part.vertices), path)
     if max(len(part.vertices), len(part.faces)) > MAX_ROWS:
         raise CatalogError(f"{path}: more than {MAX_ROWS} vertices or triangles; decimate the mesh")
     if len(part.vertices) and np.abs(part.vertices).max() * unit > _MAX_EXTENT:

@@ -1,11 +1,12 @@
 """Bounded image decoding: PNG and JPEG, and TIFF in the data sets of others, whose stated size is checked before a pixel is decoded
 (prevention of decompression bombs).
 
-Other formats that OpenCV could read are refused. NumPy and OpenCV are imported when the first image is decoded.
+Other formats that OpenCV could read are refused. NumPy, OpenCV and Pillow are imported when they are first needed.
 """
 
 from __future__ import annotations
 
+import io
 import struct
 from typing import TYPE_CHECKING
 
@@ -22,33 +23,23 @@ TEXTURE_KINDS = ("png", "jpg", "jpeg", "bmp", "tga", "tif", "tiff", "webp")
 """Suffixes, without dot, that a texture's file may have in a data set; what it holds is decided by its content."""
 _PNG = b"\x89PNG\r\n\x1a\n"
 _JPEG = b"\xff\xd8\xff"
-_NO_FRAME = (0xC4, 0xC8, 0xCC)
-"""JPEG markers between SOF0 and SOF15 that begin no frame: Huffman tables, extension, arithmetic conditioning."""
-_BARE = (0x01, *range(0xD0, 0xD9))
-"""JPEG markers without length."""
-_TIFF = {b"II*\0": "<", b"MM\0*": ">"}
-"""Byte order of a TIFF file by its signature (TIFF 6.0, section 2)."""
-_WIDTH, _HEIGHT = 256, 257
-"""Tags ImageWidth and ImageLength."""
-_TYPES = {3: "H", 4: "I"}
-"""Field types SHORT and LONG."""
+_TIFF = (b"II*\0", b"MM\0*")
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height [px] that a PNG or JPEG file states; None: it is neither, or ends before."""
+    """Width and height [px] that the header of a PNG, JPEG or TIFF file states; None: it is none of these, or damaged."""
     if data.startswith(_PNG):
         return struct.unpack_from(">II", data, 16) if len(data) >= 24 and data[12:16] == b"IHDR" else None
-    place = 2 if data.startswith(_JPEG) else len(data)
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
-        if marker == 0xFF or marker in _BARE:
-            place += 1 if marker == 0xFF else 2
-            continue
-        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
-            height, width = struct.unpack_from(">HH", data, place + 5)
-            return width, height
-        place += 2 + max(2, int.from_bytes(data[place + 2 : place + 4], "big"))
-    return None
+    if not data.startswith((_JPEG, *_TIFF)):
+        return None
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.TiffImagePlugin import TiffImageFile
+
+    try:
+        with (JpegImageFile if data.startswith(_JPEG) else TiffImageFile)(io.BytesIO(data)) as image:
+            return image.size
+    except Exception:  # Pillow raises nearly anything on damaged files
+        return None
 
 
 def decode_image(
@@ -69,7 +60,7 @@ def decode_image(
     Raises:
         SynpickError: As `error`, in one line: it is not an image of that size.
     """
-    stated = image_size(data)
+    stated = None if data.startswith(_TIFF) else image_size(data)
     if stated is None:
         raise error(f"{source} is not an image: neither PNG nor JPEG")
     if size is not None and stated != size:
@@ -93,33 +84,14 @@ def decode_image(
     return image
 
 
-def tiff_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height [px] in the first directory of a TIFF file, the largest where there are several; None: it is none, or damaged."""
-    order = _TIFF.get(data[:4])
-    if order is None:
-        return None
-    try:
-        (start,) = struct.unpack_from(f"{order}I", data, 4)
-        (count,) = struct.unpack_from(f"{order}H", data, start)
-        found: dict[int, int] = {}
-        for entry in range(start + 2, start + 2 + 12 * count, 12):
-            tag, kind = struct.unpack_from(f"{order}HH", data, entry)
-            if tag in (_WIDTH, _HEIGHT) and kind in _TYPES:
-                (value,) = struct.unpack_from(f"{order}{_TYPES[kind]}", data, entry + 8)
-                found[tag] = max(value, found.get(tag, 0))
-    except struct.error:
-        return None
-    return (found[_WIDTH], found[_HEIGHT]) if len(found) == 2 else None
-
-
 def decode_picture(data: bytes, source: object, error: type[SynpickError], size: tuple[int, int] | None = None) -> np.ndarray:
     """Decode a PNG, JPEG or TIFF file, keeping its channels and bit depth. Arguments, result and errors are those of `decode_image`."""
-    if data[:4] not in _TIFF:
+    if not data.startswith(_TIFF):
         return decode_image(data, source, error, size=size)
     import cv2
     import numpy as np
 
-    stated = tiff_size(data)
+    stated = image_size(data)
     if stated is None or not (min(stated) > 0 and max(stated) <= MAX_SIDE):
         raise error(f"{source} is not a TIFF image of up to {MAX_SIDE} x {MAX_SIDE} pixels")
     if size is not None and stated != size:

@@ -49,7 +49,9 @@ _REQUEST = struct.Struct("<dQQ")
 _END = struct.Struct("<i?")
 """Exit status, as of subprocess, and whether the time was over."""
 _STARTED = b"S"
-_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
+MAX_PIXELS = 2**25
+"""Most pixels of an image that OpenCV decodes: 8192 x 4096, which take 1.2 GB as 32-bit floats in an environment map."""
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive", "OPENCV_IO_MAX_IMAGE_PIXELS": str(MAX_PIXELS)}
 """Calls are the parallelism, and their matrices small. CoACD keeps its OpenMP threads, as often there is a single slow object;
 waiting ones take no processor time."""
 _BLOCK = 1 << 20

@@ -1,4 +1,4 @@
-"""glTF 2.0 documents (.glb, .gltf): container, JSON schema and buffers, validated before anything is decoded.
+"""glTF 2.0 documents (.glb, .gltf): container, JSON schema and buffers.
 
 Of the JSON only what is declared here is read: geometry, nodes, base colour and metallic-roughness with their images.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import binascii
 import os
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +18,11 @@ from urllib.parse import unquote, unquote_to_bytes
 import msgspec
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, read_referred
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, read_referred
 from synpick_warp.scenes.assets.mesh_parts import Notes
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import decode_json
 
-MAX_DEPTH = 256
-"""Maximum depth of the tree of nodes."""
 _JSON, _BIN = b"JSON", b"BIN\0"
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """NumPy types of an accessor's components."""
@@ -35,7 +34,7 @@ _IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
 _ATTRIBUTES = ("POSITION", "NORMAL", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_")
-_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Three = tuple[float, float, float]
@@ -63,18 +62,11 @@ class View(_Struct):
     extensions: dict[str, Any] = {}
 
 
-class SparseIndices(_Struct):
-    """Indices of the elements that a sparse accessor replaces."""
+class SparsePart(_Struct):
+    """Indices of the elements that a sparse accessor replaces, or values with which it does."""
 
     bufferView: Index  # noqa: N815
-    componentType: Literal[5121, 5123, 5125]  # noqa: N815
-    byteOffset: Index = 0  # noqa: N815
-
-
-class SparseValues(_Struct):
-    """Values with which a sparse accessor replaces elements."""
-
-    bufferView: Index  # noqa: N815
+    componentType: Literal[5121, 5123, 5125] = 5121  # noqa: N815
     byteOffset: Index = 0  # noqa: N815
 
 
@@ -82,8 +74,8 @@ class Sparse(_Struct):
     """Sparse part of an accessor: number, indices and values of the elements that it replaces."""
 
     count: Index
-    indices: SparseIndices
-    values: SparseValues
+    indices: SparsePart
+    values: SparsePart
 
 
 class Accessor(_Struct):
@@ -223,12 +215,6 @@ class Material(_Struct):
     alphaMode: str = "OPAQUE"  # noqa: N815
 
 
-class _Head(_Struct):
-    """Asset statement of a document, whose version is checked before the rest is read."""
-
-    asset: Any = None
-
-
 class Gltf(_Struct):
     """Schema of a glTF document's JSON: arrays of its elements, which refer to one another by index, and the default scene."""
 
@@ -270,13 +256,11 @@ def read_document(path: Path, notes: Notes, data: bytes | None = None) -> Docume
     else:
         header, chunks = data.removeprefix(b"\xef\xbb\xbf"), []
     where = f"{path}: its JSON chunk" if chunks else path
-    version = decode_json(header, _Head, where, CatalogError).asset
-    if isinstance(version, dict) and str(version.get("version", "2")).startswith("1"):
+    asset = decode_json(header, dict[str, msgspec.Raw], where, CatalogError).get("asset", b"")
+    if re.search(rb'"version"\s*:\s*"?1', asset):
         raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
     gltf = decode_json(header, Gltf, where, CatalogError)
     _check_extensions(gltf, path, notes)
-    _check_sizes(gltf, path)
-    _check_tree(gltf, path)
     return Document(path, gltf, _read_buffers(gltf, chunks, path))
 
 
@@ -286,7 +270,7 @@ def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:
     refused = [ascii(name)[1:-1][:80] for name in needed if not name.startswith(_DISPENSABLE)]
     if refused:
         advice = "export it with textures as PNG or JPEG" if any("texture" in name for name in refused) else "export it without it"
-        advice = "export it without compression" if any(name in _COMPRESSED for name in refused) else advice
+        advice = "export it without compression" if any(name in COMPRESSED for name in refused) else advice
         raise CatalogError(f"{path}: requires the extension {', '.join(refused[:8])}, which is not implemented; {advice}")
     notes.ignored += [ascii(name)[1:-1][:80] for name in sorted(set(gltf.extensionsUsed) | set(needed)) if name not in _IMPLEMENTED]
     notes.ignored += ["animations"] if gltf.animations else []
@@ -315,65 +299,6 @@ def item_at(items: list[_Item], index: int, what: str, path: Path) -> _Item:
     return items[index]
 
 
-def _check_sizes(gltf: Gltf, path: Path) -> None:
-    """Check what would be allocated: views and accessors in bytes, vertices and triangles of all meshes and of all nodes."""
-    for name in ("buffers", "bufferViews", "accessors", "images", "textures", "materials", "meshes", "nodes", "skins"):
-        limit = MAX_PARTS * (8 if name in ("bufferViews", "accessors") else 1)
-        if len(getattr(gltf, name)) > limit:
-            raise CatalogError(f"{path}: {len(getattr(gltf, name))} {name}; allowed: {limit}; merge the meshes' parts")
-    viewed = sum(view.byteLength for view in gltf.bufferViews)
-    stored = sum(each.count * int(COMPONENTS[each.componentType][2]) * WIDTHS[each.type] for each in gltf.accessors)
-    if max(viewed, stored) > 2 * MAX_MESH_FILE:
-        raise CatalogError(f"{path}: its accessors take {max(viewed, stored)} bytes; allowed: {2 * MAX_MESH_FILE}; decimate the mesh")
-    rows = []
-    for mesh in gltf.meshes:
-        mesh.primitives = [each for each in mesh.primitives if each.mode in (TRIANGLES, STRIP, FAN)]
-        rows.append(sum(_primitive_rows(gltf, each, path) for each in mesh.primitives))
-    drawn = sum(item_at(rows, node.mesh, "mesh", path) for node in gltf.nodes if node.mesh is not None)
-    parts = sum(len(gltf.meshes[node.mesh].primitives) for node in gltf.nodes if node.mesh is not None)
-    if max(sum(rows), drawn) > MAX_ROWS or max(parts, sum(len(mesh.primitives) for mesh in gltf.meshes)) > MAX_PARTS:
-        raise CatalogError(f"{path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
-
-
-def _primitive_rows(gltf: Gltf, primitive: Primitive, path: Path) -> int:
-    """Vertices or triangles of a primitive, whichever are more."""
-    used = {key: index for key, index in primitive.attributes.items() if key.startswith(_ATTRIBUTES)}
-    if "POSITION" not in used:
-        raise CatalogError(f"{path}: a mesh has no positions; export it again")
-    for key, index in (*used.items(), *([("indices", primitive.indices)] if primitive.indices is not None else ())):
-        accessor = item_at(gltf.accessors, index, "accessor", path)
-        if accessor.bufferView is None and accessor.sparse is None and accessor.count:
-            names = ", ".join(ascii(name)[1:-1][:80] for name in sorted(primitive.extensions)) or "compressed geometry"
-            raise CatalogError(f"{path}: {key} without data, as in files with {names}; export it without compression")
-    count = gltf.accessors[used["POSITION"]].count
-    corners = gltf.accessors[primitive.indices].count if primitive.indices is not None else count
-    return max(count, corners // 3 if primitive.mode == TRIANGLES else corners)
-
-
-def _check_tree(gltf: Gltf, path: Path) -> None:
-    """Check that nodes form trees, as glTF demands: one parent each, roots without, and no deeper than MAX_DEPTH."""
-    parents: dict[int, int] = {}
-    for number, node in enumerate(gltf.nodes):
-        if node.skin is not None:
-            for joint in item_at(gltf.skins, node.skin, "skin", path).joints:
-                item_at(gltf.nodes, joint, "node", path)
-        for child in node.children:
-            item_at(gltf.nodes, child, "node", path)
-            if parents.setdefault(child, number) != number or child == number:
-                raise CatalogError(f"{path}: node {child} has two parents; export it again")
-    for scene in gltf.scenes:
-        for root in scene.nodes:
-            item_at(gltf.nodes, root, "node", path)
-            if root in parents:
-                raise CatalogError(f"{path}: node {root} is a root and a child; export it again")
-    for number in range(len(gltf.nodes)):
-        depth, node = 0, number
-        while node in parents:
-            depth, node = depth + 1, parents[node]
-            if depth > MAX_DEPTH:
-                raise CatalogError(f"{path}: its nodes are nested deeper than {MAX_DEPTH}; export it again")
-
-
 def _read_buffers(gltf: Gltf, chunks: list[bytes], path: Path) -> list[bytes]:
     """Content of all buffers: binary chunks, embedded ones, and files in the model's folder."""
     buffers, rest, total = [], list(reversed(chunks)), 0
@@ -384,7 +309,7 @@ def _read_buffers(gltf: Gltf, chunks: list[bytes], path: Path) -> list[bytes]:
             raise CatalogError(f"{path}: its buffers take more than {2 * MAX_MESH_FILE} bytes; decimate the mesh")
     for view in gltf.bufferViews:
         if view.byteOffset + view.byteLength > len(item_at(buffers, view.buffer, "buffer", path)):
-            if compressed := sorted(set(view.extensions) & set(_COMPRESSED)):
+            if compressed := sorted(set(view.extensions) & set(COMPRESSED)):
                 raise CatalogError(f"{path}: {compressed[0]} without uncompressed data; export it without compression")
             raise CatalogError(f"{path}: not readable as {path.suffix[1:].upper()} (a buffer is shorter than its views); it is cut short")
     return buffers

@@ -21,9 +21,10 @@ from synpick_warp.scenes.assets.appearance import (
     linear_to_srgb,
     srgb_to_linear,
 )
-from synpick_warp.scenes.assets.asset_files import reading_as
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, reading_as
 from synpick_warp.scenes.assets.gltf.document import (
     COMPONENTS,
+    COMPRESSED,
     FAN,
     GLOSSINESS,
     QUANTIZATION,
@@ -96,26 +97,39 @@ class _Reader:
         # Joints may lie outside of the scene.
         placed = self.placed(roots) if self.gltf.skins else drawn
         parts: list[MeshPart] = []
+        rows = 0
         for number, transform in drawn.items():
             skin, mesh = nodes[number].skin, nodes[number].mesh
-            for each in () if mesh is None else self.gltf.meshes[mesh].primitives:
+            for each in () if mesh is None else item_at(self.gltf.meshes, mesh, "mesh", self.path).primitives:
+                if each.mode not in (TRIANGLES, STRIP, FAN):
+                    continue
                 part = self.part(each)
-                parts.append(_transform(part, transform) if skin is None else self.skinned(part, each, self.gltf.skins[skin], placed))
+                rows += max(len(part.vertices), len(part.faces))
+                if rows > MAX_ROWS or len(parts) >= MAX_PARTS:
+                    raise CatalogError(f"{self.path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
+                if skin is not None:
+                    part = self.skinned(part, each, item_at(self.gltf.skins, skin, "skin", self.path), placed)
+                parts.append(part if skin is not None else _transform(part, transform))
         return parts
 
     def placed(self, roots: list[int]) -> dict[int, np.ndarray]:
         """Transforms (4, 4) of nodes and all below them to the scene, by number, depth first."""
-        stack = [(root, np.eye(4)) for root in reversed(roots)]
+        stack = [(root, np.eye(4)) for root in reversed(dict.fromkeys(roots))]
         placed: dict[int, np.ndarray] = {}
         while stack:
             number, parent = stack.pop()
-            placed[number] = matmul(parent, _node_matrix(self.gltf.nodes[number]))
-            stack += [(child, placed[number]) for child in reversed(self.gltf.nodes[number].children)]
+            if number in placed:
+                raise CatalogError(f"{self.path}: node {number} has two parents, or is a root and a child; export it again")
+            node = item_at(self.gltf.nodes, number, "node", self.path)
+            placed[number] = matmul(parent, _node_matrix(node))
+            stack += [(child, placed[number]) for child in reversed(dict.fromkeys(node.children))]
         return placed
 
     def skinned(self, part: MeshPart, primitive: Primitive, skin: Skin, placed: dict[int, np.ndarray]) -> MeshPart:
         """Linear blend skinning in the pose of the file: vertices by the weighted mean of the transforms of their joints."""
         count, names = len(part.vertices), primitive.attributes
+        for joint in skin.joints:
+            item_at(self.gltf.nodes, joint, "node", self.path)
         sets = [number for number in range(len(names)) if f"JOINTS_{number}" in names and f"WEIGHTS_{number}" in names]
         if not sets:
             return part
@@ -144,6 +158,8 @@ class _Reader:
     def part(self, primitive: Primitive) -> MeshPart:
         """Geometry and material of a primitive as a mesh part."""
         attributes = primitive.attributes
+        if "POSITION" not in attributes:
+            raise CatalogError(f"{self.path}: a mesh has no positions; export it again")
         vertices = self.values(attributes["POSITION"], "POSITION", (3,))
         count = len(vertices)
         corners = np.arange(count)
@@ -187,7 +203,7 @@ class _Reader:
         if WIDTHS[accessor.type] not in widths:
             allowed = " or ".join(kind for kind, width in WIDTHS.items() if width in widths and kind[:3] != "MAT")
             raise CatalogError(f"{self.path}: {name} is of type {accessor.type}; needed: {allowed}; export it again")
-        values = self.raw(accessor)
+        values = self.raw(accessor, name)
         always = name in ("NORMAL", "COLOR_0") or (name[0] == "T" and QUANTIZATION not in self.gltf.extensionsUsed)
         kind = values.dtype
         values = values.astype(np.float64)
@@ -195,9 +211,14 @@ class _Reader:
             return values
         return np.maximum(values / np.iinfo(kind).max, -1.0)
 
-    def raw(self, accessor: Accessor) -> np.ndarray:
+    def raw(self, accessor: Accessor, name: str) -> np.ndarray:
         """Stored numbers of an accessor (count, width), with its sparse values in their places."""
         kind, width, sparse = np.dtype(COMPONENTS[accessor.componentType]), WIDTHS[accessor.type], accessor.sparse
+        if accessor.bufferView is None and sparse is None and accessor.count:
+            used = ", ".join(sorted(set(self.gltf.extensionsUsed) & set(COMPRESSED))) or "compressed geometry"
+            raise CatalogError(f"{self.path}: {name} without data, as in files with {used}; export it without compression")
+        if accessor.count * width * kind.itemsize > MAX_MESH_FILE:
+            raise CatalogError(f"{self.path}: {name} takes more than {MAX_MESH_FILE} bytes; decimate the mesh")
         values = np.zeros((accessor.count, width), kind)
         if accessor.bufferView is not None:
             values = self.rows(accessor.bufferView, accessor.byteOffset, accessor.count, width, kind)
