@@ -16,7 +16,7 @@ import numpy as np
 from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.catalog import shape_recipe
-from synpick_warp.scenes.collision import embedded_shapes
+from synpick_warp.scenes.collision import shapes
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
 from synpick_warp.scenes.collision.simplification import simplify_hull
@@ -35,18 +35,18 @@ def main() -> None:
     recipes = {raw.name: shape_recipe(raw, objects) for raw in raws}
     others = [raw for raw in raws if raw.name not in PIECES]
     names, meshes, rules = [raw.name for raw in others], [raw.mesh for raw in others], [recipes[raw.name] for raw in others]
-    embedded_shapes._read_shapes = dict  # type: ignore[assignment]  # nothing is taken from the present file
+    shapes.read_embedded_shapes = dict  # type: ignore[assignment]  # nothing is taken from the present file
     with tempfile.TemporaryDirectory() as cache:
         found = collision_shapes(names, meshes, rules, Path(cache), lambda line: print(line, file=sys.stderr))
-    shapes = dict(zip(names, found, strict=True)) | {name: modelled_shape(name, recipes[name]) for name in PIECES}
+    computed = dict(zip(names, found, strict=True)) | {name: modelled_shape(name, recipes[name]) for name in PIECES}
     arrays = {}
     for raw in raws:
-        shape = shapes[raw.name]
+        shape = computed[raw.name]
         if not isinstance(shape, tuple):
             raise shape
-        key = embedded_shapes.shape_key(raw.mesh, recipes[raw.name])
-        arrays |= {f"{key}.{name}": array for name, array in embedded_shapes.pack_pieces(shape).items()}
-    np.savez_compressed(embedded_shapes.FILE, **arrays)
+        key = shapes.shape_key(raw.mesh, recipes[raw.name])
+        arrays |= {f"{key}.{name}": array for name, array in shapes.pack_pieces(shape).items()}
+    np.savez_compressed(shapes.EMBEDDED_FILE, **arrays)
 
 
 def modelled_shape(name: str, recipe: ShapeRecipe) -> Shape:

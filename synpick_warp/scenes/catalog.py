@@ -25,8 +25,8 @@ from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.solids import solids
-from synpick_warp.scenes.symmetries.likeness import look_alike, shape_profile
 from synpick_warp.scenes.symmetries.objects import add_symmetries
+from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 from synpick_warp.system.linear_algebra import norm
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated

@@ -11,9 +11,9 @@ from scipy.spatial import ConvexHull
 from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.catalog import shape_recipe
-from synpick_warp.scenes.collision import embedded_shapes
+from synpick_warp.scenes.collision import shapes
 from synpick_warp.scenes.collision.decomposition import decompose
-from synpick_warp.scenes.collision.embedded_shapes import embedded_shape
+from synpick_warp.scenes.collision.shapes import embedded_shape
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
 from tools.embedded_shapes import modelled_shape
@@ -66,4 +66,4 @@ def test_rounding_errors_do_not_hide_shapes_and_changes_do():
 
 
 def test_the_file_has_no_other_shapes():
-    assert len(embedded_shapes._read_shapes()) == len(OBJECTS)
+    assert len(shapes.read_embedded_shapes()) == len(OBJECTS)

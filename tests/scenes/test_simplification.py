@@ -18,8 +18,7 @@ from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.collision import simplification
-from synpick_warp.scenes.collision.hull_planes import hull_planes
-from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
+from synpick_warp.scenes.collision.hulls import hull_planes, hull_volume, mass_properties
 from synpick_warp.scenes.collision.simplification import MIN_VERTICES, simplify_hull
 from synpick_warp.scenes.types import ConvexPiece
 from tests.harness.pieces import assert_valid

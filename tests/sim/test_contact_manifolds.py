@@ -9,7 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.collision.hull_planes import hull_planes
+from synpick_warp.scenes.collision.hulls import hull_planes
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.stages.sim import physics

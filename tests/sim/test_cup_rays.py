@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.scenes.collision.hull_planes import hull_planes
+from synpick_warp.scenes.collision.hulls import hull_planes
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.suction import SuctionHold

@@ -1,4 +1,4 @@
-"""Colour conversion and textures: sRGB transfer function, 8-bit conversion, vertex colour baking, texture atlases."""
+"""Colour conversion and textures: sRGB transfer function, image decoding, vertex colour baking, texture atlases."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import OpenEXR
 from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
-from synpick_warp.scenes.assets.exr import EXR_MAGIC, decode_exr
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -28,6 +28,9 @@ TEXTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "J
 # Linear segment of the sRGB transfer function (IEC 61966-2-1).
 _SRGB_TOE = 0.04045
 _LINEAR_TOE = 0.0031308
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+"""First bytes of an OpenEXR file."""
+_EXR_COLORS = (("R", "G", "B"), ("Y",))
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,3 +262,42 @@ def _fit_blocks(blocks: list[np.ndarray], owner: str, said: list[str]) -> list[n
             said += [f"its textures together are too large: scaled by 1/{2**halvings}"] if halvings else []
             return blocks
     raise CatalogError(f"{owner}: {len(blocks)} textures are too many for one image; merge its materials")
+
+
+def decode_exr(data: bytes, source: str, most: int) -> np.ndarray:
+    """Decode the colour or grey channels of an OpenEXR image as (H, W, 3) float32, linear; the first layer that has them.
+
+    Args:
+        data: The file.
+        source: Where it comes from, for errors.
+        most: Maximum number of pixels, which is checked by the header.
+
+    Raises:
+        CatalogError: The image is too large, damaged or has no such channels.
+    """
+    try:
+        low, high = OpenEXR.File(io.BytesIO(data), header_only=True).header()["dataWindow"]
+        width, height = (int(size) for size in np.subtract(high, low, dtype=np.int64) + 1)
+        if width * height > most:
+            raise CatalogError(f"{source}: too large an image, {width} x {height} pixels; allowed: {most} pixels; scale it down")
+        channels = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()
+    except CatalogError:
+        raise
+    except Exception as error:  # the library raises nearly anything on damaged files
+        raise CatalogError(f"{source}: not readable as OpenEXR ({describe_error(error)}); use PNG or JPEG") from None
+    planes = _exr_planes({str(name): np.asarray(channel.pixels) for name, channel in channels.items()})
+    if planes is None:
+        raise CatalogError(f"{source}: an OpenEXR image without channels R, G, B or Y of one size; use PNG or JPEG")
+    return np.nan_to_num(np.stack(planes, axis=-1).astype(np.float32), nan=0.0, posinf=1.0, neginf=0.0)
+
+
+def _exr_planes(channels: dict[str, np.ndarray]) -> list[np.ndarray] | None:
+    """Three planes (H, W) of the first layer with colours, or with grey; a sole channel of any name is grey. None: there are none."""
+    layers = sorted({name.rpartition(".")[0] for name in channels}, key=lambda layer: (len(layer), layer))
+    for names in _EXR_COLORS:
+        for layer in layers:
+            found = [channels.get(f"{layer}.{name}" if layer else name) for name in names]
+            planes = [plane for plane in found if plane is not None]
+            if len(planes) == len(names) and len({plane.shape for plane in planes}) == 1:
+                return planes * (3 // len(planes))
+    return list(channels.values()) * 3 if len(channels) == 1 else None

@@ -18,10 +18,18 @@ from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, quiet_decoding, read_referred, reading_as
+from synpick_warp.scenes.assets.asset_files import (
+    MAX_MESH_FILE,
+    MAX_ROWS,
+    MAX_TEXT_MESH,
+    check_decimals,
+    decode_text,
+    quiet_decoding,
+    read_referred,
+    reading_as,
+)
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes, check_indices
 from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
-from synpick_warp.scenes.assets.text import check_decimals, decode_text
 from synpick_warp.system.inputs.files import read_file
 
 MAX_HEADER = 2**16

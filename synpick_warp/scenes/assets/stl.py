@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, check_decimals, decode_text
 from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, MeshPart, Notes
-from synpick_warp.scenes.assets.text import check_decimals, decode_text
 from synpick_warp.system.inputs.files import read_file
 
 _HEADER = 84

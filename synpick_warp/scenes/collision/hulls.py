@@ -1,4 +1,4 @@
-"""Convex hulls: volume and diameter; mass properties of convex polyhedra."""
+"""Convex hulls: volume and diameter; mass properties and half-spaces (H-representation) of convex polyhedra."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from synpick_warp.scenes.types import ConvexPiece, HullSize
+from synpick_warp.scenes.types import Catalog, ConvexPiece, HullSize
 from synpick_warp.system.linear_algebra import dot
 
 # Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
@@ -20,6 +20,9 @@ _DISTANCES = 2**24
 _MOST_COMPARED = 2**15
 # Number of vertices from which the farthest-point search in larger hulls starts.
 _STARTS = 1024
+# Coplanar triangles are merged into one half-space if normal and offset [m] agree to this many decimals. Vertices in single precision tilt
+# the triangles of a facet against each other by up to 1e-6.
+_DECIMALS = 5
 
 
 @dataclass(frozen=True)
@@ -98,3 +101,38 @@ def mass_properties(pieces: Sequence[ConvexPiece]) -> MassProperties:
     covariance = second / (20.0 * volume) - np.outer(center, center)
     covariance = (covariance + covariance.T) / 2.0
     return MassProperties(float(volume), origin + center, np.trace(covariance) * np.eye(3) - covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneTable:
+    """Planes of all collision shapes of a catalog, in compressed row layout.
+
+    The pieces of entry e are first_piece[e] to first_piece[e + 1] - 1; the planes of piece p are first_plane[p] to first_plane[p + 1] - 1.
+    """
+
+    first_piece: np.ndarray
+    """(entry + 1) int32."""
+    first_plane: np.ndarray
+    """(piece + 1) int32."""
+    plane: np.ndarray
+    """(plane, 4) float32: outward unit normal n and offset d [m] in the object's frame; the inside is n·x ≤ d."""
+
+
+def hull_planes(piece: ConvexPiece) -> np.ndarray:
+    """H-representation of a piece (plane, 4) float64: outward unit normal n and offset d [m] of each half-space n·x ≤ d.
+
+    Computed from the hull of the vertices, not from the triangles: normals of thin triangles are unreliable.
+    """
+    equations = ConvexHull(piece.vertices.astype(np.float64)).equations
+    _, index = np.unique(equations.round(_DECIMALS), axis=0, return_index=True)
+    planes = equations[np.sort(index)]
+    return np.concatenate([planes[:, :3], -planes[:, 3:]], axis=1)
+
+
+def plane_table(catalog: Catalog) -> PlaneTable:
+    """Collect the half-spaces of all entries' pieces."""
+    pieces = [[hull_planes(piece) for piece in entry.pieces] for entry in catalog.bodies]
+    planes = [plane for entry in pieces for plane in entry]
+    first_piece = np.cumsum([0] + [len(entry) for entry in pieces])
+    first_plane = np.cumsum([0] + [len(plane) for plane in planes])
+    return PlaneTable(first_piece.astype(np.int32), first_plane.astype(np.int32), np.concatenate(planes).astype(np.float32))

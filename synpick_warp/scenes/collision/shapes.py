@@ -1,4 +1,8 @@
-"""Collision shapes of a catalog's objects, with a disk cache keyed by content (mesh, recipe, CoACD version)."""
+"""Collision shapes of a catalog's objects, with a disk cache keyed by content (mesh, recipe, CoACD version).
+
+Those of the embedded objects are shipped, so that a first bake does not wait for convex decomposition. They are keyed by mesh and recipe:
+with other settings, or after a change, objects are decomposed as any others. `python -m tools.embedded_shapes` computes them again.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +20,6 @@ import numpy as np
 from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
-from synpick_warp.scenes.collision.embedded_shapes import embedded_shape, pack_pieces, unpack_pieces
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
@@ -35,6 +39,12 @@ HULL_LIMITS = Limits(120.0, 2**32)
 """Limits of the simplification of a convex hull: 120 s of processor time and 4 GiB; a scan with two million vertices takes seconds."""
 _REMEDY = "repair the mesh, or set concave = false"
 _LATE = "decimate the mesh, raise objects.decomposition_time, or set concave = false"
+EMBEDDED_FILE = Path(__file__).with_name("embedded_shapes.npz")
+"""Arrays of `pack_pieces` for each key, named KEY.vertices, KEY.faces and KEY.counts."""
+# Meshes follow from sines and cosines, whose last bits depend on NumPy and the processor; so vertices count to 10 micrometres [m].
+_GRID = 1e-5
+# Sizes are multiples of 0.1 mm: away from the grid's limits by this fraction of a cell, rounding errors do not change a key.
+_OFFSET = 0.25
 
 
 def default_cache_dir() -> Path:
@@ -53,7 +63,7 @@ def collision_shapes(
 ) -> list[Shape | CatalogError]:
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
-    Those of the embedded objects come with the program (`embedded_shapes`). Others are computed in isolated processes (`run_isolated`).
+    Those of the embedded objects come with the program. Others are computed in isolated processes (`run_isolated`).
     What CoACD crashes on or cannot decompose gets its convex hull instead, and a line says so. If time or memory of this machine does not
     suffice, that is an error: elsewhere, or under other load, the same settings would give another shape.
 
@@ -182,3 +192,37 @@ def _save(file: Path, pieces: Shape, report: Callable[[str], None]) -> bool:
         report(f"collision shapes are not cached: {reason}; set {USER_VARIABLE} to a folder that can")
         return False
     return True
+
+
+def pack_pieces(pieces: Shape) -> dict[str, np.ndarray]:
+    """Arrays of convex pieces: `vertices` (V, 3) and `faces` (F, 3) of all, and their `counts` (piece, 2)."""
+    vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
+    return {"vertices": vertices, "faces": faces, "counts": np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])}
+
+
+def unpack_pieces(vertices: np.ndarray, faces: np.ndarray, counts: np.ndarray) -> Shape:
+    """Convex pieces of a shape from the arrays of `pack_pieces`."""
+    ends = np.cumsum(counts, axis=0)[:-1]
+    pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
+    return tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
+
+
+def shape_key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
+    """Key of a mesh's shape (hexadecimal SHA-256)."""
+    digest = hashlib.sha256(repr(recipe).encode())
+    digest.update(np.floor(mesh.vertices.astype(np.float64) / _GRID + _OFFSET).astype("<i4").tobytes())
+    digest.update(mesh.faces.astype("<i4").tobytes())
+    return digest.hexdigest()
+
+
+def embedded_shape(mesh: TriangleMesh, recipe: ShapeRecipe) -> Shape | None:
+    """Collision shape of an embedded object, from the file of the package; None for other meshes and recipes."""
+    return read_embedded_shapes().get(shape_key(mesh, recipe))
+
+
+@cache
+def read_embedded_shapes() -> dict[str, Shape]:
+    """Read the embedded collision shapes, by their keys."""
+    with np.load(EMBEDDED_FILE, allow_pickle=False) as data:
+        keys = {name.partition(".")[0] for name in data.files}
+        return {key: unpack_pieces(*(data[f"{key}.{name}"] for name in ("vertices", "faces", "counts"))) for key in keys}

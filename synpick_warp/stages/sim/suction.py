@@ -14,7 +14,7 @@ import warp as wp
 
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts, vacuum
-from synpick_warp.scenes.collision.hull_planes import plane_table
+from synpick_warp.scenes.collision.hulls import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, fill
 from synpick_warp.stages.launch import launch

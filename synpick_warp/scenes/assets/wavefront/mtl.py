@@ -13,7 +13,6 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, FileMaterial, as_color, decode_texture
 from synpick_warp.scenes.assets.asset_files import is_missing, read_referred
 from synpick_warp.scenes.assets.mesh_parts import GREY, WHITE, Notes, plain_color
-from synpick_warp.scenes.assets.wavefront.obj_text import join_lines
 
 # Options of a texture statement and how many arguments each takes at most.
 _OPTIONS = {"-blendu": 1, "-blendv": 1, "-bm": 1, "-boost": 1, "-cc": 1, "-clamp": 1, "-imfchan": 1, "-mm": 2, "-o": 3, "-s": 3, "-t": 3}
@@ -80,6 +79,11 @@ class TexturePixels:
             if sum(image.size // 3 for image in self.images.values()) > MAX_TEXTURE_PIXELS:
                 raise CatalogError(f"{self.owner}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
         return self.images[key]
+
+
+def join_lines(text: str) -> str:
+    """Text with line feeds as line ends, and lines that end in a backslash joined with the next."""
+    return text.replace("\r\n", "\n").replace("\r", "\n").replace("\\\n", " ")
 
 
 def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
