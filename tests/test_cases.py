@@ -10,8 +10,8 @@ import pytest
 from tests import bin_cases, camera_cases, mesh_cases, pick_cases
 
 CASES = Path(__file__).parent / "cases"
-KINDS = ("bins", "calibrations", "cells", "parts", "picks", "settings")
-"""Folders whose inputs have a row here; meshes, lights and others have theirs in tests/scenes."""
+KINDS = ("bins", "calibrations", "cells", "meshes", "parts", "picks", "settings")
+"""Folders whose inputs have a row here; lights and others have theirs in tests/scenes."""
 Check = Callable[[Path, Path], None]
 """Takes the path of an input and an empty folder for output; asserts."""
 ROWS: dict[str, Check] = {**bin_cases.ROWS, **camera_cases.ROWS, **mesh_cases.ROWS, **pick_cases.ROWS}

@@ -16,13 +16,13 @@ from scipy.spatial.distance import cdist
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes import catalog
+from synpick_warp.scenes import catalog as catalogs
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.collision import hulls
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
-from tests.worlds.model_files import REAL_HULLS, exported, glb, heard, put
+from tests.worlds.model_files import REAL_HULLS, exported, glb, heard, load_models, put
 
 REAL_CONCAVE = {13, 14, 15}
 
@@ -117,8 +117,8 @@ def test_meshes_that_are_not_bop_models_are_in_metres(tmp_path):
 def test_other_meshes_beside_bop_models_are_reported_as_ignored(tmp_path):
     write_box(tmp_path / "obj_000001.ply")
     write_box(tmp_path / "spare.obj")
-    lines: list[str] = []
-    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", heard(lines))) == 1
+    catalog, lines = load_models(tmp_path, tmp_path)
+    assert len(catalog) == 1
     assert any("1 meshes" in line and "ignored" in line for line in lines)
 
 
@@ -184,8 +184,8 @@ def test_units_and_centring_are_told(tmp_path, name, unit, center, size, said):
     box = trimesh.creation.box(size)
     box.apply_translation(np.array(size) / 2)
     put(file, exported(box, file.suffix[1:]))
-    lines: list[str] = []
-    (entry,) = load_catalog(config_for(tmp_path, unit=unit, center=center), tmp_path / "cache", heard(lines)).entries
+    catalog, lines = load_models(tmp_path, tmp_path, unit=unit, center=center)
+    (entry,) = catalog.entries
     scale = {"auto": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}[unit]
     assert np.ptp(entry.mesh.vertices, axis=0) == pytest.approx(scale * np.array(size), rel=1e-5)
     assert np.allclose(entry.mesh.vertices.max(axis=0), np.array(size) * scale * (0.5 if center else 1.0))
@@ -211,8 +211,7 @@ def test_an_implausible_unit_is_told_with_a_likely_one(tmp_path, unit, side, adv
     assert str(caught.value).endswith(f"; {advice}")
     # One that fits does not hide it.
     put(tmp_path / "d.stl", exported(trimesh.creation.box(np.full(3, 0.05 / {"auto": 1, "m": 1, "mm": 1e-3}[unit])), "stl"))
-    lines: list[str] = []
-    load_catalog(config_for(tmp_path, unit=unit), tmp_path / "cache", heard(lines))
+    _, lines = load_models(tmp_path, tmp_path, unit=unit)
     assert lines[-1] == f"models folder {tmp_path}: {advice}"
 
 
@@ -270,8 +269,8 @@ def test_a_small_tote_takes_small_objects(tmp_path):
 def test_objects_larger_than_the_volume_budget_are_reported(tmp_path):
     write_box(tmp_path / "large.ply", (0.2, 0.2, 0.2))
     write_box(tmp_path / "small.ply")
-    lines: list[str] = []
-    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", heard(lines))) == 2
+    catalog, lines = load_models(tmp_path, tmp_path)
+    assert len(catalog) == 2
     assert lines == ["never drawn, since larger than arrangement.volume, 0.007 m³: large (0.008 m³)"]
     roomy = replace(config_for(tmp_path), arrangement=Arrangement(volume=0.0081))
     lines.clear()
@@ -336,7 +335,7 @@ def test_of_many_hull_vertices_not_all_are_compared(monkeypatch, scale):
 def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):
     # Hulls only: decompositions of the embedded objects take longer than all other tests here.
     raws = [replace(raw, concave=False) for raw in procedural_objects()]
-    monkeypatch.setattr(catalog, "procedural_objects", lambda sets: raws)
+    monkeypatch.setattr(catalogs, "procedural_objects", lambda sets: raws)
     rows = tuple(ObjectRow(id=raw.obj_id, name="table", mass=99.0) for raw in raws)
     entries = load(Config(object_rows=rows), tmp_path)
     assert [entry.obj_id for entry in entries] == sorted(raw.obj_id for raw in raws)

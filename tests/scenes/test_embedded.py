@@ -12,6 +12,7 @@ from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.embedded import objects
 from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.surfaces import KINDS, SIDE, surface_textures
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
 from synpick_warp.scenes.modelling import (
     BOX_FACES,
@@ -281,3 +282,14 @@ def test_an_atlas_contains_each_image_at_its_rectangle():
         columns = slice(round(u0 * sheet.shape[1]), round(u1 * sheet.shape[1]))
         assert np.array_equal(sheet[rows, columns], pictures[name])
         assert np.array_equal(sheet[rows.start - PADDING, columns], pictures[name][0])
+
+
+# ---- textures of surfaces ----
+
+
+def test_textures_follow_from_their_index_and_differ():
+    made = surface_textures(len(KINDS))
+    assert all(image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8 for image in made)
+    assert len({image.tobytes() for image in made}) == len(made)
+    (again,) = surface_textures(1, 2)
+    np.testing.assert_array_equal(again, made[2])

@@ -11,23 +11,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.errors import CatalogError, LightError, SynpickError
 from synpick_warp.exporters.bop.shared.models import write_models
-from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.types import Catalog
 from tests.scenes.test_fuzz_assets import OBJ, picture
-from tests.worlds.model_files import exported, heard, put
+from tests.worlds.model_files import box, exported, load_models, put
 
 CASES = Path(__file__).resolve().parents[1] / "cases"
 SMALL = OBJ.replace("v 1 ", "v 0.1 ").replace("v 0 1 ", "v 0 0.1 ").replace("v 0 0 1\n", "v 0 0 0.1\n", 1)
 """A textured tetrahedron of 0.1 m."""
-
-
-def load(folder: Path, cache: Path, **objects) -> tuple[Catalog, list[str]]:
-    lines: list[str] = []
-    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache / "cache", heard(lines)), lines
 
 
 def write(folder: Path, **files: str | bytes) -> Path:
@@ -35,10 +27,6 @@ def write(folder: Path, **files: str | bytes) -> Path:
     for name, content in files.items():
         put(folder / name.replace("__", "/").replace("_dot_", "."), content)
     return folder
-
-
-def box(*extents: float, kind: str = "ply") -> bytes:
-    return exported(trimesh.creation.box(extents), kind)
 
 
 # ---- the inputs of tests/cases ----
@@ -49,7 +37,7 @@ def test_where_coacd_crashes_the_hull_stands(tmp_path, monkeypatch, case, names)
     monkeypatch.syspath_prepend(str(CASES / "coacd_crash" / "stub"))
     restart_server()
     try:
-        catalog, lines = load(CASES / "coacd_crash" / case, tmp_path)
+        catalog, lines = load_models(CASES / "coacd_crash" / case, tmp_path)
     finally:
         restart_server()
     assert [(entry.name, len(entry.pieces)) for entry in catalog.entries] == [(name, 1) for name in names]
@@ -64,13 +52,13 @@ def restart_server() -> None:
 
 
 def test_the_diagonal_in_models_info_is_named(tmp_path):
-    catalog, (line,) = load(CASES / "models_info_diagonal", tmp_path)
+    catalog, (line,) = load_models(CASES / "models_info_diagonal", tmp_path)
     assert catalog.entries[0].diameter == pytest.approx(0.01)
     assert "diameter 12.81 mm, which is the diagonal of its bounding box; its own, 10 mm, is used" in line
 
 
 def test_a_folder_per_object(tmp_path):
-    catalog, lines = load(CASES / "gso_layout", tmp_path)
+    catalog, lines = load_models(CASES / "gso_layout", tmp_path)
     assert [entry.name for entry in catalog.entries] == ["Shoe"]
     assert catalog.entries[0].material.texture is not None
     assert not lines
@@ -113,10 +101,10 @@ def test_files_of_formats_that_are_not_read_are_named(tmp_path, names, beside):
     said = f"models folder {tmp_path / 'models'}: of a format that is not read: {', '.join(sorted(names))}; save them as PLY, OBJ, glTF, "
     if not beside:
         with pytest.raises(CatalogError, match=re.escape(said)):
-            load(tmp_path / "models", tmp_path)
+            load_models(tmp_path / "models", tmp_path)
         return
     put(tmp_path / "models" / beside, box(0.1, 0.1, 0.1, kind=beside[-3:]))
-    _, (line, *_) = load(tmp_path / "models", tmp_path)
+    _, (line, *_) = load_models(tmp_path / "models", tmp_path)
     assert line.startswith(said)
 
 
@@ -127,17 +115,17 @@ def test_a_bad_mesh_is_left_out_with_a_line_and_keeps_its_number(tmp_path):
     folder = write(tmp_path / "models", a_dot_ply=box(0.1, 0.1, 0.1), b_dot_ply=b"no mesh", c_dot_ply=box(3.0, 3.0, 3.0), d_dot_glb=b"glTF")
     write(folder, e_dot_ply=box(0.1, 0.1, 0.0), f_dot_ply=box(0.1, 0.1, 0.1))
     write(folder, g_dot_ply=box(0.1, 0.1, 0.1), g_dot_obj=box(0.1, 0.1, 0.1, kind="obj"))
-    catalog, lines = load(folder, tmp_path)
+    catalog, lines = load_models(folder, tmp_path)
     assert [(entry.obj_id, entry.name) for entry in catalog.entries] == [(1, "a"), (6, "f"), (7, "g")]
     assert all(line.startswith("left out: ") for line in lines)
     with pytest.raises(CatalogError):
-        load(folder, tmp_path, strict=True)
+        load_models(folder, tmp_path, strict=True)
 
 
 def test_a_folder_of_bad_meshes_ends_in_one_line(tmp_path):
     folder = write(tmp_path / "models", a_dot_ply=b"no mesh", b_dot_ply=b"no mesh either")
     with pytest.raises(CatalogError) as caught:
-        load(folder, tmp_path)
+        load_models(folder, tmp_path)
     assert str(caught.value).startswith(f"models folder {folder}: none of its 2 objects can be used; the first: {folder / 'a.ply'}: ")
 
 
@@ -161,7 +149,7 @@ def test_a_bad_light_map_is_left_out(tmp_path):
 def test_a_texture_is_found_by_names_of_other_systems(tmp_path, name):
     folder = write(tmp_path / "models", a_dot_obj=SMALL.replace("a.mtl", "A.MTL"), a_dot_mtl=f"newmtl skin\nmap_Kd {name}\n")
     write(folder, **{("skin_dot_png" if "Tex" not in name and "\\tex" not in name else "tex__skin_dot_png"): picture()})
-    catalog, lines = load(folder, tmp_path)
+    catalog, lines = load_models(folder, tmp_path)
     assert catalog.entries[0].material.texture is not None
     assert len(lines) == 1
     assert "is read" in lines[0]
@@ -174,7 +162,7 @@ def test_such_names_do_not_lead_out_of_the_folder(tmp_path, name):
     (folder / "textures").symlink_to("..")
     (tmp_path / "skin.png").write_bytes(picture())
     with pytest.raises(CatalogError, match=r"skin\.png"):
-        load(folder, tmp_path)
+        load_models(folder, tmp_path)
 
 
 @pytest.mark.parametrize("mtl", ["texture.png", "../materials/textures/texture.png", "..\\materials\\textures\\Texture.PNG"])
@@ -187,7 +175,7 @@ def test_a_folder_per_object_with_textures_beside(tmp_path, mtl, depth):
         files = {f"{depth}model_dot_obj": SMALL, f"{depth}a_dot_mtl": f"newmtl skin\nmap_Kd {mtl}\n"}
         write(folder / name, **files, materials__textures__texture_dot_png=picture(), meshes__nontextured_dot_ply=box(0.1, 0.1, 0.1))
     write(folder / "no_model", readme_dot_txt="none")
-    catalog, lines = load(folder, tmp_path)
+    catalog, lines = load_models(folder, tmp_path)
     assert [(entry.obj_id, entry.name) for entry in catalog.entries] == [(1, "Mug"), (2, "Shoe")]
     assert all(entry.material.texture is not None for entry in catalog.entries)
     assert sum("2 meshes, of which" in line for line in lines) == 2
@@ -227,7 +215,7 @@ def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, files, read):
         put(folder / name, content)
         put((folder / name).with_name("a.mtl"), "newmtl skin\nmap_Kd texture_map.png\n")
         put((folder / name).with_name("texture_map.png"), picture())
-    catalog, lines = load(tmp_path / "models", tmp_path)
+    catalog, lines = load_models(tmp_path / "models", tmp_path)
     assert [entry.name for entry in catalog.entries] == [YCB]
     assert np.ptp(catalog.entries[0].mesh.vertices, axis=0) == pytest.approx([0.06] * 3, rel=1e-5)
     assert (catalog.entries[0].material.texture is not None) == read.endswith(".obj")
@@ -237,7 +225,7 @@ def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, files, read):
 def test_a_whole_bop_data_set_is_pointed_to_its_models(tmp_path):
     write(tmp_path / "set", models__obj_000001_dot_ply=box(100.0, 60.0, 20.0), camera_dot_json="{}")
     with pytest.raises(CatalogError, match=r"its folder models has BOP models; give .*/set/models$"):
-        load(tmp_path / "set", tmp_path)
+        load_models(tmp_path / "set", tmp_path)
 
 
 def test_a_set_of_lights_from_windows(tmp_path):
@@ -276,7 +264,7 @@ SIZES = {"min_x": -50, "min_y": -30, "min_z": -10, "size_x": 100, "size_y": 60, 
     ],
 )
 def test_a_stale_models_info_is_named_and_not_copied(tmp_path, info, said):
-    catalog, lines = load(bop(tmp_path, **info), tmp_path)
+    catalog, lines = load_models(bop(tmp_path, **info), tmp_path)
     assert catalog.entries[0].diameter == pytest.approx(0.1183, rel=1e-3)
     assert len(lines) == bool(said)
     assert said in "".join(lines)
@@ -291,7 +279,7 @@ def test_a_diagonal_that_is_hardly_longer_than_the_diameter_is_named(tmp_path):
     """By 2 % only, for a rod."""
     rod = exported(trimesh.creation.cylinder(10.0, 100.0))
     folder = write(tmp_path / "models", obj_000001_dot_ply=rod, models_info_dot_json=json.dumps({"1": {"diameter": 103.923}}))
-    _, (line,) = load(folder, tmp_path)
+    _, (line,) = load_models(folder, tmp_path)
     assert "diagonal" in line
 
 
@@ -300,18 +288,18 @@ def test_an_object_without_an_entry_goes_without_symmetries(tmp_path):
     write(folder, obj_000002_dot_ply=box(50.0, 50.0, 50.0), obj_000003_dot_ply=box(50.0, 50.0, 50.0))
     info = json.loads((folder / "models_info.json").read_text())
     (folder / "models_info.json").write_text(json.dumps({**info, "3": {"diameter": "big"}}))
-    catalog, lines = load(folder, tmp_path)
+    catalog, lines = load_models(folder, tmp_path)
     assert [len(entry.symmetries_discrete) for entry in catalog.entries] == [1, 0, 0]
     assert [line.rpartition("; ")[2] for line in lines] == ["until then it has no symmetries"] * 2
     write_models(tmp_path / "out", catalog)
     written = json.loads((tmp_path / "out" / "models_info.json").read_text())
     assert written["3"]["diameter"] == pytest.approx(86.6, rel=1e-3)
     with pytest.raises(CatalogError, match="no entry for object 2"):
-        load(folder, tmp_path, strict=True)
+        load_models(folder, tmp_path, strict=True)
 
 
 def test_a_mesh_in_metres_among_millimetres_is_told(tmp_path):
     folder = write(tmp_path / "models", obj_000001_dot_ply=box(0.1, 0.06, 0.02))
     (folder / "models_info.json").write_text(json.dumps({"1": {"diameter": 118.3}}))
     with pytest.raises(SynpickError, match=r"diameter is 0\.1183 mm, but models_info\.json says 118\.3; scale it to millimetres"):
-        load(folder, tmp_path)
+        load_models(folder, tmp_path)

@@ -16,19 +16,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.configs.schema import Bake, Config
 from synpick_warp.errors import CatalogError, LightError
 from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS
 from synpick_warp.scenes.assets.meshes import read_mesh
-from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
 from synpick_warp.stages.render.light_tables import precompute_environment
 from tests.harness.fuzz import start_isolation
 from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, picture
-from tests.worlds.model_files import binary_ply, exported, pack_glb, pack_png, unpack_glb
+from tests.worlds.model_files import binary_ply, box, exported, load_models, pack_glb, pack_png, read, unpack_glb
 
 SECONDS = 5.0
 """Longest time that any input may take."""
@@ -54,7 +52,7 @@ def refused(folder: Path, cache: Path, *words: str) -> str:
     start_isolation()
     started = time.monotonic()
     with pytest.raises(CatalogError) as caught:
-        load_catalog(Config(bake=Bake(models=str(folder))), cache)
+        load_models(folder, cache)
     said = str(caught.value)
     assert said.isprintable()
     assert all(word in said for word in words), said
@@ -70,30 +68,30 @@ def refused(folder: Path, cache: Path, *words: str) -> str:
 def test_a_texture_outside_of_the_folder_is_refused(tmp_path, name, word):
     folder = folder_of(tmp_path, f"comment {word} {name}")
     (folder / "link").symlink_to("../..")
-    refused(folder, tmp_path / "cache", "names the file", "obj_000001.ply")
+    refused(folder, tmp_path, "names the file", "obj_000001.ply")
 
 
 def test_a_second_texture_comment_is_refused(tmp_path):
     folder = folder_of(tmp_path, "comment TextureFile skin.png", "comment TextureFile models_info.json")
-    refused(folder, tmp_path / "cache", "2 texture comments")
+    refused(folder, tmp_path, "2 texture comments")
 
 
 @pytest.mark.parametrize("line", ["comment texturefile skin.png", "comment  TEXTUREFILE  sub/skin.png", "comment TextureFile ./skin.png"])
 def test_a_texture_that_is_read_is_copied_into_the_set(tmp_path, line):
     folder = folder_of(tmp_path, line)
-    catalog = load_catalog(Config(bake=Bake(models=str(folder))), tmp_path / "cache")
+    catalog = load_models(folder, tmp_path)[0]
     write_models(tmp_path / "models", catalog)
     name = line.split()[-1]
     assert (tmp_path / "models" / name).read_bytes() == picture()
     assert (tmp_path / "models" / "obj_000001.ply").read_bytes() == (folder / "obj_000001.ply").read_bytes()
-    again = load_catalog(Config(bake=Bake(models=str(tmp_path / "models"))), tmp_path / "cache")
+    again = load_models(tmp_path / "models", tmp_path)[0]
     assert np.array_equal(again.entries[0].material.texture, catalog.entries[0].material.texture)
 
 
 def test_only_the_texture_that_was_read_is_copied(tmp_path):
     """A texture that is replaced between reading and copying is not copied, whether by another image or by a file that is no image."""
     folder = folder_of(tmp_path, "comment TextureFile skin.png")
-    catalog = load_catalog(Config(bake=Bake(models=str(folder))), tmp_path / "cache")
+    catalog = load_models(folder, tmp_path)[0]
     other = cv2.imencode(".png", np.zeros((4, 3, 3), np.uint8))[1].tobytes()
     for number, content in enumerate((other, b"no picture")):
         (folder / "skin.png").write_bytes(content)
@@ -147,7 +145,7 @@ def test_file_names_that_cannot_be_kept_are_one_line(tmp_path, name, said):
     folder = tmp_path / "models"
     folder.mkdir()
     Path(os.fsdecode(os.fsencode(folder) + b"/" + name)).write_bytes(b"no model")
-    assert said in refused(folder, tmp_path / "cache")
+    assert said in refused(folder, tmp_path)
 
 
 # ---- files ----
@@ -161,13 +159,11 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, name, kind):
         (folder / "obj_000001.ply").unlink()
     (folder / name).unlink(missing_ok=True)
     {"fifo": os.mkfifo, "folder": os.mkdir, "device": lambda path: os.symlink("/dev/zero", path)}[kind](folder / name)
-    refused(folder, tmp_path / "cache", name)
+    refused(folder, tmp_path, name)
 
 
 def test_a_fifo_in_the_cache_of_shapes_is_no_obstacle(tmp_path):
-    box = trimesh.creation.box((0.1, 0.1, 0.1))
-    (tmp_path / "box.ply").write_bytes(box.export(file_type="ply"))
-    mesh, _ = read_mesh(tmp_path / "box.ply", 1.0)
+    mesh, _ = read(tmp_path / "box.ply", box(0.1, 0.1, 0.1))
     recipe = ShapeRecipe(concave=False, hull_vertices=64, piece_vertices=16, pieces=8, concavity=0.2)
     shapes = collision_shapes(["box"], [mesh], [recipe], tmp_path / "cache", print)
     (file,) = (tmp_path / "cache").iterdir()
@@ -189,13 +185,13 @@ def test_a_large_texture_is_refused_by_its_header_without_warnings(tmp_path, sid
     (folder / "skin.png").write_bytes(png(side, side))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        refused(folder, tmp_path / "cache", "skin.png: too large an image", "8192 x 8192")
+        refused(folder, tmp_path, "skin.png: too large an image", "8192 x 8192")
 
 
 def test_an_image_that_another_program_would_decode_is_refused(tmp_path):
     folder = folder_of(tmp_path, "comment TextureFile skin.png")
     (folder / "skin.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
-    refused(folder, tmp_path / "cache", "format is unknown")
+    refused(folder, tmp_path, "format is unknown")
 
 
 def test_a_header_announces_no_more_than_the_file_has(tmp_path):

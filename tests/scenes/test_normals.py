@@ -9,13 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_gltf
 
-from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals
-from synpick_warp.scenes.catalog import load_catalog
 from tests.twins.layers import render_layers
-from tests.worlds.model_files import exported, put
+from tests.worlds.model_files import exported, load_models, put
 from tests.worlds.toy_scene import ToyScene, camera, entry
 
 KINDS = ("ply", "obj", "glb", "gltf", "stl")
@@ -112,10 +110,7 @@ def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
     """The same box with normals of one vertex a corner, and without normals, where its vertices are split."""
     (tmp_path / "models").mkdir()
     file = write(tmp_path / "models", trimesh.creation.box((0.1, 0.08, 0.06)), "ply")
-    one, other = (
-        load_catalog(Config(bake=Bake(models=str(file.parent)), objects=Objects(crease_angle=angle)), tmp_path / "cache").entries[0]
-        for angle in (180.0, 35.0)
-    )
+    one, other = (load_models(file.parent, tmp_path, crease_angle=angle)[0].entries[0] for angle in (180.0, 35.0))
     assert (len(one.mesh.vertices), len(other.mesh.vertices)) == (8, 24)
     assert other.volume == pytest.approx(one.volume)
     assert other.inertia == pytest.approx(one.inertia)
@@ -124,7 +119,7 @@ def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
     assert signed_volume(other.mesh.vertices, other.mesh.faces) == pytest.approx(4.8e-4)
     places, faces = merge_positions(other.mesh.vertices, other.mesh.faces)
     assert trimesh.Trimesh(places, faces, process=False).is_watertight
-    catalog = load_catalog(Config(bake=Bake(models=str(file.parent))), tmp_path / "cache")
+    catalog = load_models(file.parent, tmp_path)[0]
     write_models(tmp_path / "out", catalog)
     again, _ = read_mesh(tmp_path / "out" / "obj_000001.ply", 1e-3)
     assert np.array_equal(again.normals, other.mesh.normals)

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
-from synpick_warp.configs.schema import Bake, Config, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
-from synpick_warp.scenes.catalog import load_catalog
-from tests.worlds.model_files import exported, heard, put, step_cylinder
+from tests.worlds.model_files import box, load_models, put, step_cylinder
 
 SHOWN = "not readable as STEP (OpenCASCADE refuses it)"
-
-
-def load(folder: Path, cache: Path, **objects):
-    lines: list[str] = []
-    return load_catalog(Config(bake=Bake(models=str(folder)), objects=Objects(**objects)), cache, heard(lines)).entries, lines
 
 
 @pytest.mark.parametrize(
@@ -29,8 +20,8 @@ def load(folder: Path, cache: Path, **objects):
 def test_lengths_are_in_the_unit_that_the_file_names(tmp_path, name, size, prefix):
     pytest.importorskip("cascadio")
     put(tmp_path / "parts" / name, step_cylinder(size[0], size[1], prefix))
-    (entry,), lines = load(tmp_path / "parts", tmp_path, unit="in", center=True)
-    (line,) = lines
+    catalog, lines = load_models(tmp_path / "parts", tmp_path, unit="in", center=True)
+    (entry,), (line,) = catalog.entries, lines
     assert all(words in line for words in (" x 60 mm, unit of the file; centred: moved by ", ", -0.03 m"))
     assert np.ptp(entry.mesh.vertices, axis=0) == pytest.approx((0.04, 0.04, 0.06), rel=2e-3)
     # Within the distance of chords from the circle.
@@ -39,9 +30,9 @@ def test_lengths_are_in_the_unit_that_the_file_names(tmp_path, name, size, prefi
 
 def test_a_step_file_beside_its_mesh_is_ignored(tmp_path):
     put(tmp_path / "parts" / "a.step", "no STEP file")
-    put(tmp_path / "parts" / "a.stl", exported(trimesh.creation.box((0.1, 0.1, 0.1)), "stl"))
-    entries, lines = load(tmp_path / "parts", tmp_path)
-    assert [entry.name for entry in entries] == ["a"]
+    put(tmp_path / "parts" / "a.stl", box(0.1, 0.1, 0.1, kind="stl"))
+    catalog, lines = load_models(tmp_path / "parts", tmp_path)
+    assert [entry.name for entry in catalog.entries] == ["a"]
     assert lines == [f"{tmp_path / 'parts'}: 1 STEP files beside meshes of the same name are ignored"]
 
 

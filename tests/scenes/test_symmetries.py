@@ -15,15 +15,14 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.evaluation.models import read_models
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.configs.schema import Bake, Config, ObjectRow, Objects
+from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.errors import CatalogError, ConfigError
 from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.models_info import read_models_info
-from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
 from synpick_warp.scenes.symmetries.surface import Surface
-from tests.worlds.model_files import exported, heard, put
+from tests.worlds.model_files import exported, load_models, put
 
 MAKE = trimesh.creation
 
@@ -157,10 +156,7 @@ HALF = (-1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 
 
 def load(tmp_path: Path, mesh: trimesh.Trimesh, name: str = "part.stl", row: ObjectRow | None = None, **objects):
     put(tmp_path / "parts" / name, exported(mesh, name.rpartition(".")[2]))
-    lines: list[str] = []
-    config = Config(bake=Bake(models=str(tmp_path / "parts")), objects=Objects(**objects), object_rows=(row,) if row else ())
-    catalog = load_catalog(config, tmp_path / "cache", heard(lines))
-    return catalog, lines
+    return load_models(tmp_path / "parts", tmp_path, *([row] if row else []), **objects)
 
 
 @pytest.mark.parametrize(

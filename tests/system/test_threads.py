@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +15,7 @@ import zarr
 
 from synpick_warp.dataset.stored_array import open_stored_array
 from synpick_warp.system.processes import threads
+from synpick_warp.system.processes.garbage import collection_paused
 
 
 @pytest.fixture(autouse=True)
@@ -88,3 +91,18 @@ def test_a_parallel_map_keeps_the_order_and_raises_the_first_items_error(monkeyp
         threads.map_in_threads(lambda number: 1.0 / number, [0, 1, 2])
     assert threads.map_in_threads(str, []) == []
     assert threads.is_only_launcher()
+
+
+# ---- pausing the garbage collection ----
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_collection_goes_on_as_before(before):
+    try:
+        (gc.enable if before else gc.disable)()
+        with contextlib.suppress(ZeroDivisionError), collection_paused():
+            assert not gc.isenabled()
+            raise ZeroDivisionError
+        assert gc.isenabled() is before
+    finally:
+        gc.enable()

@@ -13,7 +13,10 @@ import numpy as np
 import trimesh
 from PIL import Image
 
+from synpick_warp.configs.schema import Bake, Config, ObjectRow, Objects
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.types import Catalog
 
 CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
@@ -163,6 +166,18 @@ def step_cylinder(radius: float, height: float, unit: str = ".MILLI.") -> str:
 def heard(lines: list[str]) -> Callable[[str], None]:
     """Collect lines of progress, but for those on masses that are guessed, which most models here have."""
     return lambda line: None if " is a guess; " in line else lines.append(line)
+
+
+def load_models(folder: Path, cache: Path, *rows: ObjectRow, **objects: Any) -> tuple[Catalog, list[str]]:
+    """Catalog of a model folder under these settings, and what is told of it, as `heard`."""
+    lines: list[str] = []
+    config = Config(bake=Bake(models=str(folder)), objects=Objects(**objects), object_rows=rows)
+    return load_catalog(config, cache / "cache", heard(lines)), lines
+
+
+def box(*sides: float, kind: str = "ply") -> bytes:
+    """Model file of a box."""
+    return exported(trimesh.creation.box(sides), kind)
 
 
 def put(path: Path, content: str | bytes) -> Path:
