@@ -307,11 +307,6 @@ def test_a_budget_below_the_smallest_object_is_an_error(objects, mode):
         count_slots(config, objects)
 
 
-def test_slot_counts_are_deterministic(objects):
-    config = config_of(arrangement__max_objects=12, arrangement__volume=3e-3)
-    assert count_slots(config, objects) == count_slots(config, objects)
-
-
 # ---- small catalogs ----
 
 

@@ -237,21 +237,6 @@ def test_a_material_out_of_range_is_refused(tmp_path, key, value):
         read_mesh(tmp_path / "a.glb", 1.0)
 
 
-def test_the_vertex_that_is_missing_is_named(tmp_path):
-    text = "ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
-    text += "property list uchar int vertex_indices\nend_header\n" + "0 0 1\n" * 9 + "3 0 1 7\n3 -1 0 1\n"
-    (tmp_path / "a.ply").write_text(text)
-    with pytest.raises(CatalogError, match="refers to vertex -1, but there are 9"):
-        read_mesh(tmp_path / "a.ply", 1.0)
-
-
-@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
-def test_text_of_an_obj_may_be_latin_1(tmp_path, encoding):
-    (tmp_path / "a.obj").write_text("# Grüße\n" + OBJ.replace("usemtl skin", "usemtl grün"), encoding=encoding)
-    (tmp_path / "a.mtl").write_text("# Größe\nnewmtl grün\nKd 0 1 0\n", encoding=encoding)
-    assert read_mesh(tmp_path / "a.obj", 1.0)[1].color == (0.0, 1.0, 0.0)
-
-
 def test_a_colour_that_is_not_finite_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text(OBJ)
     (tmp_path / "a.mtl").write_text("newmtl skin\nKd nan 0 0\n")

@@ -64,7 +64,6 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
         ("newmtl skin\nKd 0.2 0.4 0.6\nPm 0.9\nPr 0.25\n", (0.2, 0.4, 0.6), 0.9, 0.25, ""),
         ("newmtl skin\nKd 1 1 1\nmap_Pm grey.png\nmap_Pr grey.png\n", (1, 1, 1), 0.2, 0.2, ""),
         ("newmtl skin\nKa 1 1 1\nKs 1 1 1\nNs 30\nillum 2\nd 1\n", GREY, None, None, ""),
-        ("newmtl skin\nmap_Ka skin.png\n", GREY, None, None, "ignored: map_Ka"),
         (
             RED + "norm n.png\nmap_d a.png\nKe 1 1 1\nd 0.5\n",
             (1, 0, 0),
@@ -73,13 +72,6 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
             "ignored: norm, map_d, emission, transparency",
         ),
         ("newmtl skin\nKd spectral file.rfl\n", GREY, None, None, "ignored: Kd spectral"),
-        (
-            RED + "newmtl old\nmap_Kd gone.png\n",
-            (1, 0, 0),
-            None,
-            None,
-            "the image 'gone.png' of an unused material is missing",
-        ),
         (RED + "newmtl old\nmap_Kd grey.png\n", (1, 0, 0), None, None, ""),
         (
             "newmtl other\nKd 1 0 0\n",
@@ -87,13 +79,6 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
             None,
             None,
             "no material 'skin' in its libraries, the default is used; ignored: texture coordinates without a texture",
-        ),
-        (
-            None,
-            GREY,
-            None,
-            None,
-            "there is no material library 'a.mtl', the default material is used; ignored: texture coordinates without a texture",
         ),
     ],
 )
