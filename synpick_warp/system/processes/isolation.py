@@ -19,7 +19,6 @@ import resource
 import select
 import signal
 import socket
-import struct
 import sys
 import tempfile
 import threading
@@ -27,6 +26,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -34,7 +34,7 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.files import describe_bytes
 from synpick_warp.system.processes.threads import SETUP
-from synpick_warp.system.processes.worker import ProcessError, WorkerProcess, start_process
+from synpick_warp.system.processes.worker import ProcessError, WorkerProcess, send, start_process
 
 MODULES = ("synpick_warp.scenes.catalog", "synpick_warp.scenes.lights")
 """What the server imports before it forks; functions of other modules work too, but import theirs in each call."""
@@ -44,11 +44,6 @@ _WALL = 60.0
 """Wall time of a call, relative to its limit of processor time: for one that sleeps, and beyond any load."""
 _GRACE = 5
 """How much later than its supervisor's the alarm of a process itself ends it [s], should the supervisor have died."""
-_REQUEST = struct.Struct("<dQQ")
-"""Time limit [s], memory limit [bytes], size of the pickled function and arguments [bytes]."""
-_END = struct.Struct("<i?")
-"""Exit status, as of subprocess, and whether the time was over."""
-_STARTED = b"S"
 MAX_PIXELS = 2**25
 """Most pixels of an image that OpenCV decodes: 8192 x 4096, which take 1.2 GB as 32-bit floats in an environment map."""
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive", "OPENCV_IO_MAX_IMAGE_PIXELS": str(MAX_PIXELS)}
@@ -166,15 +161,17 @@ class _Links:
                 except OSError as error:
                     advice = "end other processes, or raise the limits"
                     raise ProcessError(f"no process can be started to read a file: {error.strerror}; {advice}") from error
-                with link:
+                with link, Connection(os.dup(link.fileno())) as connection:
                     with self._lock:
                         if self._closed:
                             return _STOPPED
                         self._open.add(link)
                     try:
                         # An idle server may exit at this moment: then the link closes without a word.
-                        if _receive(link, 1) == _STARTED:
-                            return _outcome(_exchange(link, request, limits), result, limits)
+                        if _receive(connection) is not None:
+                            with contextlib.suppress(OSError):
+                                send(connection, (limits.seconds, limits.memory, request))
+                            return _outcome(_receive(connection), result, limits)
                         if self._closed:
                             return _STOPPED
                     finally:
@@ -191,13 +188,11 @@ class _Links:
                     link.shutdown(socket.SHUT_RDWR)
 
 
-def _receive(link: socket.socket, size: int) -> bytes:
-    """Receive up to `size` bytes, fewer if the other end closes."""
-    data = bytearray()
-    with contextlib.suppress(OSError):
-        while len(data) < size and (part := link.recv(min(size - len(data), _BLOCK))):
-            data += part
-    return bytes(data)
+def _receive(link: Connection) -> Any:
+    """Receive a message; None: the other end has closed the link."""
+    with contextlib.suppress(EOFError, OSError):
+        return link.recv()
+    return None
 
 
 def _open_scratch() -> BinaryIO:
@@ -207,19 +202,17 @@ def _open_scratch() -> BinaryIO:
     return tempfile.TemporaryFile()
 
 
-def _exchange(link: socket.socket, request: bytes, limits: Limits) -> bytes:
-    """Send a request to an isolated process and wait; returns how it ended, as packed by `_END`, or less if the link was closed."""
-    with contextlib.suppress(OSError):
-        link.sendall(_REQUEST.pack(limits.seconds, limits.memory, len(request)))
-        link.sendall(request)
-    return _receive(link, _END.size)
+def _outcome(end: tuple[int, bool] | None, stream: BinaryIO, limits: Limits) -> Any:
+    """Result of a call, unpickled from `stream`, or a `Failure`, by how its process ended.
 
-
-def _outcome(end: bytes, stream: BinaryIO, limits: Limits) -> Any:
-    """Result of a call, unpickled from `stream`, or a `Failure`, from how its process ended (`_END`)."""
-    if len(end) < _END.size:
+    Args:
+        end: Exit status, as of subprocess, and whether the time was over; None: the link was closed.
+        stream: The file into which the process wrote its result.
+        limits: Limits of the call.
+    """
+    if end is None:
         return _STOPPED
-    code, timed_out = _END.unpack(end)
+    code, timed_out = end
     if timed_out or code in (-signal.SIGALRM, -signal.SIGPROF):
         return Failure(f"took longer than {limits.seconds:g} s of processor time and was stopped", by_machine=True)
     if code == -signal.SIGKILL:
@@ -252,7 +245,7 @@ def main(modules: Sequence[str], idle: float) -> None:
             return
         if os.fork() == 0:
             control.close()
-            _exit_after(_supervise, socket.socket(fileno=handles[0]), handles[1])
+            _exit_after(_supervise, Connection(handles[0]), handles[1])
         for handle in handles:
             os.close(handle)
 
@@ -266,17 +259,13 @@ def _exit_after(function: Callable[..., int], *arguments: Any) -> None:
         os._exit(code)
 
 
-def _supervise(link: socket.socket, result: int) -> int:
-    """Run a request in a child, and send how it ended (`_END`); the child is killed if its time is over or the caller closed the link."""
+def _supervise(link: Connection, result: int) -> int:
+    """Run a request in a child, and send how it ended (`_outcome`); kill it if its time is over or the caller closed the link."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    link.sendall(_STARTED)
-    header = _receive(link, _REQUEST.size)
-    if len(header) < _REQUEST.size:
+    send(link, "started")
+    if (message := _receive(link)) is None:
         return 0
-    seconds, memory, size = _REQUEST.unpack(header)
-    request = _receive(link, size)
-    if len(request) < size:
-        return 0
+    seconds, memory, request = message
     alive, held = os.pipe()  # The child alone holds the other end: it closes as the child ends.
     child = os.fork()
     if child == 0:
@@ -288,7 +277,7 @@ def _supervise(link: socket.socket, result: int) -> int:
         os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     with contextlib.suppress(OSError):
-        link.sendall(_END.pack(os.waitstatus_to_exitcode(status), not ready))
+        send(link, (os.waitstatus_to_exitcode(status), not ready))
     return 0
 
 
