@@ -21,7 +21,7 @@ from synpick_warp.scenes.assets.appearance import (
     linear_to_srgb,
     srgb_to_linear,
 )
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, reading_as
+from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, reading_as
 from synpick_warp.scenes.assets.gltf.document import (
     COMPONENTS,
     COMPRESSED,
@@ -120,6 +120,8 @@ class _Reader:
             number, parent = stack.pop()
             if number in placed:
                 raise CatalogError(f"{self.path}: node {number} has two parents, or is a root and a child; export it again")
+            if len(placed) == MAX_PARTS:
+                raise CatalogError(f"{self.path}: more than {MAX_PARTS} nodes; merge the meshes' parts")
             node = item_at(self.gltf.nodes, number, "node", self.path)
             placed[number] = matmul(parent, _node_matrix(node))
             stack += [(child, placed[number]) for child in reversed(dict.fromkeys(node.children))]
@@ -217,8 +219,8 @@ class _Reader:
         if accessor.bufferView is None and sparse is None and accessor.count:
             used = ", ".join(sorted(set(self.gltf.extensionsUsed) & set(COMPRESSED))) or "compressed geometry"
             raise CatalogError(f"{self.path}: {name} without data, as in files with {used}; export it without compression")
-        if accessor.count * width * kind.itemsize > MAX_MESH_FILE:
-            raise CatalogError(f"{self.path}: {name} takes more than {MAX_MESH_FILE} bytes; decimate the mesh")
+        if accessor.count > 3 * MAX_ROWS:  # Corners of as many triangles.
+            raise CatalogError(f"{self.path}: {name} has {accessor.count} values, more than {MAX_ROWS} triangles have; decimate the mesh")
         values = np.zeros((accessor.count, width), kind)
         if accessor.bufferView is not None:
             values = self.rows(accessor.bufferView, accessor.byteOffset, accessor.count, width, kind)
