@@ -23,7 +23,7 @@ from PIL import Image as PillowImage
 
 import synpick_warp
 from synpick_warp.apps.viz.drawing import FONT, instance_color, put_text, write_picture
-from synpick_warp.apps.viz.false_colors import color_depth, color_layer
+from synpick_warp.apps.viz.false_colors import color_depth, draw_layer
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import SynpickError
@@ -99,8 +99,8 @@ def draw_strip(episode: Episode) -> Image:
         "depth": color_depth(view.depth),
         "instances": draw_masks(view, view.masks),
         "amodal masks": draw_masks(view, view.amodal_masks, outline=True),
-        "normals": color_layer("normals", view.layer("normals")),
-        "optical flow": color_layer("flow", view.layer("flow")),
+        "normals": draw_layer("normals", view.layer("normals"))[1],
+        "optical flow": draw_layer("flow", view.layer("flow"))[1],
     }
     small = [captioned(cv2.resize(panel, PANEL, interpolation=cv2.INTER_AREA), name) for name, panel in panels.items()]
     return np.concatenate([np.concatenate(small[:3], axis=1), np.concatenate(small[3:], axis=1)])

@@ -8,7 +8,7 @@ To add a layer:
 2. write its kernel in `kernels/render/images/`, and name kernel and inputs in `LayerRenderer.render` (`stages/render/layers.py`);
 3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/test_layer_codec.py`;
    tests fail until both are there. Known answers belong in `tests/render/images/test_layers.py`, a row in the table of
-   `exporters/README.md`; `tests/dataset/test_layer_bake.py` bakes it by itself. A drawing in `apps/viz/preview_layers.py` is optional.
+   `exporters/README.md`; `tests/dataset/test_layer_bake.py` bakes it by itself. A drawing in `apps/viz/false_colors.py` is optional.
 """
 
 from __future__ import annotations

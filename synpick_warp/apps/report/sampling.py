@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.apps.statistics.collect import read_facts
 from synpick_warp.apps.statistics.columns import EpisodeFacts
-from synpick_warp.dataset.annotations import check_content
-from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.environment import LUMINANCE
@@ -78,9 +77,8 @@ def read_episodes(data_set: DataSet) -> SampledEpisodes:
     indices = list(data_set)
     rows, attempts = {}, {}
     for index in spread(indices, MAX_EPISODES):
-        episode = data_set[index]
-        rows[index] = check_content(episode.row, EpisodeFacts, data_set.folder / f"{episode_entry(index)}.json")
-        attempts[index] = len(episode.attempts)
+        rows[index] = read_facts(data_set, index)
+        attempts[index] = len(data_set[index].attempts)
     return SampledEpisodes(rows, attempts, len(indices))
 
 

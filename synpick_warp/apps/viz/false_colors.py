@@ -76,11 +76,6 @@ def color_depth(depth: np.ndarray, scale: DepthScale | None = None) -> Image:
     return colored
 
 
-def color_layer(name: str, values: np.ndarray) -> Image:
-    """One layer as colours, from its values as `synpick_warp.dataset.view.read_layer` returns them."""
-    return draw_layer(name, values)[1]
-
-
 def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = None) -> tuple[str, Image]:
     """Caption and colours of one layer, from its values as `synpick_warp.dataset.view.read_layer` returns them.
 
@@ -104,16 +99,6 @@ def _draw_normals(values: np.ndarray) -> tuple[str, Image]:
     colors = (values * np.array([1.0, -1.0, -1.0], np.float32) + 1.0) / 2.0
     colors[~values.any(axis=-1)] = 0.0
     return "normals: red right, green up, blue to the camera", _bytes(colors)
-
-
-def _draw_albedo(values: np.ndarray) -> tuple[str, Image]:
-    """Caption and picture of layer albedo, as it is."""
-    return "albedo", np.ascontiguousarray(values[..., ::-1])
-
-
-def _draw_nocs(values: np.ndarray) -> tuple[str, Image]:
-    """Caption and picture of normalized object coordinates, x, y, z as red, green, blue."""
-    return "nocs: red x, green y, blue z of the object", _bytes(values)
 
 
 def _draw_classes(values: np.ndarray) -> tuple[str, Image]:
@@ -142,11 +127,6 @@ def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
 def _draw_depth(caption: str, values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
     """Depth as a TURBO colour map; holes are black."""
     return f"{caption}: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
-
-
-def _draw_infrared(caption: str, values: np.ndarray) -> tuple[str, Image]:
-    """Infrared image as grey levels, as they are."""
-    return caption, np.repeat(values[..., None], 3, axis=-1)
 
 
 def _draw_score(caption: str, values: np.ndarray) -> tuple[str, Image]:
@@ -179,13 +159,13 @@ def _from_hsv(hue: np.ndarray, value: np.ndarray) -> Image:
 
 _DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
     "normals": _draw_normals,
-    "albedo": _draw_albedo,
-    "nocs": _draw_nocs,
+    "albedo": lambda values: ("albedo", np.ascontiguousarray(values[..., ::-1])),
+    "nocs": lambda values: ("nocs: red x, green y, blue z of the object", _bytes(values)),
     "classes": _draw_classes,
     "flow": _draw_flow,
     "scene_flow": _draw_scene_flow,
-    "ir_left": functools.partial(_draw_infrared, "infrared, left"),
-    "ir_right": functools.partial(_draw_infrared, "infrared, right"),
+    "ir_left": lambda values: ("infrared, left", np.repeat(values[..., None], 3, axis=-1)),
+    "ir_right": lambda values: ("infrared, right", np.repeat(values[..., None], 3, axis=-1)),
     "suction_seal": functools.partial(_draw_score, "suction: seal, yellow 1, blue near 0, black 0"),
     "suction_wrench": functools.partial(_draw_score, "suction: wrench, yellow 1, blue near 0, black 0"),
 }

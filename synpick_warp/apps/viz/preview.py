@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -215,32 +215,23 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
     size = color.shape[1::-1]
     colored = _placeholder(color, "no depth in this data set") if colored is None else colored
-    facts = baked.facts(view.scene, view.frame, view.camera)
-    panels: list[tuple[str, Callable[[float], Image]]] = [
-        (facts[0], lambda scale: _fit(color, scale)),
-        (f"{describe_depth(depth_scale)}; one scale", lambda scale: _fit(colored, scale, smooth=False)),
-        (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
-        ("boxes: amodal thin, visible thick", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
-        (
-            "object: label, visible fraction, name",
-            lambda scale: _draw_legend(view, facts[1:], baked, max(_MIN_LEGEND, round(size[1] * scale)), most),
-        ),
+    scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
+    place, *facts = baked.facts(view.scene, view.frame, view.camera)
+    low = max(_MIN_LEGEND, round(size[1] * scale))
+    panels = [
+        (place, _fit(color, scale)),
+        (f"{describe_depth(depth_scale)}; one scale", _fit(colored, scale, smooth=False)),
+        (_instances_caption(view), _fit(_color_instances(view, color), scale, smooth=False)),
+        ("boxes: amodal thin, visible thick", _draw_boxes(view, _fit(color, scale), scale)),
+        ("object: label, visible fraction, name", draw_legend((legend_width(low, most), low), facts, view.truth, baked.names)),
     ]
     count = float(view.camera.get("depth_scale", 1.0))
     counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
-    layers = layer_pictures(view.files, view.frame, counts)
-    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layers]
+    panels += [(caption, _fit(picture, scale, smooth=False)) for caption, picture in layer_pictures(view.files, view.frame, counts)]
     if graph := view.files.graph(view.frame):
-        panels.append(("arrows: lies on; numbers: unstacking order", lambda scale: _draw_graph(view, graph, _fit(color, scale), scale)))
-    scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
-    drawn = [(caption, draw(scale)) for caption, draw in panels]
-    height = max(image.shape[0] for _, image in drawn)
-    return np.concatenate([_captioned(image, caption, height) for caption, image in drawn], axis=1)
-
-
-def _draw_legend(view: _View, facts: Sequence[str], baked: Baked, height: int, most: int) -> Image:
-    """Draw the legend: facts of the view and a line for each object; `most` lines at most fill `height` [px]."""
-    return draw_legend((legend_width(height, most), height), facts, view.truth, baked.names)
+        panels.append(("arrows: lies on; numbers: unstacking order", _draw_graph(view, graph, _fit(color, scale), scale)))
+    height = max(image.shape[0] for _, image in panels)
+    return np.concatenate([_captioned(image, caption, height) for caption, image in panels], axis=1)
 
 
 def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
@@ -265,18 +256,22 @@ def _instances_caption(view: _View) -> str:
 
 def _color_instances(view: _View, color: Image) -> Image:
     """Visible masks in their instances' colours over the darkened grey image."""
-    grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
-    drawn = np.repeat(grey[..., None], 3, axis=2)
     if not view.files.has("mask_visib"):
         return _placeholder(color, "no masks in this data set")
+    drawn = _darkened_grey(color)
     for index, (record, _) in enumerate(view.truth):
         drawn[view.files.mask("mask_visib", view.frame, index)] = instance_color(record.get("instance_id", index))
     return drawn
 
 
+def _darkened_grey(color: Image) -> Image:
+    """Grey image at a third of its brightness."""
+    return np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
+
+
 def _placeholder(color: Image, text: str) -> Image:
     """Picture of a text on the darkened grey image, where a panel has no picture."""
-    drawn = np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
+    drawn = _darkened_grey(color)
     put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
 
