@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from synpick_warp.cli.main import main
-from synpick_warp.errors import OutputError
+from synpick_warp.errors import OutputError, SynpickError
 from synpick_warp.factory import assembly, pipeline
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
@@ -110,6 +110,14 @@ def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], Any]
             made = make(place / "set")
             (place / "made").write_bytes(pickle.dumps(made))
     return place / "set", pickle.loads((place / "made").read_bytes())
+
+
+def refusal(call: Callable[..., object], *arguments: Any, **named: Any) -> str:
+    """Message of the error, in one line, with which a call refuses its arguments."""
+    with pytest.raises(SynpickError) as caught:
+        call(*arguments, **named)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 class Ran(NamedTuple):

@@ -12,10 +12,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from synpick_warp.errors import DeviceError, OutputError
+from synpick_warp.errors import OutputError
 from synpick_warp.factory.devices import DeviceProcesses
 from synpick_warp.system.hardware import device as devices
 from synpick_warp.system.hardware.device import describe_kinds, pick_devices
+from tests.builders import refusal
 from tests.harness.device_programs import program
 from tests.harness.processes import wait_until_gone
 
@@ -139,6 +140,7 @@ PARENT = """
 import os, sys
 from types import SimpleNamespace
 from synpick_warp.factory.devices import DeviceProcesses
+from tests.builders import refusal
 from tests.harness.device_programs import program
 reports = SimpleNamespace(note=lambda text: print(text, flush=True))
 with DeviceProcesses(["cuda:0", "cuda:1"], program("wait_for_stop"), os.open("/", os.O_RDONLY)) as processes:
@@ -192,9 +194,7 @@ def test_names_of_devices(machine):
     ],
 )
 def test_wrong_names_of_devices_are_one_line(machine, names, said):
-    with pytest.raises(DeviceError) as caught:
-        pick_devices(names)
-    assert str(caught.value) == said
+    assert refusal(pick_devices, names) == said
 
 
 def test_without_a_gpu_all_is_the_cpu(machine, monkeypatch):
