@@ -28,8 +28,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.kept import keeping_baker
-from synpick_warp.factory.pipeline import with_measures
+from synpick_warp.factory.pipeline import bake_episodes, with_measures
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.urls import RAY, check_engine
@@ -104,7 +103,7 @@ def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummar
         return f"a Ray worker has synpick-warp {__version__}, and this command {version}; install one version everywhere"
     job: Job = pickle.loads(data)
     limit_threads(cores)
-    real, own = job.bake or keeping_baker(), {"bake.device": device, "bake.writers": job.config.bake.writers or cores}
+    real, own = job.bake or bake_episodes, {"bake.device": device, "bake.writers": job.config.bake.writers or cores}
 
     def bake(config: Config, *given: Any) -> BakeSummary:
         return real(config.with_values(own), *given)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import shutil
 import tempfile
 import threading
@@ -24,9 +25,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.order import EpisodeSource
-from synpick_warp.factory.pipeline import with_measures
+from synpick_warp.factory.pipeline import bake_episodes, with_measures
 from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
@@ -97,7 +97,7 @@ def bake_into_store(
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits; empty: all.
         devices: As in `pipeline.run_bake`.
-        bake: Bakes episodes into a folder; None: one that keeps objects, lights, worlds and kernels from chunk to chunk.
+        bake: Bakes episodes into a folder; None: `pipeline.bake_episodes`.
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
         lease: Time to live of a claim without heartbeat [s].
         workers: Number of claiming workers, which begin at about the same time; 0: unknown.
@@ -118,12 +118,12 @@ def bake_into_store(
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
         if claims is None or not ledger.finished():
-            baker = bake or keeping_baker()
             for work in _works(ledger, place, claims, ranges, workers, progress):
                 with work:
-                    part = _bake(ledger, place, work, progress, devices, baker, summary)
+                    part = _bake(ledger, place, work, progress, devices, bake or bake_episodes, summary)
                 if _take(summary, part):
                     return summary
+                gc.collect()  # Frees the worlds of this bake before memory for those of the next is planned.
         if not summary.total:
             progress.note("all episodes are done")
         progress.stage("finishing files")

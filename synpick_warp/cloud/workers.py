@@ -24,9 +24,8 @@ from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.devices import DeviceProcesses
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.kept import keeping_baker
 from synpick_warp.factory.order import deal_writers
-from synpick_warp.factory.pipeline import with_measures
+from synpick_warp.factory.pipeline import bake_episodes, with_measures
 from synpick_warp.factory.sizes import count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.launch import limit_threads
@@ -135,7 +134,8 @@ def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
     tempfile.tempdir = job.folder  # The main process removes it, however this one ends.
     if job.own["bake.device"] == "cpu":
         limit_threads(max(1, count_cores() // job.processes))
-    summary, real, is_busy = BakeSummary(), job.bake or keeping_baker(job.processes, link), False
+    real = job.bake or partial(bake_episodes, processes=job.processes, stop=link)
+    summary, is_busy = BakeSummary(), False
 
     def bake(config: Config, *given: Any) -> BakeSummary:
         nonlocal is_busy

@@ -134,11 +134,6 @@ class PickQueue:
         self.release()
 
     @property
-    def waits(self) -> bool:
-        """Whether states wait for their trials, or episodes for their ends."""
-        return bool(self.pending or self._ends)
-
-    @property
     def is_due(self) -> bool:
         """Whether a whole batch of states waits."""
         return len(self.pending) >= self.batch

@@ -100,7 +100,7 @@ def bake_episodes(
     episodes: Sequence[int],
     devices: Sequence[str] = (),
     deliver: Callable[[], None] | None = None,
-    build: Callable[..., Factory] | None = None,
+    processes: int = 1,
     stop: BakeLink | None = None,
 ) -> BakeSummary:
     """Generate these episodes of a data set in a folder, or the remaining ones of them.
@@ -112,7 +112,7 @@ def bake_episodes(
         episodes: Indices, sorted; of an `EpisodeSource` one device takes further ones, too.
         devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
-        build: Builds the stages of one device; None: `build_factory`.
+        processes: Processes that bake on this host, which share its memory.
         stop: Requests to stop one device; None: signals do.
 
     Raises:
@@ -131,9 +131,9 @@ def bake_episodes(
         try:
             with explain_shortage(config):
                 names = pick_processes(config, devices, len(output.remaining)) if devices else (config.bake.device,)
-                if build is None and (advice := advise_processes(config, names, len(output.remaining))):
+                if deliver is None and (advice := advise_processes(config, names, len(output.remaining))):
                     progress.note(advice)
-                _fill(output, source, needs, names, summary, progress, deliver, build or build_factory, stop or StopRequest())
+                _fill(output, source, needs, names, summary, progress, deliver, processes, stop or StopRequest())
         except OutputError as error:
             if out.exists():
                 raise
@@ -149,7 +149,7 @@ def _fill(
     summary: BakeSummary,
     progress: Progress,
     deliver: Callable[[], None] | None,
-    build: Callable[..., Factory],
+    processes: int,
     stop: StopRequest | BakeLink,
 ) -> None:
     """Generate the remaining episodes, and those of the source, then the indices over all, or deliver the episodes."""
@@ -159,8 +159,8 @@ def _fill(
         bake_on_devices(config, output, needs, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            own = {"longest_first": True, "expected": source.expected}
-            factory = build(config, progress, output.remaining, needs.physics, needs.images, **own)
+            own = {"processes": processes, "longest_first": True, "expected": source.expected}
+            factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, **own)
         if deliver is None:
             check_disk(forecast_bake(factory.config, factory.catalog, output.remaining), output.out, progress)
     else:

@@ -10,9 +10,21 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Mode
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.factory import order
-from synpick_warp.factory.order import DEVIATIONS, FRAMES_OF_MODE, SORTED_EPISODES, deal_episodes, deal_writers, order_longest_first
+from synpick_warp.factory.order import (
+    DEVIATIONS,
+    FRAMES_OF_MODE,
+    SORTED_EPISODES,
+    EpisodeSource,
+    deal_episodes,
+    deal_writers,
+    order_longest_first,
+)
+from synpick_warp.factory.pipeline import bake_episodes
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKED, boxes
+from tests.harness.exporter_contract import digests
 from tests.twins.arrangement import sample_modes, sample_objects
-from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog
+from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
 
 OBJECTS = catalog(BOX, CUBE, ANGLE)
 SEED = 5
@@ -104,3 +116,17 @@ def test_episodes_are_dealt_there_and_back():
 @pytest.mark.parametrize(("writers", "devices", "dealt"), [(16, 2, [8, 8]), (17, 4, [5, 4, 4, 4]), (2, 3, [1, 1, 1]), (16, 1, [16])])
 def test_writers_are_shared_out(writers, devices, dealt):
     assert deal_writers(writers, devices) == dealt
+
+
+@pytest.mark.slow
+def test_episodes_that_come_while_worlds_are_idle_have_the_bytes_of_one_bake(picked_set, tmp_path):
+    class Source(EpisodeSource):
+        def more(self, wait: bool) -> list[int]:
+            return [rest.pop()] if rest else []
+
+    rest = [0]
+    with boxes():
+        summary = bake_episodes(settings(**PICKED), tmp_path / "grown", SilentProgress(), Source([1]))
+    assert not rest
+    assert (summary.total, len(summary.episodes)) == (2, 2)
+    assert digests(tmp_path / "grown") == digests(picked_set)
