@@ -21,7 +21,8 @@ from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.codes import names
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
-from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.episodes.randomize import Distribution
+from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import sections, table_lists
 from synpick_warp.configs.files.table_lists import SPLITS
 from synpick_warp.configs.files.write import format_toml
@@ -42,7 +43,7 @@ _SETTINGS_HEAD = """# Reference of the settings
 
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
 
-What they are for: the [guide](README.md).
+What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out.
 """
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
@@ -54,16 +55,16 @@ def settings_reference() -> str:
     parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
     parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
-    lines = ["| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
+    lines = ["key | default | allowed | meaning", "---|---|---|---"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
     return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
 
 
 def _sensors() -> list[str]:
     """Heading and rows of the presets of depth sensors: every figure with its source."""
-    lines = ["## Sensor presets", "", "| preset | figure | value | trust | source |", "|---|---|---|---|---|"]
+    lines = ["## Sensor presets", "", "preset | figure | value | trust | source", "---|---|---|---|---"]
     for name, figures in SENSORS.items():
-        lines += [f"| `{name}` | {key} | `{format_toml(one.value)}` | {one.trust} | {one.source} |" for key, one in figures.items()]
+        lines += [f"`{name}` | {key} | `{format_toml(one.value)}` | {one.trust} | {one.source}" for key, one in figures.items()]
     return lines
 
 
@@ -74,14 +75,24 @@ def _anchor(title: str) -> str:
 
 def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
-    lines = [f'| <a id="{_anchor(title)}"></a>**`{title}`** | | | | **{" ".join((kind.__doc__ or "").split())}** |']
+    lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | | **{" ".join((kind.__doc__ or "").split())}**']
     for name, item in settings_of(kind).items():
         if is_table(item.kind):
             lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
             continue
         default = "" if item.default is None else f"`{format_toml(item.default)}`"
-        lines.append(f"| `{prefix}{name}` | {default} | {item.unit} | {describe_allowed(item)} | {item.doc} |")
+        lines.append(f"`{prefix}{name}` | {default} | {_allowed(item)} | {item.doc}")
     return lines
+
+
+def _allowed(item: Setting) -> str:
+    """What a setting allows: an interval with its unit, or words."""
+    low, high, above = (None if bound is None else f"{bound:.10g}" for bound in (item.bounds.low, item.bounds.high, item.bounds.above))
+    if item.allowed or (low or high or above) is None:
+        return describe_allowed(item) + (f" [{item.unit}]" if item.unit else "")
+    interval = f"({above}" if above is not None else f"[{low}" if low is not None else "(-∞"
+    interval += f", {high}]" if high is not None else ", ∞)"
+    return f"{interval} {item.unit}".rstrip() + (" or distribution" if isinstance(item.default, Distribution) else "")
 
 
 def validation_reference() -> str:

@@ -169,8 +169,6 @@ def check_output_file(
     In the folder of a data set itself files may have the suffixes OWN_SUFFIXES; in its subfolders there are no outputs.
 
     Args:
-        out: The file, or a folder.
-        option: Option that names it.
         data_set: The data set that the command reads, which may be one of other programs.
         inputs: Other files that the command reads.
         is_folder: Whether it is a folder, which none is in the folder of a data set itself, either.

@@ -171,7 +171,7 @@ def bake(
     profile_out: Annotated[
         Path | None, Parameter(help="Trace file of --profile, for ui.perfetto.dev (default: OUT-profile.json beside the data set).")
     ] = None,
-    dry_run: Annotated[bool, Parameter(negative=(), help="Bake nothing: print the expected views, size on disk, memory and time.")] = False,
+    dry_run: DryRunOption = False,
 ) -> int:
     """Simulate, render and write a data set. After an interruption, the same command resumes with the remaining episodes.
 

@@ -42,7 +42,6 @@ def check_value(key: str, value: object, item: Setting, source: str) -> Any:
     Args:
         key: Full key of the setting, for messages.
         value: The value as parsed from TOML.
-        item: The setting.
         source: Where the value comes from, for messages, such as "in my.toml".
 
     Raises:

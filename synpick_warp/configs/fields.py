@@ -69,7 +69,6 @@ def setting(
     """Declare a setting: a field of a dataclass.
 
     Args:
-        default: Default value.
         doc: Meaning, in sentences.
         choices: Allowed strings; empty: any.
         parse: Converts a value as TOML has it to one of the field's type; raises ValueError with what is allowed.

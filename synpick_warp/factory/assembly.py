@@ -88,8 +88,6 @@ class Stages:
         """Fields of `EpisodeRow` that record what an episode draws: looks and cameras; None: nothing.
 
         Args:
-            episode: Index of the episode.
-            objects: Number of its objects.
             distractors: Names of its distractors, by instance.
         """
         looks = draw_looks(self.randomized, self.config.bake.seed, episode, objects, distractors) if self.randomized else None
@@ -125,8 +123,6 @@ def build_factory(
     """Load assets and build the stages on the device.
 
     Args:
-        config: All settings.
-        progress: Observer.
         episodes: Indices of the episodes to simulate; None: all.
         records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
         processes: Processes of the bake, which share the host's memory.
@@ -165,9 +161,6 @@ def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progre
 
     Args:
         smallest: Builds the minimal factory, silently.
-        device: The device.
-        progress: Observer.
-        renders: Whether views are rendered.
     """
     if is_cache_warm(device):
         with make_compiler(None, progress):

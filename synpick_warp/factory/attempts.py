@@ -179,7 +179,6 @@ class AttemptLog:
         """Start with no episode running.
 
         Args:
-            suction: Settings of suction.
             resolution: Width and height of the perception image [px].
             object_ids: obj_id of each body of the catalog (body) int32.
             distractors: Name of each distractor, by its obj_id; None: there is none.

@@ -47,7 +47,6 @@ def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStr
     """Start to compile what `launch_all` launches.
 
     Args:
-        compiler: Entered.
         simulation: Worlds that have not ticked yet. No kernel runs, so that their state stays; contents of scratch arrays may change.
         stream: Renderer and encoders; None: nothing is rendered.
     """

@@ -91,7 +91,6 @@ class DeviceProcesses:
         """Start the processes, which load their libraries while this one prepares the folder.
 
         Args:
-            names: Devices.
             program: Python code that calls `worker.main`.
             lock: Handle that holds the folder's lock; all processes keep it open.
 
@@ -126,7 +125,6 @@ class DeviceProcesses:
         Args:
             shares: What each device's process is sent: its `Share`, or what its program takes.
             summary: Receives the processes' summaries; its `resumed` episodes count as done.
-            progress: Observer.
 
         Returns:
             Which devices were lost, and why; empty: none.
@@ -257,12 +255,7 @@ def bake_on_devices(
 
     Args:
         config: All settings; `bake.writers` are shared out among the devices.
-        output: The folder.
-        needs: Needs of its formats.
-        names: Devices.
         program: Python code that calls `worker.main`.
-        summary: Receives the episodes.
-        progress: Observer.
 
     Raises:
         SynpickError: A device was lost, or an error that the user can correct. Committed episodes stay.

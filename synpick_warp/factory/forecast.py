@@ -52,13 +52,7 @@ class Forecast:
 
 
 def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> Forecast:
-    """Forecast the bake of these episodes, of which up to SAMPLED are drawn ahead.
-
-    Args:
-        config: All settings.
-        catalog: The objects.
-        episodes: Indices.
-    """
+    """Forecast the bake of these episodes, of which up to SAMPLED are drawn ahead."""
     frames = round(predict_length(config, catalog, episodes[:: len(episodes) // SAMPLED + 1]) * len(episodes))
     # Of each camera: views a frame, and pixels of a view.
     cameras = [(1.0 / every, width * height) for (width, height), every in zip(config.rig.sizes, config.rig.every, strict=True)]

@@ -92,7 +92,6 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
     Body slots are counted at their maximum: the object capacity for each slot type.
 
     Args:
-        config: All settings.
         device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
         writers: Writer processes; 0: nothing is written, views stay on the device.
         pieces: Convex pieces of each object, as far as they are known.
@@ -155,8 +154,6 @@ def check_memory(terms: Sequence[Term], device: wp.Device, processes: int = 1) -
     """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
 
     Args:
-        terms: The plan by `plan_memory`.
-        device: Device of the simulation.
         processes: As of `split_memories`.
 
     Raises:
@@ -236,8 +233,6 @@ def _simulation(sizes: dict[str, int], stores_steps: bool | None, supports: bool
     Args:
         sizes: Extents by `record_sizes`.
         stores_steps: Whether each step is recorded, not only each tick; None: no physics is.
-        supports: Whether support is recorded.
-        device: Device of the simulation.
     """
     with dry_run() as state:
         *_, record = allocate_worlds(sizes, device)
@@ -275,12 +270,8 @@ def _images(
     """Scratch of the renderer, and images of a batch of views.
 
     Args:
-        arrays: Arrays of the renderer.
         sizes: Extents by `view_sizes`.
-        cameras: Number of cameras.
-        layers: Names of the layers.
         host: What is copied to the host; None: nothing is written.
-        device: Device of the rendering.
     """
     views, size = sizes["view"], f"{sizes['column']:,}x{sizes['row']:,} px"
     copied: list[Any] = []
@@ -362,9 +353,6 @@ def newton_rows(
     may need few of them, and rows are a lower bound.
 
     Args:
-        worlds: Number of worlds.
-        arrangement, physics: Settings.
-        bins: Sizes of all bins.
         own_bins: Whether they are the user's own, which have shapes of their own.
         is_cuda: Whether the arrays lie in a GPU's memory.
         pieces: Convex pieces of each object, as far as they are known.

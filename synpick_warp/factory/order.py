@@ -52,9 +52,6 @@ def order_longest_first(config: Config, catalog: Catalog, episodes: Sequence[int
     """Sort the last SORTED_EPISODES episodes by `predict_frames`, the longest first, and then by index.
 
     Args:
-        config: All settings.
-        catalog: The objects.
-        episodes: Indices.
         device: Device that samples modes and objects.
     """
     indices = np.sort(np.asarray(episodes, np.int32))

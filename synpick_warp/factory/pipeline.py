@@ -70,9 +70,7 @@ def run_bake(
     """Simulate, render and write a data set, or the remaining episodes of one.
 
     Args:
-        config: All settings.
         out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
-        progress: Observer.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits; empty: all.
         devices: Devices with a process each, see `pick_processes`; empty: `bake.device` alone.
@@ -103,14 +101,11 @@ def bake_episodes(
     processes: int = 1,
     stop: BakeLink | None = None,
 ) -> BakeSummary:
-    """Generate these episodes of a data set in a folder, or the remaining ones of them.
+    """Generate these episodes of a data set in a folder, or the remaining ones of them. Other arguments as of `run_bake`.
 
     Args:
         config: All settings, with measures (`with_measures`).
-        out: As in `run_bake`.
-        progress: Observer.
         episodes: Indices, sorted; of an `EpisodeSource` one device takes further ones, too.
-        devices: As in `run_bake`.
         deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
         processes: Processes that bake on this host, which share its memory.
         stop: Requests to stop one device; None: signals do.
@@ -194,7 +189,6 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
     """Generate and commit the episodes of one device, in its process; the folder is prepared already.
 
     Args:
-        share: Part of the bake.
         handles: Handles that the writers keep open.
         link: Receives reports, and requests to stop.
     """

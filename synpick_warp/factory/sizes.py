@@ -46,8 +46,6 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     """Choose worlds and batches that the settings leave open. What they name stays, whether it fits or not.
 
     Args:
-        config: All settings.
-        device: Device of the simulation.
         episodes: Episodes that the device simulates.
         writers: Writer processes of the device.
         processes: Processes that share the host's memory.

@@ -57,7 +57,6 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats).
 
     Args:
-        config: All settings.
         progress: Receives the stages and the progress of the compilation.
 
     Raises:

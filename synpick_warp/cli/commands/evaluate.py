@@ -136,10 +136,7 @@ def make_table(
 
     Args:
         data_set: Where the ground truth is.
-        results: BOP result files.
-        style: Format of the table.
         visib_min: Smallest visible fraction of a target.
-        convention: Convention of the area.
         top: Maximum number of estimates per image and object.
         vertices: Number of vertices of a model; 0: all.
         alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.

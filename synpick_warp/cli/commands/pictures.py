@@ -143,11 +143,7 @@ def draw_cell(
     """Draw the cell of settings, as of `load_settings`.
 
     Args:
-        preset_or_file: As of `load_settings`.
         name: What the sheet is of, for its title.
-        out: PNG or JPEG file to write.
-        progress: Receives stages.
-        say: Called with each note.
         objects: Objects of the settings; None: they are read.
 
     Raises:

@@ -101,7 +101,6 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
     """Override single settings of a finished configuration, and validate the result.
 
     Args:
-        config: The configuration.
         settings: Full key, such as "physics.step", -> value; or list of tables or section, such as "bin", -> its rows or content.
         source: Where `settings` come from, for error messages.
 

@@ -143,9 +143,6 @@ def resolve_splits(tables: Tables, mode: str, color_format: str, source: str) ->
 
     Args:
         tables: Checked tables, in the order of the file.
-        mode: bake.mode.
-        color_format: bop.color_format.
-        source: Where they come from, for messages.
 
     Raises:
         ConfigError: Two splits share an episode or a folder, or indices exceed 32 bits.

@@ -23,7 +23,6 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
     """All settings as TOML text, including defaults; paths are absolute, so that it holds wherever it is written to.
 
     Args:
-        config: The configuration.
         comments: Precede each setting by its meaning, unit and allowed values.
     """
     # Without rows those of the preset would hold; no preset has rows of another kind.

@@ -203,12 +203,8 @@ def _placement(
     """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad].
 
     Args:
-        row: The camera.
         keys: Keys of its position, up vector and look-at point.
-        turn: The angle.
         label: Name of the camera for messages.
-        bins: The bins.
-        shift: `bins.shift`.
     """
     (place, _, target), (fx, fy, *_) = keys, intrinsics(row)
     at = position(row.pose)

@@ -15,25 +15,9 @@ from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout, bake_modes, may_pick, possible_modes
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects
-from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.rules.camera_rules import find_camera_conflicts
-from synpick_warp.configs.schema import (
-    FORMATS,
-    MIXED,
-    Arrangement,
-    Bake,
-    Bop,
-    Config,
-    DepthSensor,
-    Effects,
-    Move,
-    ObjectRow,
-    Physics,
-    Pick,
-    Settle,
-    Split,
-)
+from synpick_warp.configs.schema import FORMATS, MIXED, Bake, Bop, Config, Move, Physics, Pick, Settle, Split
 from synpick_warp.errors import format_value
 
 _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
@@ -47,9 +31,7 @@ _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 def find_conflicts(config: Config) -> Iterator[Conflict]:
     """Find all violated constraints, the most basic first."""
     bins, bop = config.cell.bins, config.bop
-    yield from _mix(config.bake, config.splits)
-    if PICKS in config.bake.formats and not may_pick(config.bake, config.splits):
-        yield "bake.formats", "without picks where no episode picks, as in mode move"
+    yield from _modes(config.bake, config.splits)
     yield from _bins(config.bins, config.bin)
     for key, row in config.cell.tables.items():
         yield from _box(key, row)
@@ -62,33 +44,30 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     yield from _times(config.settle, config.physics)
     mouths = [opening[2:] for one in bins if one.shell for opening in one.openings]
     yield from find_gripper_conflicts(config.gripper, config.suction, mouths)
-    yield from _layers(config.render.layers)
-    yield from _ranges(config.effects, config.depth_sensor)
-    yield from _jpeg_quality(config.effects, bop)
+    yield from _pictures(config)
     if bop.graph and config.physics.sleep > 0.0:
         yield "physics.sleep", "0 with bop.graph, which reads the contact forces of what rests [m]"
     yield from _split_folders(config.splits, bop)
     yield from _scene_ids(DataLayout.of(config))
-    if not config.objects.embedded:
-        yield "objects.embedded", f"at least one of {', '.join(EMBEDDED)}"
-    yield from _object_rows(config.object_rows)
-    yield from _distractors(config.randomize, config.arrangement, config.bake)
-    yield from _counts(config.arrangement, config.randomize.most_distractors)
+    yield from _objects(config)
     if config.randomize.background_textures and config.render.table and not any(config.render.table_size):
         yield "render.table_size", "above 0 with randomize.background_textures, which are seen beyond the edge of the table [m]"
 
 
-def _distractors(randomize: Randomize, arrangement: Arrangement, bake: Bake) -> Iterator[Conflict]:
-    """Yield conflicts of distractors: no room for other objects, or the same models as these."""
-    most = randomize.most_distractors
-    if most >= arrangement.max_objects:
+def _objects(config: Config) -> Iterator[Conflict]:
+    """Yield conflicts of objects: ids that several rows have, distractors without room or of the same models, and numbers of parts that are
+    more than there is room for, or none in some episodes."""
+    arrangement, randomize, models = config.arrangement, config.randomize, config.bake.models
+    if not config.objects.embedded:
+        yield "objects.embedded", f"at least one of {', '.join(EMBEDDED)}"
+    counts = Counter(row.id for row in config.object_rows)
+    for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
+        yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"
+    distractors = randomize.most_distractors
+    if distractors >= arrangement.max_objects:
         yield "randomize.distractors", f"less than arrangement.max_objects, {arrangement.max_objects}, which counts them, too"
-    if most and bake.models and os.path.realpath(randomize.distractor_models) == os.path.realpath(bake.models):
+    if distractors and models and os.path.realpath(randomize.distractor_models) == os.path.realpath(models):
         yield "randomize.distractor_models", "another folder than bake.models: its objects would be without labels"
-
-
-def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
-    """Yield conflicts of the numbers of parts: more than there is room for, or none in some episodes."""
     most, room = most_objects(arrangement.counts), arrangement.max_objects - distractors
     if most > room:
         beside = f", less {distractors} distractors" if distractors else ""
@@ -97,12 +76,14 @@ def _counts(arrangement: Arrangement, distractors: int) -> Iterator[Conflict]:
         yield "arrangement.counts", "at least one part that each episode has"
 
 
-def _mix(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
+def _modes(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
     """Yield conflicts of modes and formats."""
     if MIXED in bake_modes(bake, splits) and not any(bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
+    if PICKS in bake.formats and not may_pick(bake, splits):
+        yield "bake.formats", "without picks where no episode picks, as in mode move"
 
 
 def _box(key: str, tote: Tote) -> Iterator[Conflict]:
@@ -177,28 +158,22 @@ def _move(move: Move, gripper: Gripper, bins: Sequence[BinSizes]) -> Iterator[Co
                 return
 
 
-def _layers(layers: tuple[str, ...]) -> Iterator[Conflict]:
-    """Yield layers that are named twice."""
+def _pictures(config: Config) -> Iterator[Conflict]:
+    """Yield layers that are named twice, ranges of effects and depth sensor whose minimum exceeds the maximum, and a JPEG quality that
+    begins at 0 or that the colour format has no use for."""
+    layers, color_format = config.render.layers, config.bop.color_format
     if len(set(layers)) < len(layers):
         yield "render.layers", f"each layer once: {format_value(list(dict.fromkeys(layers)))}"
-
-
-def _ranges(effects: Effects, depth_sensor: DepthSensor) -> Iterator[Conflict]:
-    """Yield ranges of effects and depth sensor whose minimum exceeds the maximum."""
-    for name, section in (("effects", effects), ("depth_sensor", depth_sensor)):
+    for name, section in (("effects", config.effects), ("depth_sensor", config.depth_sensor)):
         for item in dataclasses.fields(section):
             value = getattr(section, item.name)
             if isinstance(value, tuple) and value[0] > value[1]:
                 yield f"{name}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
-
-
-def _jpeg_quality(effects: Effects, bop: Bop) -> Iterator[Conflict]:
-    """Yield a JPEG quality that begins at 0 or that the colour format has no use for."""
-    low, high = effects.jpeg_quality
+    low, high = config.effects.jpeg_quality
     if high and not low:
         yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {format_value([1, high])}"
-    if high and bop.color_format != "jpg":
-        yield "effects.jpeg_quality", f"0, 0 with bop.color_format {bop.color_format}"
+    if high and color_format != "jpg":
+        yield "effects.jpeg_quality", f"0, 0 with bop.color_format {color_format}"
 
 
 def _split_folders(splits: Sequence[Split], bop: Bop) -> Iterator[Conflict]:
@@ -220,10 +195,3 @@ def _scene_ids(layout: DataLayout) -> Iterator[Conflict]:
         long = next((split.name for split in layout.splits if split.first + split.episodes > most), "")
         key = f"splits.{long}.episodes" if long else "bake.episodes"
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
-
-
-def _object_rows(rows: Sequence[ObjectRow]) -> Iterator[Conflict]:
-    """Yield ids that several object rows have."""
-    counts = Counter(row.id for row in rows)
-    for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
-        yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"

@@ -34,7 +34,6 @@ class SmPartition:
         """Split the SMs of a GPU.
 
         Args:
-            device: A GPU.
             reserved: Number of reserved SMs; CUDA rounds up, with compute capability 9 to a multiple of 8.
 
         Raises:
