@@ -6,8 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -55,18 +54,16 @@ class LiveProgress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def stage(self, text: str) -> None:
         """Show the stage's name beside the bar."""
         self._bar.update(self._task, description=text, detail="")
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, *, episodes_done: int, episodes: int, views: int, **counts: Any) -> None:
         """Set the bar to the episodes done, with worlds, views and time left [s] beside it; it is named so from the first view on."""
-        detail = _detail(worlds_active, views, views_per_s, seconds_left)
+        detail = _detail(views=views, **counts)
         name = "episodes" if views or episodes_done else None
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail, description=name)
 
@@ -87,7 +84,7 @@ class PlainProgress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         return None
 
     def stage(self, text: str) -> None:
@@ -99,14 +96,12 @@ class PlainProgress:
         self._counted_at[name] = now
         self.note(text)
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, *, episodes_done: int, episodes: int, **counts: Any) -> None:
         """Print counts, at most every `PLAIN_INTERVAL`."""
         now = time.monotonic()
         if now - self._printed_at >= PLAIN_INTERVAL:
             self._printed_at = now
-            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
+            self.note(f"episodes {episodes_done}/{episodes} · {_detail(**counts)}")
 
     def note(self, text: str) -> None:
         """Print a line with the time since the start."""
@@ -135,7 +130,7 @@ class CountProgress:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
     def report(self, unit: str, done: int, total: int) -> None:

@@ -54,12 +54,9 @@ class BakeLink:
         """Send the stage's name to the main process."""
         self.report("stage", text)
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, **counts: Any) -> None:
         """Send the counts of progress to the main process."""
-        counts = {"episodes_done": episodes_done, "worlds_active": worlds_active, "views": views}
-        self.report("update", counts | {"views_per_s": views_per_s, "seconds_left": seconds_left})
+        self.report("update", counts)
 
     def note(self, text: str) -> None:
         """Send a note to the main process."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 Report = Callable[[str, int, int], None]
 """Progress of a pass over a data set: receives the unit ("views"), the number done and the total."""
@@ -19,7 +19,7 @@ class Progress(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None: ...
 
     def stage(self, text: str) -> None:
         """A new stage starts, such as "building worlds"."""
@@ -42,15 +42,13 @@ class SilentProgress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         return None
 
     def stage(self, text: str) -> None:
         """Do nothing."""
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, **counts: Any) -> None:
         """Do nothing."""
 
     def note(self, text: str) -> None:
@@ -67,18 +65,9 @@ class ForwardingProgress(SilentProgress):
         """Pass it on."""
         self._progress.stage(text)
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, **counts: Any) -> None:
         """Pass it on."""
-        self._progress.update(
-            episodes_done=episodes_done,
-            episodes=episodes,
-            worlds_active=worlds_active,
-            views=views,
-            views_per_s=views_per_s,
-            seconds_left=seconds_left,
-        )
+        self._progress.update(**counts)
 
     def note(self, text: str) -> None:
         """Pass it on."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
@@ -97,9 +98,7 @@ class SteadyMeter(SilentProgress):
         self.readings: list[Reading] = []
         self.is_stopped = False
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, *, episodes_done: int, episodes: int, views: int, **_: Any) -> None:
         """Take a reading after each tick from the steady state on; interrupts the bake when it has measured long enough."""
         count = self.counter() if self.counter else views
         tally = self.cleaner.poll() if self.cleaner else Tally()

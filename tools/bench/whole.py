@@ -78,9 +78,7 @@ class _Trace(SilentProgress):
         """Record when a stage begins."""
         self.stages.append((text, time.perf_counter() - self.started))
 
-    def update(
-        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
-    ) -> None:
+    def update(self, *, episodes_done: int, worlds_active: int, views: int, **_: Any) -> None:
         """Record a point of progress and the disk used; interrupts the bake if the cleaner has a problem."""
         if self.cleaner.poll().problem and not self._is_stopped:
             self._is_stopped = True
