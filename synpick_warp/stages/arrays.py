@@ -1,7 +1,7 @@
 """Declarations of device arrays: name, dimensions, type and unit in one place, from which arrays are allocated and their memory counted.
 
 Two forms: a dataclass whose fields are declared by `device_array`, for the host; and `struct_arrays`, for the members of a Warp struct,
-whose types and numbers of dimensions come from the struct itself.
+whose types and numbers of dimensions come from the struct itself. `array_group` makes the first of the second, for the host and kernels.
 
 In a dry run (`dry_run`) the same calls allocate nothing: they return stand-ins and list them, by which the memory plan counts what the
 constructors of the stages would allocate.
@@ -13,9 +13,10 @@ import contextlib
 import math
 from collections.abc import Collection, Iterator, Mapping
 from contextvars import ContextVar
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, make_dataclass
+from functools import cached_property
 from types import SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import warp as wp
@@ -75,6 +76,40 @@ def struct_arrays(struct: Any, *shape: str, units: Mapping[str, str] | None = No
                 f"{struct.cls.__name__}.{name} has {types[name].ndim} dimensions, not {len(spec.shape)}: {', '.join(spec.shape)}"
             )
     return StructArrays(struct, specs)
+
+
+class ArrayGroup:
+    """Group of device arrays that kernels take as one struct (bundle): a dataclass with a field for each member of it."""
+
+    struct: ClassVar[Any]
+    """The class decorated by `wp.struct`."""
+
+    @cached_property
+    def bundle(self) -> Any:
+        """The struct with these arrays."""
+        return bundle(self.struct, self)
+
+
+def bundle(struct: Any, *sources: object) -> Any:
+    """Instance of a Warp struct whose members are the sources' attributes of these names, each of the first that has one.
+
+    Raises:
+        TypeError: No source has a member.
+    """
+    result = struct()
+    for name in struct.vars:
+        owner = next((source for source in sources if hasattr(source, name)), None)
+        if owner is None:
+            raise TypeError(f"no source has {struct.cls.__name__}.{name}")
+        setattr(result, name, getattr(owner, name))
+    return result
+
+
+def array_group(struct: Any, *shape: str, units: Mapping[str, str] | None = None, **shapes: tuple[str, ...]) -> Any:
+    """Base of an `ArrayGroup` with the arrays of a Warp struct; arguments as of `struct_arrays`."""
+    specs = struct_arrays(struct, *shape, units=units, **shapes).specs
+    declared = [(name, wp.array, field(metadata={"array": spec})) for name, spec in specs.items()]
+    return make_dataclass(struct.cls.__name__, declared, bases=(ArrayGroup,), namespace={"struct": struct}, frozen=True, eq=False)
 
 
 @dataclass(frozen=True, eq=False)

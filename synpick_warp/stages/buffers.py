@@ -9,7 +9,8 @@ import warp as wp
 
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.visibility.masks import InstanceMasks
-from synpick_warp.stages.arrays import allocate, device_array
+from synpick_warp.kernels.state import FramePoses, Snapshots
+from synpick_warp.stages.arrays import allocate, array_group, device_array
 from synpick_warp.views.layers import LAYER_TABLE, Layer
 from synpick_warp.views.masks import most_words
 
@@ -17,56 +18,23 @@ FIXTURES = ("tote", "finger", "cup")
 """Order of the dimension "fixture"; finger: the gripper shaft."""
 
 
-@dataclass(frozen=True, eq=False)
-class Snapshot:
-    """Snapshot of every world at the end of a tick: episode, frame, objects (-1: none), poses to the world, light, and the poses of the
-    previous frame (`last_`); input of renderer and exporters.
-    """
-
-    live: wp.array = device_array("world", dtype=wp.int32)
-    """1: this tick is a frame of the world's episode."""
-    episode: wp.array = device_array("world", dtype=wp.int32)
-    """Episode index."""
-    frame: wp.array = device_array("world", dtype=wp.int32)
-    """Frame index within the episode."""
-    bin: wp.array = device_array("world", dtype=wp.int32)
-    """Bin of the episode; its pose is that of the first fixture."""
-    catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """Catalog index of each instance; -1: none."""
-    pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    """Object to world."""
-    fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
-    """Bin, gripper shaft and cup to world."""
-    fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
-    """0: the fixture is not rendered."""
-    light: wp.array = device_array("world", dtype=wp.int32)
-    """Index of the episode's environment map."""
-    light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Environment yaw: rotation of the map counter-clockwise about +z."""
-    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="EV")
-    """Exposure value relative to the automatic exposure [EV]."""
-    follows: wp.array = device_array("world", dtype=wp.int32)
-    """1: the `last_` arrays hold the previous frame of the same episode; 0: there is none."""
-    last_catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
-    last_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    last_fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
-    last_fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
+_WORLD = dict.fromkeys(("live", "episode", "frame", "bin", "light", "light_yaw", "light_exposure", "follows"), ("world",))
+_FIXTURES = dict.fromkeys(("fixture_pose", "fixture_visible", "last_fixture_pose", "last_fixture_visible"), ("world", "fixture"))
+_METRES = dict.fromkeys(("pose", "fixture_pose", "last_pose", "last_fixture_pose"), "m")
+_UNITS = _METRES | {"light_yaw": "rad", "light_exposure": "EV"}
 
 
-@dataclass(frozen=True, eq=False)
-class LastFrame:
-    """State of each world at the end of the previous tick: episode, objects and poses. The next snapshot copies it to its `last_` arrays.
+class Snapshot(array_group(Snapshots, "world", "instance", units=_UNITS, **_WORLD, **_FIXTURES)):
+    """Snapshot of every world at the end of a tick: input of renderer and exporters."""
 
-    Members are named as in `Snapshot` and `FramePoses`.
-    """
 
-    live: wp.array = device_array("world", dtype=wp.int32)
-    episode: wp.array = device_array("world", dtype=wp.int32)
-    frame: wp.array = device_array("world", dtype=wp.int32)
-    catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
-    pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
-    fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
+_WORLD = dict.fromkeys(("live", "episode", "frame"), ("world",))
+_FIXTURES = dict.fromkeys(("fixture_pose", "fixture_visible"), ("world", "fixture"))
+_METRES = {"pose": "m", "fixture_pose": "m"}
+
+
+class LastFrame(array_group(FramePoses, "world", "instance", units=_METRES, **_WORLD, **_FIXTURES)):
+    """State of each world at the end of the previous tick."""
 
 
 @dataclass(frozen=True, eq=False)

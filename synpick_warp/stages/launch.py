@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import os
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -13,6 +13,7 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
+from synpick_warp.stages.arrays import ArrayGroup, bundle
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.threads import PIXELS
 
@@ -49,6 +50,8 @@ def launch(
 ) -> None:
     """Launch a kernel with arguments by the names of its parameters, without their suffixes `_out` and `_inout`.
 
+    The argument of a struct parameter that no source has is the `ArrayGroup` of this struct, or a bundle of the sources' attributes.
+
     Args:
         kernel: The kernel.
         dim: Number of threads.
@@ -60,26 +63,60 @@ def launch(
     Raises:
         TypeError: No source has an argument, or several have it, or an argument is none of the kernel's.
     """
+    arguments = _find_arguments(kernel, sources, out, given)
+    device = next(array.device for array in _arrays(arguments))
+    wp.launch(kernel_for(kernel, *arguments), dim=dim, inputs=arguments, device=device, block_dim=block_dim)
+
+
+def launch_images(kernel: wp.Kernel, pixels: int, *sources: object, out: object = None, **given: object) -> None:
+    """Launch a kernel as `launch_pixels` does, with arguments by the names of its parameters as of `launch`."""
+    arguments = _find_arguments(kernel, sources, out, {"first": 0, **given})
+    first = [name for name, *_ in _parameters(kernel)].index("first")
+    launch_pixels(kernel, pixels, arguments[:first], arguments[first + 1 :], next(array.device for array in _arrays(arguments)))
+
+
+def _find_arguments(kernel: wp.Kernel, sources: Sequence[object], out: object, given: dict[str, object]) -> list[Any]:
+    """Arguments of a kernel, as of `launch`."""
     arguments = []
-    for parameter, name in _parameters(kernel):
+    for parameter, name, kind in _parameters(kernel):
         if given.keys() & {parameter, name}:
             arguments.append(given.pop(parameter if parameter in given else name))
             continue
         owners = [out] if out is not None and parameter.endswith("_out") else [source for source in sources if hasattr(source, name)]
+        if hasattr(kind, "cls") and not any(hasattr(owner, name) for owner in owners):
+            arguments.append(_find_bundle(kernel, kind, (*sources, out)))
+            continue
         if len(owners) != 1:
             raise TypeError(f"{kernel.key}: {len(owners)} sources have {name}")
         arguments.append(getattr(owners[0], name))
     if given:
         raise TypeError(f"{kernel.key} has no parameter {', '.join(given)}")
-    device = next(argument.device for argument in arguments if isinstance(argument, wp.array))
-    wp.launch(kernel_for(kernel, *arguments), dim=dim, inputs=arguments, device=device, block_dim=block_dim)
+    return arguments
+
+
+def _find_bundle(kernel: wp.Kernel, struct: Any, sources: Sequence[object]) -> Any:
+    """Struct of the group of arrays that is declared by it, or of attributes of the sources."""
+    group = next((source for source in sources if isinstance(source, ArrayGroup) and source.struct is struct), None)
+    if group is not None:
+        return group.bundle
+    try:
+        return bundle(struct, *sources)
+    except TypeError as error:
+        raise TypeError(f"{kernel.key}: {error}") from None
+
+
+def _arrays(arguments: Sequence[Any]) -> Iterator[wp.array]:
+    """Yield the arrays of arguments: those of structs last."""
+    yield from (argument for argument in arguments if isinstance(argument, wp.array))
+    for argument in arguments:
+        members = argument._cls.vars if hasattr(argument, "_cls") else ()
+        yield from (value for value in (getattr(argument, name) for name in members) if isinstance(value, wp.array))
 
 
 @functools.cache
-def _parameters(kernel: wp.Kernel) -> list[tuple[str, str]]:
-    """Parameters of a kernel, and their names without suffix."""
-    names = inspect.signature(kernel.func).parameters
-    return [(name, name.removesuffix("_out").removesuffix("_inout")) for name in names]
+def _parameters(kernel: wp.Kernel) -> list[tuple[str, str, Any]]:
+    """Parameters of a kernel, their names without suffix, and their types."""
+    return [(name, name.removesuffix("_out").removesuffix("_inout"), kind) for name, kind in kernel.adj.arg_types.items()]
 
 
 def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:

@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from synpick_warp.kernels.encoding.dct import transform_block
-from synpick_warp.kernels.encoding.tables import ZIGZAG
+from synpick_warp.kernels.encoding.dct import ZIGZAG, transform_block
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes
 from synpick_warp.system.codecs import jpeg

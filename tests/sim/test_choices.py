@@ -10,8 +10,11 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.sim.choices import list_choices_kernel
+from synpick_warp.kernels.state import Attempts, Worlds
 from synpick_warp.kernels.structs import CatalogData
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.choices import ChoiceReader
+from tests.worlds.kernel_worlds import filled
 
 STATES, ROWS, OBJECTS = 2, 8, 6
 """Saved states of an episode, rows of the ring buffer, and labelled objects: the stride is 3."""
@@ -24,11 +27,12 @@ def list_choices(device, attempts: list[int], has_target: list[bool]) -> list[tu
     stride, following = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
     world, found = wp.zeros(ROWS, dtype=int, device=device), []
     for attempt, sees in zip(attempts, has_target, strict=True):
-        values = (Phase.ACT, Task.APPROACH if sees else Task.LOOK, 0, attempt)
-        state = [wp.array([int(value)], dtype=int, device=device) for value in values]
+        values = {"phase": Phase.ACT, "task": Task.APPROACH if sees else Task.LOOK, "steps": 0, "attempt": attempt}
+        arrays = {name: wp.array([int(value)], dtype=int, device=device) for name, value in values.items()}
         index = wp.array(np.arange(OBJECTS)[None], dtype=int, device=device)
-        inputs = [catalog, STATES, *state, index]
-        wp.launch(list_choices_kernel, dim=1, inputs=inputs, outputs=[stride, following, world], device=device)
+        state = filled(Worlds(), {"phase": arrays.pop("phase"), "catalog_index": index})
+        given = {"catalog": catalog, "states": STATES, "state": state, "attempts": filled(Attempts(), arrays)}
+        launch(list_choices_kernel, 1, **given, stride=stride, next=following, world=world)
         found += [(int(row), attempt) for row in np.flatnonzero(world.numpy() == 0)]
     return found
 

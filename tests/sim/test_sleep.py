@@ -9,8 +9,11 @@ import warp as wp
 from synpick_warp.codes import Outcome, Phase, Removal, Task
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep as kernels
+from synpick_warp.kernels.state import Contacts
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.kernel_worlds import filled
 from tests.worlds.sights import CALM, brief
 from tests.worlds.small_worlds import report
 from tools.checks.states import Rows, check_arrays, check_branches, differing
@@ -222,9 +225,9 @@ def test_worlds_without_rows_need_one_iteration(device):
 def joined(device, bodies: int, pairs: list[tuple[int, int]]) -> list[int]:
     """Union-find roots (body) of bodies with one shape each, after contacts `pairs`."""
     parent = wp.array(np.arange(bodies), dtype=int, device=device)
-    shapes = [wp.array([pair[side] for pair in pairs], dtype=int, device=device) for side in (0, 1)]
-    inputs = [wp.array([len(pairs)], dtype=int, device=device), *shapes, wp.array(np.arange(bodies), dtype=int, device=device)]
-    wp.launch(kernels.join_islands_kernel, dim=len(pairs), inputs=inputs, outputs=[parent], device=device)
+    values = {f"shape{side}": [pair[side] for pair in pairs] for side in (0, 1)} | {"count": [len(pairs)], "shape_body": range(bodies)}
+    contacts = filled(Contacts(), {name: wp.array(list(value), dtype=int, device=device) for name, value in values.items()})
+    launch(kernels.join_islands_kernel, len(pairs), contacts=contacts, parent=parent)
     roots = parent.numpy()
     while (roots[roots] != roots).any():
         roots = roots[roots]

@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.sim import snapshot
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
+from synpick_warp.stages.launch import launch
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
-from tests.worlds.kernel_worlds import filled
 
 WORLDS, ROOM, FIXTURES = 3, 2, 3
 SIZES = {"world": WORLDS, "instance": ROOM, "fixture": FIXTURES}
 KEPT = ("catalog_index", "pose", "fixture_pose", "fixture_visible")
 TICK = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(-1, 3)), min_size=WORLDS, max_size=WORLDS)
 """live, episode and frame of each world."""
-
-
-def frame_poses(arrays: Any) -> Any:
-    return filled(snapshot.FramePoses(), {name: getattr(arrays, name) for name in ("live", "episode", "frame", *KEPT)})
 
 
 class Linked:
@@ -44,8 +37,7 @@ class Linked:
             values = getattr(made, name).numpy()
             values[:] = (self.count + 10 * np.arange(WORLDS)).reshape(WORLDS, *(1,) * (values.ndim - 1))
             getattr(made, name).assign(values)
-        outputs = [frame_poses(self.last), made.follows, *(getattr(made, f"last_{name}") for name in KEPT)]
-        wp.launch(snapshot.link_frames_kernel, dim=WORLDS, inputs=[frame_poses(made)], outputs=outputs, device=self.device)
+        launch(snapshot.link_frames_kernel, WORLDS, made, self.last)
         return made
 
 

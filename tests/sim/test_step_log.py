@@ -9,12 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Outcome, Phase, Task
 from synpick_warp.kernels.sim import step_log
+from synpick_warp.kernels.state import Contacts
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
 from tests.twins import gripper as twin
 from tests.twins.raycast import rotation_of
+from tests.worlds.kernel_worlds import filled
 from tests.worlds.sights import CALM, SHORT, picking
 from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, settings
 
@@ -257,9 +260,10 @@ def test_sums_of_contact_forces_are_exact_and_opposite(device):
     force[:, :3] = [[1.0, -2.0, 2.0], [0.5, 0.0, 0.0], [0.0, 0.0, 8.0], [np.nan, 1.0, 1.0], [100.0, 0.0, 0.0]]
     shapes = np.array([[0, 1], [1, 0], [1, 2], [0, 1], [0, 1]], np.int32)
     total = wp.zeros((2, 4), dtype=wp.int64, device=device)
-    inputs = [wp.array(values, dtype=int, device=device) for values in (np.array([0, 1, -1]), np.array([4]), shapes[:, 0], shapes[:, 1])]
+    values = {"shape_body": [0, 1, -1], "count": [4], "shape0": shapes[:, 0], "shape1": shapes[:, 1]}
+    contacts = filled(Contacts(), {name: wp.array(value, dtype=int, device=device) for name, value in values.items()})
     forces = wp.array(force, dtype=wp.spatial_vector, device=device)
-    wp.launch(step_log.sum_contacts_kernel, dim=5, inputs=[*inputs, forces], outputs=[total], device=device)
+    launch(step_log.sum_contacts_kernel, 5, contacts=contacts, contact_force=forces, total=total)
     np.testing.assert_array_equal(total.numpy() / float(step_log.COUNTS_PER_NEWTON), [[0.5, -2.0, 2.0, 3.5], [-0.5, 2.0, 6.0, 11.5]])
 
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Removal, Task
 from synpick_warp.kernels.perception import worklist
+from synpick_warp.kernels.state import Attempts, Worlds
 from synpick_warp.stages.sim import arrange, gripper
-from tests.worlds.kernel_worlds import KernelWorlds
+from tests.worlds.kernel_worlds import KernelWorlds, filled
 
 STEP, TIP = 2e-3, 0.05
 PICK = {
@@ -350,11 +351,12 @@ def test_a_gripper_that_is_nowhere_ends_the_episode(device, link):
 @settings(deadline=None, max_examples=25)
 def test_everybody_who_looks_is_looked_at_once(looking, views, device):
     worlds = len(looking)
-    phase = wp.full(worlds, Phase.ACT, dtype=int, device=device)
-    task = wp.array([Task.LOOK if looks else Task.PRESS for looks in looking], dtype=int, device=device)
+    state = filled(Worlds(), {"phase": wp.full(worlds, Phase.ACT, dtype=int, device=device)})
+    tasks = [Task.LOOK if looks else Task.PRESS for looks in looking]
+    attempts = filled(Attempts(), {"task": wp.array(tasks, dtype=int, device=device)})
     listed, world = wp.zeros(worlds, dtype=int, device=device), wp.zeros(views, dtype=int, device=device)
     count, first, left = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
-    wp.launch(worklist.list_worlds_kernel, dim=1, inputs=[worlds, phase, task], outputs=[listed, count, first, left], device=device)
+    wp.launch(worklist.list_worlds_kernel, dim=1, inputs=[worlds, state, attempts], outputs=[listed, count, first, left], device=device)
     seen: list[int] = []
     batches = 0
     while left.numpy()[0]:

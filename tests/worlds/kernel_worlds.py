@@ -201,7 +201,9 @@ class KernelWorlds:
         body_q.fill_(wp.transform_identity())
         contacts = SimpleNamespace(rigid_contact_max=0)
         return SimpleNamespace(
-            state=SimpleNamespace(joint_q=zeros(self.coords), joint_qd=zeros(self.dofs), body_q=body_q),
+            state=SimpleNamespace(
+                joint_q=zeros(self.coords), joint_qd=zeros(self.dofs), body_q=body_q, body_qd=zeros(self.bodies, wp.spatial_vector)
+            ),
             control=SimpleNamespace(joint_f=zeros(self.dofs), joint_target_q=zeros(self.coords)),
             solver=SimpleNamespace(constraint_overflow=zeros(1, wp.bool)),
             lost=zeros(1, wp.int32),

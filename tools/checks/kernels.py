@@ -1,8 +1,8 @@
 """Static check (linter) of device code: prints file:line: rule for each violation, and exits with 1 if there are any.
 
-Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a default, in groups headed `# Scene:`,
-`# State:`, `# In:`, `# Out:`, in this order (the owner may follow); `_out` or `_inout` ends the names of written arrays, and of no
-others; a comment behind every array names its dimensions; a docstring.
+Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a default; `_out` or `_inout` ends the names of written arrays
+and structs, and of no others; a docstring. Arrays beside structs: a comment behind each names its dimensions, and all parameters are in
+groups headed `# Scene:`, `# State:`, `# In:`, `# Out:`, in this order (the owner may follow).
 Kernel modules: a docstring, no backward passes, no postponed annotations, no imports but Warp and other kernels.
 Everywhere: `wp.launch` in synpick_warp/{stages,newton_patches} only, with arguments named as the parameters (`tools.checks.launches`).
 
@@ -86,7 +86,8 @@ def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> I
     others = kernel.args
     if others.defaults or others.kw_defaults or others.kwonlyargs or others.posonlyargs or others.vararg or others.kwarg:
         yield kernel.lineno, f"{kernel.name} can only have plain parameters without defaults"
-    yield from check_groups(kernel, lines)
+    if any(parameter.annotation is not None and _ARRAY.match(ast.unparse(parameter.annotation)) for parameter in parameters):
+        yield from check_groups(kernel, lines)
     yield from check_shapes(kernel, lines)
     certain, possible = written_names(kernel, writes)
     for parameter in parameters:

@@ -7,7 +7,7 @@ files of them.
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS
+from synpick_warp.kernels.encoding.dct import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS
 
 wp.set_module_options({"enable_backward": False})
 

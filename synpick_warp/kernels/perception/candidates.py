@@ -14,6 +14,7 @@ from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies
 from synpick_warp.kernels.rng import GAMMA, mix, pixel_key, stream_key
+from synpick_warp.kernels.state import Attempts, Observations, Plans, Worlds
 
 wp.set_module_options({"enable_backward": False})
 
@@ -207,10 +208,10 @@ def draw_pixels_kernel(
     # Scene:
     seed: wp.uint64,
     # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    attempt: wp.array[int],  # (world)
-    target: wp.array[int],  # (world)
-    grasp_pixel: wp.array2d[wp.vec2i],  # (world, instance) [px]
+    state: Worlds,
+    attempts: Attempts,
+    plan: Plans,
+    observation: Observations,
     # In:
     views: Views,
     component: wp.array3d[int],  # (view, row, column)
@@ -227,10 +228,10 @@ def draw_pixels_kernel(
         return
     pixel = NOWHERE
     if draw == pool_inout.pixel.shape[1] - 1:
-        if target[world] >= 0:
-            pixel = grasp_pixel[world, target[world]]
+        if plan.target[world] >= 0:
+            pixel = observation.grasp_pixel[world, plan.target[world]]
     elif pool_inout.pixels[view] > 0:
-        key = view_stream(seed, arrangement_id[world], attempt[world])
+        key = view_stream(seed, state.arrangement_id[world], attempts.attempt[world])
         pixel = pixel_of_rank(pool_inout, component, view, wide_index(key, draw, pool_inout.pixels[view]))
     pool_inout.pixel[view, draw] = pixel
 
@@ -359,9 +360,8 @@ def choose_candidates_kernel(
     first: int,
     # State:
     row: wp.array[int],  # (world)
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    attempt: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
+    state: Worlds,
+    attempts: Attempts,
     # In:
     views: Views,
     component: wp.array3d[int],  # (view, row, column)
@@ -390,7 +390,7 @@ def choose_candidates_kernel(
         weight = float(pool.pixels[view])
     elif candidate > 0:
         share = int(Share.STRATIFIED)
-        key = view_stream(seed, arrangement_id[world], attempt[world])
+        key = view_stream(seed, state.arrangement_id[world], attempts.attempt[world])
         instances = find_stratum(pool, view, -1, 0)[1]
         place = candidate - 1 + wide_index(key, STARTS, instances)
         instance = find_stratum(pool, view, -1, place)[0]
@@ -405,7 +405,7 @@ def choose_candidates_kernel(
     candidates_out.share[grasp] = share
     candidates_out.weight[grasp] = weight
     candidates_out.pixel[grasp] = pixel
-    candidates_out.entry[grasp] = catalog_index[world, instance]
+    candidates_out.entry[grasp] = state.catalog_index[world, instance]
     candidates_out.seal[grasp] = pool.seal[view, draw]
     candidates_out.wrench[grasp] = pool.wrench[view, draw]
     row_out[grasp] = row[world]
@@ -442,10 +442,11 @@ def store_normals_kernel(
     # Scene:
     candidates: int,
     first: int,
+    # State:
+    plan: Plans,
     # In:
     index: wp.array[int],  # (one)
     views: Views,
-    normal: wp.array[wp.vec3],  # (world)
     # Out:
     surface_normal_out: wp.array[wp.vec3],  # (grasp)
 ):
@@ -453,7 +454,7 @@ def store_normals_kernel(
     view = wp.tid()
     world = views.world[view]
     if world >= 0:
-        surface_normal_out[(first + view) * candidates + index[0]] = wp.normalize(normal[world])
+        surface_normal_out[(first + view) * candidates + index[0]] = wp.normalize(plan.normal[world])
 
 
 @wp.kernel
@@ -461,13 +462,11 @@ def store_grasps_kernel(
     # Scene:
     candidates: int,
     first: int,
+    # State:
+    plan: Plans,
     # In:
     index: wp.array[int],  # (one)
     views: Views,
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    yaw: wp.array[float],  # (world) [rad]
-    tilt: wp.array[float],  # (world) [rad]
     # Out:
     grasp_point_out: wp.array[wp.vec3],  # (grasp) [m]
     grasp_normal_out: wp.array[wp.vec3],  # (grasp)
@@ -480,10 +479,10 @@ def store_grasps_kernel(
     if world < 0:
         return
     grasp = (first + view) * candidates + index[0]
-    grasp_point_out[grasp] = point[world]
-    grasp_normal_out[grasp] = normal[world]
-    grasp_yaw_out[grasp] = yaw[world]
-    grasp_tilt_out[grasp] = tilt[world]
+    grasp_point_out[grasp] = plan.point[world]
+    grasp_normal_out[grasp] = plan.normal[world]
+    grasp_yaw_out[grasp] = plan.yaw[world]
+    grasp_tilt_out[grasp] = plan.tilt[world]
 
 
 @wp.kernel

@@ -8,6 +8,7 @@ import warp as wp
 
 from synpick_warp.kernels.bitsets import NO_MEMBERS, WORD_BITS, WORD_SHIFT, bit, has_member, lowest_bit
 from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.state import Observations
 from synpick_warp.kernels.structs import PerceptionData
 
 wp.set_module_options({"enable_backward": False})
@@ -277,15 +278,7 @@ def remove_upward(view: int, size: int, lane: int, lanes: int, cycles: Cycles, a
 
 
 @wp.kernel
-def link_clutter_kernel(
-    # Scene:
-    perception: PerceptionData,
-    # In:
-    views: Views,
-    votes: wp.array3d[float],  # (world, instance, instance)
-    # Out:
-    above_out: wp.array3d[wp.uint32],  # (world, instance, word)
-):
+def link_clutter_kernel(perception: PerceptionData, observation_inout: Observations, views: Views):
     """Edges of the clutter graph, cycles included: `above` receives the bit set of each instance's direct predecessors.
 
     w(j → i) = max(v_ij - v_ji, 0), where votes v below `min_votes` count as 0. Launched over view, instance, word.
@@ -295,43 +288,25 @@ def link_clutter_kernel(
     if world < 0:
         return
     edges = wp.uint32(0)
-    for upper in range(WORD_BITS * word, wp.min(WORD_BITS * (word + 1), votes.shape[1])):
-        if edge_weight(votes, world, instance, upper, perception.min_votes) > 0.0:
+    for upper in range(WORD_BITS * word, wp.min(WORD_BITS * (word + 1), observation_inout.votes.shape[1])):
+        if edge_weight(observation_inout.votes, world, instance, upper, perception.min_votes) > 0.0:
             edges = edges | bit(upper)
-    above_out[world, instance, word] = edges
+    observation_inout.above[world, instance, word] = edges
 
 
 @wp.kernel
-def close_clutter_kernel(
-    # In:
-    views: Views,
-    above: wp.array3d[wp.uint32],  # (world, instance, word)
-    # Out:
-    cycles_out: Cycles,
-    ancestors_out: wp.array3d[wp.uint32],  # (world, instance, word)
-):
+def close_clutter_kernel(observation_inout: Observations, views: Views, cycles_out: Cycles):
     """Transitive closure of the clutter graph, by a search from each instance: `ancestors` receives the instances from which a path leads
     to it. Launched over view, instance.
     """
     view, instance = wp.tid()
     world = views.world[view]
     if world >= 0:
-        close_row(above[world], instance, cycles_out.pending[view], ancestors_out[world])
+        close_row(observation_inout.above[world], instance, cycles_out.pending[view], observation_inout.ancestors[world])
 
 
 @wp.kernel
-def break_cycles_kernel(
-    # Scene:
-    perception: PerceptionData,
-    lanes: int,
-    # In:
-    views: Views,
-    votes: wp.array3d[float],  # (world, instance, instance)
-    ancestors: wp.array3d[wp.uint32],  # (world, instance, word)
-    # Out:
-    cycles_out: Cycles,
-    above_inout: wp.array3d[wp.uint32],  # (world, instance, word)
-):
+def break_cycles_kernel(perception: PerceptionData, lanes: int, observation_inout: Observations, views: Views, cycles_out: Cycles):
     """Make each world's clutter graph acyclic: in every strongly connected component the acyclic subset of maximum weight is kept; in
     components of more than `exact_cycle` objects a greedy one.
 
@@ -341,20 +316,20 @@ def break_cycles_kernel(
     world = views.world[view]
     if world < 0:
         return
-    instances = votes.shape[1]
+    instances = observation_inout.votes.shape[1]
     for i in range(lane, instances, lanes):
-        cycles_out.leader[view, i] = find_leader(ancestors[world], i)
+        cycles_out.leader[view, i] = find_leader(observation_inout.ancestors[world], i)
     sync_lanes()
     for first in range(instances):
         size = gather_component(first, instances, view, lane, cycles_out)
         if size > 0:
             sync_lanes()
-            weigh_component(votes, world, view, size, lane, lanes, perception.min_votes, cycles_out)
+            weigh_component(observation_inout.votes, world, view, size, lane, lanes, perception.min_votes, cycles_out)
             sync_lanes()
             if size <= perception.exact_cycle:
                 rank_exactly(view, size, lane, lanes, cycles_out)
             else:
                 rank_greedily(view, size, lane, lanes, cycles_out)
             sync_lanes()
-            remove_upward(view, size, lane, lanes, cycles_out, above_inout[world])
+            remove_upward(view, size, lane, lanes, cycles_out, observation_inout.above[world])
             sync_lanes()

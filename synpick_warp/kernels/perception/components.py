@@ -21,6 +21,38 @@ LAST_PIXEL = wp.constant(wp.int64(0x7FFFFFFF))
 PIXEL_BITS = wp.constant(wp.int64(31))
 
 
+@wp.struct
+class Segments:
+    """Images, with pixels in row-major order, and results of segmentation. A patch is the largest component of an instance."""
+
+    segment: wp.array2d[wp.uint8]
+    """(view, pixel): segmentation id of the G-buffer."""
+    depth: wp.array2d[float]
+    """(view, pixel): planar depth of the G-buffer [m]."""
+    component: wp.array2d[int]
+    """(view, pixel): label of the connected component (8-connectivity, within one instance): the smallest index of its pixels; -1: none."""
+    area: wp.array2d[int]
+    """(view, pixel): size of a component [px], stored at its root, the pixel whose index is the label; 0 elsewhere."""
+    patch: wp.array2d[wp.uint16]
+    """(view, pixel): low byte: 1 + instance, 0: no patch; bit 8 + d: the neighbour in direction d belongs to the same patch."""
+    gap: wp.array2d[int]
+    """(view, pixel): 256 x distance within the column [px] + low byte of `patch`."""
+    distance: wp.array2d[float]
+    """(view, pixel): distance to the centre of the nearest pixel outside the patch [px]; 0 outside of patches."""
+    largest: wp.array2d[int]
+    """(view, instance): label of the largest component; -1: the instance is not visible."""
+    largest_key: wp.array2d[wp.int64]
+    """(view, instance): size and label of the largest component, packed by `pack_key`."""
+    pole_key: wp.array2d[wp.int64]
+    """(view, instance): squared distance [px²] and pixel of the pole, packed by `pack_key`."""
+    square: wp.array2d[wp.int64]
+    """(view, instance): sum of squared depths over the patch [2⁻²⁴ m²]."""
+    contour: wp.array3d[wp.vec2i]
+    """(view, instance, point): outer contour of the patch [px]."""
+    contour_length: wp.array2d[int]
+    """(view, instance): number of contour points."""
+
+
 @wp.func
 def split_index(index: int, height: int, strips: int) -> tuple[int, int, int]:
     """(view, row, strip) of a thread's flat index."""
@@ -51,18 +83,7 @@ def instance_id(segment: wp.array2d[wp.uint8], view: int, pixel: int, instances:
 
 
 @wp.kernel
-def label_strips_kernel(
-    # In:
-    views: Views,
-    segment: wp.array2d[wp.uint8],  # (view, pixel)
-    width: int,
-    height: int,
-    strips: int,
-    first: int,
-    # Out:
-    component_out: wp.array2d[int],  # (view, pixel)
-    area_out: wp.array2d[int],  # (view, pixel) [px]
-):
+def label_strips_kernel(segments_inout: Segments, views: Views, width: int, height: int, strips: int, first: int):
     """Initialize union-find: `component_out` receives the first pixel of each pixel's run of equal ids in its strip, or -1 off instances.
 
     `area_out` is set to 0. Launched over view, row, strip (flat, from index `first` on).
@@ -75,15 +96,15 @@ def label_strips_kernel(
     start = int(0)
     before = int(0)
     for i in range(wp.min(STRIP, width - column)):
-        here = instance_id(segment, view, pixel + i, views.instances)
+        here = instance_id(segments_inout.segment, view, pixel + i, views.instances)
         if here != before:
             start = pixel + i
         before = here
         label = int(NO_COMPONENT)
         if here > 0:
             label = start
-        component_out[view, pixel + i] = label
-        area_out[view, pixel + i] = 0
+        segments_inout.component[view, pixel + i] = label
+        segments_inout.area[view, pixel + i] = 0
 
 
 @wp.func
@@ -119,14 +140,7 @@ def unite(component: wp.array2d[int], view: int, a: int, b: int):
 
 
 @wp.kernel
-def merge_strips_kernel(
-    # In:
-    views: Views,
-    segment: wp.array2d[wp.uint8],  # (view, pixel)
-    width: int,
-    # Out:
-    component_inout: wp.array2d[int],  # (view, pixel)
-):
+def merge_strips_kernel(segments_inout: Segments, views: Views, width: int):
     """Union pass: unite runs of equal ids with the strip to the left and with the row above, diagonals included, once for every pair of
     runs.
 
@@ -140,43 +154,36 @@ def merge_strips_kernel(
     above_left = int(0)
     above = int(0)
     if begin > 0:
-        left = instance_id(segment, view, row * width + begin - 1, views.instances)
+        left = instance_id(segments_inout.segment, view, row * width + begin - 1, views.instances)
         if row > 0:
-            above_left = instance_id(segment, view, (row - 1) * width + begin - 1, views.instances)
+            above_left = instance_id(segments_inout.segment, view, (row - 1) * width + begin - 1, views.instances)
     if row > 0:
-        above = instance_id(segment, view, (row - 1) * width + begin, views.instances)
+        above = instance_id(segments_inout.segment, view, (row - 1) * width + begin, views.instances)
     for column in range(begin, wp.min(begin + STRIP, width)):
         pixel = row * width + column
-        here = instance_id(segment, view, pixel, views.instances)
+        here = instance_id(segments_inout.segment, view, pixel, views.instances)
         above_right = int(0)
         if row > 0 and column + 1 < width:
-            above_right = instance_id(segment, view, pixel - width + 1, views.instances)
+            above_right = instance_id(segments_inout.segment, view, pixel - width + 1, views.instances)
         if here > 0:
             if column == begin and left == here:
-                unite(component_inout, view, pixel - 1, pixel)
+                unite(segments_inout.component, view, pixel - 1, pixel)
             # Skip neighbours above that the left pixel of the same run has already united.
             if above == here:
                 if left != here or above_left != here:
-                    unite(component_inout, view, pixel - width, pixel)
+                    unite(segments_inout.component, view, pixel - width, pixel)
             else:
                 if above_left == here and left != here:
-                    unite(component_inout, view, pixel - width - 1, pixel)
+                    unite(segments_inout.component, view, pixel - width - 1, pixel)
                 if above_right == here:
-                    unite(component_inout, view, pixel - width + 1, pixel)
+                    unite(segments_inout.component, view, pixel - width + 1, pixel)
         left = here
         above_left = above
         above = above_right
 
 
 @wp.kernel
-def measure_components_kernel(
-    # In:
-    views: Views,
-    width: int,
-    # Out:
-    component_inout: wp.array2d[int],  # (view, pixel)
-    area_out: wp.array2d[int],  # (view, pixel) [px]
-):
+def measure_components_kernel(segments_inout: Segments, views: Views, width: int):
     """Path compression: replace each label by its root, and add the lengths of its runs to the component's size at the root.
 
     Writes `component_inout` and `area_out`, with one atomic addition per run. Launched over view, row, strip.
@@ -189,40 +196,33 @@ def measure_components_kernel(
     root = int(NO_COMPONENT)
     count = int(0)
     for pixel in range(begin, wp.min(begin + STRIP, (row + 1) * width)):
-        label = component_inout[view, pixel]
+        label = segments_inout.component[view, pixel]
         # All pixels of a run but its first still have the first one as label, from `label_strips_kernel`.
         if label != run:
             if count > 0:
-                wp.atomic_add(area_out, view, root, count)
+                wp.atomic_add(segments_inout.area, view, root, count)
             count = 0
             run = int(NO_COMPONENT)
             if label >= 0:
                 run = pixel
-                root = find_root(component_inout, view, label)
+                root = find_root(segments_inout.component, view, label)
         if run >= 0:
-            component_inout[view, pixel] = root
+            segments_inout.component[view, pixel] = root
             count += 1
     if count > 0:
-        wp.atomic_add(area_out, view, root, count)
+        wp.atomic_add(segments_inout.area, view, root, count)
 
 
 @wp.kernel
-def find_largest_kernel(
-    # In:
-    views: Views,
-    segment: wp.array2d[wp.uint8],  # (view, pixel)
-    area: wp.array2d[int],  # (view, pixel) [px]
-    # Out:
-    largest_key_out: wp.array2d[wp.int64],  # (view, instance)
-):
+def find_largest_kernel(segments_inout: Segments, views: Views):
     """Argmax of the component size of each instance: max over its roots of pack_key(area, root). Keys must be 0 before. Launched over view,
     pixel."""
     view, pixel = wp.tid()
     if views.world[view] < 0:
         return
-    size = area[view, pixel]
+    size = segments_inout.area[view, pixel]
     if size > 0:
-        wp.atomic_max(largest_key_out, view, int(segment[view, pixel]) - 1, pack_key(wp.int64(size), pixel))
+        wp.atomic_max(segments_inout.largest_key, view, int(segments_inout.segment[view, pixel]) - 1, pack_key(wp.int64(size), pixel))
 
 
 @wp.kernel
@@ -231,17 +231,15 @@ def unpack_largest_kernel(
     catalog: CatalogData,
     # State:
     catalog_index: wp.array2d[int],  # (world, instance)
+    segments_inout: Segments,
     # In:
     views: Views,
-    largest_key: wp.array2d[wp.int64],  # (view, instance)
-    # Out:
-    largest_out: wp.array2d[int],  # (view, instance)
 ):
     """Label of each instance's largest component; -1: not visible, or a distractor, which perception does not know as an object, or the
     view is unused. Launched over view, instance.
     """
     view, instance = wp.tid()
-    largest_out[view, instance] = NO_COMPONENT
+    segments_inout.largest[view, instance] = NO_COMPONENT
     world = views.world[view]
-    if world >= 0 and largest_key[view, instance] > wp.int64(0) and catalog_index[world, instance] < catalog.count:
-        largest_out[view, instance] = unpack_pixel(largest_key[view, instance])
+    if world >= 0 and segments_inout.largest_key[view, instance] > wp.int64(0) and catalog_index[world, instance] < catalog.count:
+        segments_inout.largest[view, instance] = unpack_pixel(segments_inout.largest_key[view, instance])

@@ -2,8 +2,10 @@
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Segments
 from synpick_warp.kernels.perception.distance_transform import SEGMENT_BITS, direction_column, direction_row
 from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.state import Observations
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,18 +79,7 @@ def next_direction(neighbours: int, start: int, turn: int) -> int:
 
 
 @wp.kernel
-def trace_contours_kernel(
-    # In:
-    views: Views,
-    patch: wp.array2d[wp.uint16],  # (view, pixel)
-    largest: wp.array2d[int],  # (view, instance)
-    width: int,
-    # Out:
-    contour_out: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
-    contour_length_out: wp.array2d[int],  # (view, instance)
-    centroid_out: wp.array2d[wp.vec2],  # (world, instance) [px]
-    overflow_out: wp.array[int],  # (world)
-):
+def trace_contours_kernel(segments_inout: Segments, views: Views, width: int, observation_out: Observations):
     """Border following (Moore neighbours): pixels of the outer contour of each instance's largest component, their number, and its
     centroid.
 
@@ -98,15 +89,15 @@ def trace_contours_kernel(
     """
     view, instance = wp.tid()
     world = views.world[view]
-    contour_length_out[view, instance] = 0
+    segments_inout.contour_length[view, instance] = 0
     if world < 0:
         return
-    origin = largest[view, instance]
+    origin = segments_inout.largest[view, instance]
     if origin < 0:
         return
     start_row = origin // width
     start_column = origin - start_row * width
-    neighbours = int(patch[view, origin]) >> SEGMENT_BITS
+    neighbours = int(segments_inout.patch[view, origin]) >> SEGMENT_BITS
     direction = next_direction(neighbours, NORTH_WEST, CLOCKWISE)
     # Offset of the pixel from which the border returns to its start: the last contour point.
     last_u = direction_column(direction)
@@ -116,10 +107,10 @@ def trace_contours_kernel(
     polygon = PolygonMoments()
     following = bool(True)
     while following:
-        if polygon.points == contour_out.shape[2]:
-            overflow_out[world] = 1
+        if polygon.points == segments_inout.contour.shape[2]:
+            observation_out.overflow[world] = 1
             break
-        contour_out[view, instance, polygon.points] = wp.vec2i(start_column + u, start_row + v)
+        segments_inout.contour[view, instance, polygon.points] = wp.vec2i(start_column + u, start_row + v)
         polygon = add_vertex(polygon, u, v)
         if direction == NO_DIRECTION:
             break
@@ -130,7 +121,7 @@ def trace_contours_kernel(
         u = next_u
         v = next_v
         direction = (direction + 4) & 7
-        neighbours = int(patch[view, origin + v * width + u]) >> SEGMENT_BITS
-    contour_length_out[view, instance] = polygon.points
+        neighbours = int(segments_inout.patch[view, origin + v * width + u]) >> SEGMENT_BITS
+    segments_inout.contour_length[view, instance] = polygon.points
     centroid = polygon_centroid(polygon)
-    centroid_out[world, instance] = wp.vec2(float(start_column) + float(centroid[0]), float(start_row) + float(centroid[1]))
+    observation_out.centroid[world, instance] = wp.vec2(float(start_column) + float(centroid[0]), float(start_row) + float(centroid[1]))

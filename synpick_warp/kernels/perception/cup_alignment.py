@@ -4,6 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, Views, in_image
 from synpick_warp.kernels.rng import TAU
+from synpick_warp.kernels.state import Plans
 from synpick_warp.kernels.structs import CupData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -106,16 +107,12 @@ def align_cups_kernel(
     suction: SuctionData,
     cups: CupData,
     grid: ImageGrid,
+    # State:
+    plan_inout: Plans,
     # In:
     views: Views,
     component: wp.array3d[int],  # (view, row, column)
     largest: wp.array2d[int],  # (view, instance)
-    target: wp.array[int],  # (world)
-    point: wp.array[wp.vec3],  # (world) [m]
-    # Out:
-    normal_inout: wp.array[wp.vec3],  # (world)
-    yaw_inout: wp.array[float],  # (world) [rad]
-    tilt_inout: wp.array[float],  # (world) [rad]
 ):
     """Turn the grasp of each target about its point so that most cups lie on the target's largest component.
 
@@ -125,26 +122,26 @@ def align_cups_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    if world < 0 or target[world] < 0:
+    if world < 0 or plan_inout.target[world] < 0:
         return
-    label = largest[view, target[world]]
-    normal = normal_inout[world]
-    best = head_frame(normal, yaw_inout[world])
+    label = largest[view, plan_inout.target[world]]
+    normal = plan_inout.normal[world]
+    best = head_frame(normal, plan_inout.yaw[world])
     most = int(-1)
     least = float(0.0)
     for candidate in range(YAWS + 1):
-        yaw = yaw_inout[world]
+        yaw = plan_inout.yaw[world]
         if candidate > 0:
             yaw = TAU * float(candidate - 1) / float(YAWS) - wp.PI
         frame = head_frame(normal, yaw)
         # Sine of the angle between axis and normal.
         deviation = wp.abs(wp.dot(frame.across, normal))
         if candidate == 0 or (deviation <= wp.sin(suction.swing_limit) and wp.abs(frame.tilt) <= pick.tilt_limit):
-            score = score_frame(frame, point[world], suction, cups, views, grid, view, component, label)
+            score = score_frame(frame, plan_inout.point[world], suction, cups, views, grid, view, component, label)
             if score > most or (score == most and deviation < least):
                 most = score
                 least = deviation
                 best = frame
-    normal_inout[world] = best.axis
-    yaw_inout[world] = best.yaw
-    tilt_inout[world] = best.tilt
+    plan_inout.normal[world] = best.axis
+    plan_inout.yaw[world] = best.yaw
+    plan_inout.tilt[world] = best.tilt

@@ -6,6 +6,7 @@ the largest component of an instance; one word a pixel stores its patch and whic
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Segments
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False})
@@ -41,18 +42,7 @@ def direction_row(direction: int) -> int:
 
 
 @wp.kernel
-def mark_patches_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    views: Views,
-    segment: wp.array2d[wp.uint8],  # (view, pixel)
-    component: wp.array2d[int],  # (view, pixel)
-    largest: wp.array2d[int],  # (view, instance)
-    first: int,
-    # Out:
-    patch_out: wp.array2d[wp.uint16],  # (view, pixel)
-):
+def mark_patches_kernel(grid: ImageGrid, segments_inout: Segments, views: Views, first: int):
     """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component; none beyond the border.
 
     Launched over view, pixel (tile order, from flat index `first` on).
@@ -61,31 +51,23 @@ def mark_patches_kernel(
     if not in_image(grid, row, column) or views.world[view] < 0:
         return
     pixel = row * grid.width + column
-    label = component[view, pixel]
+    label = segments_inout.component[view, pixel]
     word = int(0)
     if label >= 0:
-        here = int(segment[view, pixel])
-        if largest[view, here - 1] == label:
+        here = int(segments_inout.segment[view, pixel])
+        if segments_inout.largest[view, here - 1] == label:
             word = here
             for direction in range(8):
                 x = column + direction_column(direction)
                 y = row + direction_row(direction)
                 if in_image(grid, y, x):
-                    if component[view, y * grid.width + x] == label:
+                    if segments_inout.component[view, y * grid.width + x] == label:
                         word = word | (1 << (direction + SEGMENT_BITS))
-    patch_out[view, pixel] = wp.uint16(word)
+    segments_inout.patch[view, pixel] = wp.uint16(word)
 
 
 @wp.kernel
-def measure_columns_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    views: Views,
-    patch: wp.array2d[wp.uint16],  # (view, pixel)
-    # Out:
-    gap_out: wp.array2d[int],  # (view, pixel)
-):
+def measure_columns_kernel(grid: ImageGrid, segments_inout: Segments, views: Views):
     """First pass, down and up each column: 256 g + (1 + instance) in patches, else 0.
 
     g [px] is the distance to the nearest pixel of the column outside the patch. Launched over view, column.
@@ -96,25 +78,25 @@ def measure_columns_kernel(
     gap = int(0)
     for row in range(grid.height):
         pixel = row * grid.width + column
-        word = int(patch[view, pixel])
+        word = int(segments_inout.patch[view, pixel])
         if word == 0:
             gap = 0
         elif (word >> (NORTH + SEGMENT_BITS)) & 1 != 0:
             gap += 1
         else:
             gap = 1
-        gap_out[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
+        segments_inout.gap[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
     gap = int(0)
     for i in range(grid.height):
         pixel = (grid.height - 1 - i) * grid.width + column
-        word = int(patch[view, pixel])
+        word = int(segments_inout.patch[view, pixel])
         if word != 0:
             if (word >> (SOUTH + SEGMENT_BITS)) & 1 != 0:
                 gap += 1
             else:
                 gap = 1
-            if gap < gap_out[view, pixel] >> SEGMENT_BITS:
-                gap_out[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
+            if gap < segments_inout.gap[view, pixel] >> SEGMENT_BITS:
+                segments_inout.gap[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
 
 
 @wp.func
@@ -129,16 +111,7 @@ def read_gap(gap: wp.array2d[int], view: int, row: int, column: int, width: int,
 
 
 @wp.kernel
-def measure_rows_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    views: Views,
-    gap: wp.array2d[int],  # (view, pixel)
-    first: int,
-    # Out:
-    distance_out: wp.array2d[float],  # (view, pixel) [px]
-):
+def measure_rows_kernel(grid: ImageGrid, segments_inout: Segments, views: Views, first: int):
     """Second pass: d = sqrt(min over x' of (x - x')² + g²(x')), searched outward until (x - x')² alone is as large; 0 outside patches.
 
     Launched over view, pixel (tile order, from flat index `first` on).
@@ -146,15 +119,15 @@ def measure_rows_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
         return
-    word = gap[view, row * grid.width + column]
+    word = segments_inout.gap[view, row * grid.width + column]
     segment = word & SEGMENT_MASK
     square = word >> SEGMENT_BITS
     square = square * square
     offset = int(1)
     while offset * offset < square:
-        left = read_gap(gap, view, row, column - offset, grid.width, segment)
-        right = read_gap(gap, view, row, column + offset, grid.width, segment)
+        left = read_gap(segments_inout.gap, view, row, column - offset, grid.width, segment)
+        right = read_gap(segments_inout.gap, view, row, column + offset, grid.width, segment)
         nearer = wp.min(left, right)
         square = wp.min(square, offset * offset + nearer * nearer)
         offset += 1
-    distance_out[view, row * grid.width + column] = wp.sqrt(float(square))
+    segments_inout.distance[view, row * grid.width + column] = wp.sqrt(float(square))

@@ -26,17 +26,7 @@ def intersect_triangle(start: wp.vec3, direction: wp.vec3, a: wp.vec3, b: wp.vec
 
 
 @wp.kernel
-def intersect_hits_kernel(
-    # Scene:
-    meshes: Meshes,
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    views: Views,
-    first: int,
-    # Out:
-    gbuffer_inout: GBuffer,
-):
+def intersect_hits_kernel(meshes: Meshes, grid: ImageGrid, bodies: ViewBodies, views: Views, first: int, gbuffer_inout: GBuffer):
     """Replace depth and barycentric weights of each pixel's hit by those that a ray query of the body's mesh returns, to the last bit.
 
     Rasterization and BVH traversal find the same triangles, but round differently, and a grasp plan amplifies the last bit of a depth into

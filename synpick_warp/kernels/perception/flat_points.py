@@ -6,6 +6,7 @@ from synpick_warp.codes import Stream
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.rng import stream_key, uniform_index
+from synpick_warp.kernels.state import Attempts, Observations, Plans, Worlds
 from synpick_warp.kernels.structs import CupData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -74,21 +75,17 @@ def choose_flat_points_kernel(
     suction: SuctionData,
     cups: CupData,
     least_failures: int,
-    # State: worlds, attempts
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    attempt: wp.array[int],  # (world)
-    target_failures: wp.array2d[int],  # (world, instance)
+    # State:
+    state: Worlds,
+    attempts: Attempts,
+    observation_inout: Observations,
+    plan: Plans,
     # In:
     views: Views,
     gbuffer: GBuffer,
     component: wp.array3d[int],  # (view, row, column)
     distance: wp.array3d[float],  # (view, row, column) [px]
     extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
-    distances: wp.array2d[wp.vec3],  # (world, instance) [px]
-    target: wp.array[int],  # (world)
-    # Out:
-    grasp_pixel_inout: wp.array2d[wp.vec2i],  # (world, instance) [px]
-    depth_out: wp.array2d[float],  # (world, instance) [m]
 ):
     """Move the grasp point of targets with at least `least_failures` failed attempts to where the surface below all cups is flat.
 
@@ -98,31 +95,34 @@ def choose_flat_points_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    if world < 0 or target[world] < 0:
+    if world < 0 or plan.target[world] < 0:
         return
-    instance = target[world]
-    failures = target_failures[world, instance]
+    instance = plan.target[world]
+    failures = attempts.target_failures[world, instance]
     if failures < least_failures:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.GRASPS)
+    key = stream_key(seed, state.arrangement_id[world][0], state.arrangement_id[world][1], Stream.GRASPS)
     box = extent[view, instance]
-    chosen = grasp_pixel_inout[world, instance]
+    chosen = observation_inout.grasp_pixel[world, instance]
     label = component[view, chosen[1], chosen[0]]
     radius = head_span(suction, cups) * views.cameras.intrinsics[view][0]
     bump = float(DIAMETERS + 1) * OUTSIDE
     if failures == 0:
         bump = measure_bump(gbuffer, component, view, chosen, radius / gbuffer.depth[view, chosen[1], chosen[0]])
-    first = 2 * DRAWS * (attempt[world] + 1)
+    first = 2 * DRAWS * (attempts.attempt[world] + 1)
     draw = int(0)
     while draw < DRAWS and bump > FLAT:
         column = uniform_index(key, first + 2 * draw, box[2] + box[0] + 1) - box[0]
         row = uniform_index(key, first + 2 * draw + 1, box[3] + box[1] + 1) - box[1]
         draw += 1
-        if component[view, row, column] == label and distance[view, row, column] >= MARGIN * distances[world, instance][0]:
+        if (
+            component[view, row, column] == label
+            and distance[view, row, column] >= MARGIN * observation_inout.distances[world, instance][0]
+        ):
             pixel = wp.vec2i(column, row)
             other = measure_bump(gbuffer, component, view, pixel, radius / gbuffer.depth[view, row, column])
             if other < bump:
                 bump = other
                 chosen = pixel
-    grasp_pixel_inout[world, instance] = chosen
-    depth_out[world, instance] = gbuffer.depth[view, chosen[1], chosen[0]]
+    observation_inout.grasp_pixel[world, instance] = chosen
+    observation_inout.depth[world, instance] = gbuffer.depth[view, chosen[1], chosen[0]]

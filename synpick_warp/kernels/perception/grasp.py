@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
+from synpick_warp.kernels.state import Observations, Plans
 from synpick_warp.kernels.structs import PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -55,16 +56,15 @@ def smooth_normal_kernel(
     surfaces: Surfaces,
     grid: ImageGrid,
     window: int,
+    # State:
+    plan_inout: Plans,
+    observation: Observations,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
     component: wp.array3d[int],  # (view, row, column)
     largest: wp.array2d[int],  # (view, instance)
-    grasp_pixel: wp.array2d[wp.vec2i],  # (world, instance) [px]
-    target: wp.array[int],  # (world)
-    # Out:
-    normal_out: wp.array[wp.vec3],  # (world)
 ):
     """Smoothed surface normal of each target: n = Σ n_p over pixels p of its largest component, within `window` of its grasp pixel.
 
@@ -73,10 +73,10 @@ def smooth_normal_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    if world < 0 or target[world] < 0:
+    if world < 0 or plan_inout.target[world] < 0:
         return
-    instance = target[world]
-    p = grasp_pixel[world, instance]
+    instance = plan_inout.target[world]
+    p = observation.grasp_pixel[world, instance]
     total = wp.vec3(0.0, 0.0, 0.0)
     for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
         for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
@@ -87,24 +87,11 @@ def smooth_normal_kernel(
                 # Only the normal is used; the pixel width (0) affects texture filtering alone.
                 surface = interpolate_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
                 total += surface.normal
-    normal_out[world] = total
+    plan_inout.normal[world] = total
 
 
 @wp.kernel
-def frame_grasp_kernel(
-    # Scene:
-    pick: PickData,
-    # In:
-    gbuffer: GBuffer,
-    views: Views,
-    grasp_pixel: wp.array2d[wp.vec2i],  # (world, instance) [px]
-    target: wp.array[int],  # (world)
-    # Out:
-    normal_inout: wp.array[wp.vec3],  # (world)
-    point_out: wp.array[wp.vec3],  # (world) [m]
-    yaw_out: wp.array[float],  # (world) [rad]
-    tilt_out: wp.array[float],  # (world) [rad]
-):
+def frame_grasp_kernel(pick: PickData, plan_inout: Plans, observation: Observations, gbuffer: GBuffer, views: Views):
     """Grasp pose of each target: point c + Rᵀ (d · ray) with planar depth d of the grasp pixel; unit normal within the tilt limit; yaw,
     tilt.
 
@@ -112,14 +99,14 @@ def frame_grasp_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    if world < 0 or target[world] < 0:
+    if world < 0 or plan_inout.target[world] < 0:
         return
-    p = grasp_pixel[world, target[world]]
+    p = observation.grasp_pixel[world, plan_inout.target[world]]
     ray = camera_ray(views.cameras, view, p[1], p[0], wp.vec2(0.0, 0.0)) * gbuffer.depth[view, p[1], p[0]]
     position = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
-    point_out[world] = wp.vec3(views.cameras.center[view] + wp.transpose(views.cameras.rotation[view]) * position)
-    normal = limit_normal(normal_inout[world], pick.tilt_limit)
+    plan_inout.point[world] = wp.vec3(views.cameras.center[view] + wp.transpose(views.cameras.rotation[view]) * position)
+    normal = limit_normal(plan_inout.normal[world], pick.tilt_limit)
     angles = gripper_angles(normal)
-    normal_inout[world] = normal
-    yaw_out[world] = angles[0]
-    tilt_out[world] = angles[1]
+    plan_inout.normal[world] = normal
+    plan_inout.yaw[world] = angles[0]
+    plan_inout.tilt[world] = angles[1]

@@ -4,6 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
+from synpick_warp.kernels.state import Observations, Worlds
 from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
 wp.set_module_options({"enable_backward": False})
@@ -84,12 +85,12 @@ def bound_contours_kernel(
     catalog: CatalogData,
     perception: PerceptionData,
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
+    state: Worlds,
+    observation: Observations,
     # In:
     views: Views,
     contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
     contour_length: wp.array2d[int],  # (view, instance)
-    depth: wp.array2d[float],  # (world, instance) [m]
     # Out:
     extent_out: wp.array2d[wp.vec4i],  # (view, instance) [px]
     reach_out: wp.array2d[float],  # (view, instance) [px]
@@ -104,9 +105,11 @@ def bound_contours_kernel(
     world = views.world[view]
     if world < 0:
         return
-    e = catalog_index[world, instance]
+    e = state.catalog_index[world, instance]
     if lane == 0 and e >= 0:
-        reach_out[view, instance] = perception.reach * catalog.diagonal[e] * views.cameras.intrinsics[view][0] / depth[world, instance]
+        reach_out[view, instance] = (
+            perception.reach * catalog.diagonal[e] * views.cameras.intrinsics[view][0] / observation.depth[world, instance]
+        )
     extent = wp.vec4i(NOWHERE, NOWHERE, NOWHERE, NOWHERE)
     length = contour_length[view, instance]
     for point in range(lane, length, CONTOUR_LANES):
@@ -121,6 +124,8 @@ def count_votes_kernel(
     # Scene:
     grid: ImageGrid,
     perception: PerceptionData,
+    # State:
+    observation: Observations,
     # In:
     gbuffer: GBuffer,
     views: Views,
@@ -128,7 +133,6 @@ def count_votes_kernel(
     largest: wp.array2d[int],  # (view, instance)
     contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
     contour_length: wp.array2d[int],  # (view, instance)
-    depth: wp.array2d[float],  # (world, instance) [m]
     extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
     reach: wp.array2d[float],  # (view, instance) [px]
     # Out:
@@ -157,7 +161,7 @@ def count_votes_kernel(
             d = gbuffer.depth[view, q[1], q[0]]
             if j >= 0 and j != instance and largest[view, j] >= 0 and d < gbuffer.depth[view, inside[1], inside[0]]:
                 if is_in_reach(q, reach[view, j], extent[view, j], contour, view, j, contour_length[view, j]):
-                    if d > depth[world, instance] + perception.deep_distance:
+                    if d > observation.depth[world, instance] + perception.deep_distance:
                         wp.atomic_add(count_out, view, instance, j, DEEP, 1)
                     else:
                         wp.atomic_add(count_out, view, instance, j, FULL, 1)
@@ -171,7 +175,7 @@ def weigh_votes_kernel(
     views: Views,
     count: wp.array4d[int],  # (view, instance, instance, kind)
     # Out:
-    votes_out: wp.array3d[float],  # (world, instance, instance)
+    observation_out: Observations,
 ):
     """Write the occlusion votes votes[i, j] = full + deep_weight · deep, that j lies above i, from the counts by kind. Launched over view,
     instance, instance.
@@ -181,4 +185,4 @@ def weigh_votes_kernel(
     if world < 0:
         return
     deep = float(count[view, instance, neighbour, DEEP])
-    votes_out[world, instance, neighbour] = float(count[view, instance, neighbour, FULL]) + perception.deep_weight * deep
+    observation_out.votes[world, instance, neighbour] = float(count[view, instance, neighbour, FULL]) + perception.deep_weight * deep

@@ -7,6 +7,7 @@ from synpick_warp.kernels.grasps import Grasps, PerturbationData, Perturbations
 from synpick_warp.kernels.perception.cup_alignment import HeadFrame, head_frame
 from synpick_warp.kernels.perception.grasp import gripper_angles, limit_normal
 from synpick_warp.kernels.rng import pixel_key, stream_key, uniform
+from synpick_warp.kernels.state import Attempts, Plans, Worlds
 from synpick_warp.kernels.structs import CupData, PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -51,15 +52,11 @@ def plan_trials_kernel(
     row: wp.array[int],  # (world)
     trial: wp.array[int],  # (world)
     grasps: Grasps,
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    attempt: wp.array[int],  # (world)
+    state: Worlds,
+    attempts: Attempts,
     # Out:
     perturbations_out: Perturbations,
-    target_out: wp.array[int],  # (world)
-    point_out: wp.array[wp.vec3],  # (world) [m]
-    normal_out: wp.array[wp.vec3],  # (world)
-    yaw_out: wp.array[float],  # (world) [rad]
-    tilt_out: wp.array[float],  # (world) [rad]
+    plan_out: Plans,
 ):
     """Write the plans of worlds that begin a trial (`row` is not -1): its grasp, perturbed unless it is the grasp's first trial (repeat 0).
 
@@ -79,7 +76,9 @@ def plan_trials_kernel(
     rotation = wp.vec3(0.0, 0.0, 0.0)
     friction = float(1.0)
     if repeat > 0:
-        key = pixel_key(stream_key(spread.seed, arrangement_id[world][0], arrangement_id[world][1], Stream.TRIALS), attempt[world])
+        key = pixel_key(
+            stream_key(spread.seed, state.arrangement_id[world][0], state.arrangement_id[world][1], Stream.TRIALS), attempts.attempt[world]
+        )
         key = pixel_key(key, grasps.candidate[grasp])
         offset = symmetric_vector(key, SAMPLES * repeat, spread.offset)
         rotation = symmetric_vector(key, SAMPLES * repeat + 3, spread.angle)
@@ -89,8 +88,8 @@ def plan_trials_kernel(
     perturbations_out.offset[trial[world]] = offset
     perturbations_out.rotation[trial[world]] = rotation
     perturbations_out.friction[trial[world]] = friction
-    target_out[world] = grasps.target[grasp]
-    point_out[world] = point
-    normal_out[world] = frame.axis
-    yaw_out[world] = frame.yaw
-    tilt_out[world] = frame.tilt
+    plan_out.target[world] = grasps.target[grasp]
+    plan_out.point[world] = point
+    plan_out.normal[world] = frame.axis
+    plan_out.yaw[world] = frame.yaw
+    plan_out.tilt[world] = frame.tilt

@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.codes import Mode, Outcome, Stream
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.rng import stream_key, uniform_index
+from synpick_warp.kernels.state import Attempts, Observations, Plans, Worlds
 from synpick_warp.kernels.structs import PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -31,28 +32,21 @@ def sample_visible(visible: wp.array2d[int], world: int, key: wp.uint64, index: 
 
 
 @wp.func
-def rank_visible(
-    visible: wp.array2d[int],
-    visible_fraction: wp.array2d[float],
-    ancestors: wp.array3d[wp.uint32],
-    target_failures: wp.array2d[int],
-    world: int,
-    sign: float,
-) -> int:
+def rank_visible(observation: Observations, target_failures: wp.array2d[int], world: int, sign: float) -> int:
     """Visible instance with the smallest sign · (number of ancestors) + failures, then the largest sign · fraction, then the smallest
     index; or -1. A failed attempt weighs as one more object above, one since the last success more than all objects.
     """
     chosen = int(-1)
     least = float(0.0)
     largest = float(0.0)
-    for i in range(visible.shape[1]):
-        if visible[world, i] > 0:
+    for i in range(observation.visible.shape[1]):
+        if observation.visible[world, i] > 0:
             members = int(0)
-            for word in range(ancestors.shape[2]):
-                members += int(wp.bit_count(ancestors[world, i, word]))
+            for word in range(observation.ancestors.shape[2]):
+                members += int(wp.bit_count(observation.ancestors[world, i, word]))
             # Whole numbers, which are exact in single precision.
             count = sign * float(members) + float(target_failures[world, i])
-            fraction = sign * visible_fraction[world, i]
+            fraction = sign * observation.visible_fraction[world, i]
             if chosen < 0 or count < least or (count == least and fraction > largest):
                 chosen = i
                 least = count
@@ -62,22 +56,7 @@ def rank_visible(
 
 @wp.kernel
 def choose_target_kernel(
-    # Scene:
-    seed: wp.uint64,
-    pick: PickData,
-    # State: worlds, attempts
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    mode: wp.array[int],  # (world)
-    attempt: wp.array[int],  # (world)
-    outcome: wp.array[int],  # (world)
-    target_failures: wp.array2d[int],  # (world, instance)
-    # In:
-    views: Views,
-    visible: wp.array2d[int],  # (world, instance) [px]
-    visible_fraction: wp.array2d[float],  # (world, instance)
-    ancestors: wp.array3d[wp.uint32],  # (world, instance, word)
-    # Out:
-    target_out: wp.array[int],  # (world)
+    seed: wp.uint64, pick: PickData, state: Worlds, attempts: Attempts, observation: Observations, views: Views, plan_out: Plans
 ):
     """Choose a target: the visible instance with the fewest ancestors, ties by the largest visible fraction; -1: none is visible.
 
@@ -90,11 +69,11 @@ def choose_target_kernel(
     if world < 0:
         return
     chosen = int(-1)
-    if mode[world] != Mode.TARGET:
-        chosen = rank_visible(visible, visible_fraction, ancestors, target_failures, world, 1.0)
-    elif pick.random_after_failure != 0 and outcome[world] >= Outcome.DROPPED:
-        key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.TARGETS)
-        chosen = sample_visible(visible, world, key, attempt[world] + 1)
+    if state.mode[world] != Mode.TARGET:
+        chosen = rank_visible(observation, attempts.target_failures, world, 1.0)
+    elif pick.random_after_failure != 0 and attempts.outcome[world] >= Outcome.DROPPED:
+        key = stream_key(seed, state.arrangement_id[world][0], state.arrangement_id[world][1], Stream.TARGETS)
+        chosen = sample_visible(observation.visible, world, key, attempts.attempt[world] + 1)
     else:
-        chosen = rank_visible(visible, visible_fraction, ancestors, target_failures, world, -1.0)
-    target_out[world] = chosen
+        chosen = rank_visible(observation, attempts.target_failures, world, -1.0)
+    plan_out.target[world] = chosen

@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
+from synpick_warp.kernels.state import Attempts, Worlds
 
 wp.set_module_options({"enable_backward": False})
 
@@ -12,8 +13,8 @@ def list_worlds_kernel(
     # Scene:
     worlds: int,
     # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
+    state: Worlds,
+    attempts: Attempts,
     # Out:
     worklist_out: wp.array[int],  # (world)
     length_out: wp.array[int],  # (one)
@@ -26,7 +27,7 @@ def list_worlds_kernel(
     """
     count = int(0)
     for world in range(worlds):
-        if phase[world] == Phase.ACT and task[world] == Task.LOOK:
+        if state.phase[world] == Phase.ACT and attempts.task[world] == Task.LOOK:
             worklist_out[count] = world
             count += 1
     length_out[0] = count

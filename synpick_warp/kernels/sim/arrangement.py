@@ -6,6 +6,7 @@ from synpick_warp.codes import Ending, Look, LookKind, LookPart, Mode, Phase, St
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index
 from synpick_warp.kernels.sim.endings import delivers
+from synpick_warp.kernels.state import Worlds
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, ModeData
 
 wp.set_module_options({"enable_backward": False})
@@ -22,10 +23,7 @@ def assign_episodes_kernel(
     episodes: wp.array[int],  # (episode)
     tries: int,
     # State:
-    arrangement_id_inout: wp.array[wp.vec2i],  # (world)
-    phase_inout: wp.array[int],  # (world)
-    ending_inout: wp.array[int],  # (world)
-    next_episode_inout: wp.array[int],  # (one)
+    state_inout: Worlds,
 ):
     """Assign episodes to free worlds in order: the next of `episodes`, or the same one again if its arrangement is to be resampled.
 
@@ -33,38 +31,35 @@ def assign_episodes_kernel(
     `tries` - 1; -1, 0 stands for no episode. Phases become START or IDLE. A single thread (dim 1) loops over the worlds, so that
     worlds receive episodes in order.
     """
-    following = next_episode_inout[0]
+    following = state_inout.next_episode[0]
     for world in range(worlds):
-        phase = phase_inout[world]
-        episode = arrangement_id_inout[world][0]
-        arrangement = arrangement_id_inout[world][1]
-        resample = phase == Phase.OVER and not delivers(ending_inout[world]) and arrangement + 1 < tries
+        phase = state_inout.phase[world]
+        episode = state_inout.arrangement_id[world][0]
+        arrangement = state_inout.arrangement_id[world][1]
+        resample = phase == Phase.OVER and not delivers(state_inout.ending[world]) and arrangement + 1 < tries
         if resample:
-            arrangement_id_inout[world] = wp.vec2i(episode, arrangement + 1)
-            phase_inout[world] = Phase.START
+            state_inout.arrangement_id[world] = wp.vec2i(episode, arrangement + 1)
+            state_inout.phase[world] = Phase.START
         elif phase == Phase.OVER or phase == Phase.EMPTY:
             if following < episodes.shape[0]:
-                arrangement_id_inout[world] = wp.vec2i(episodes[following], 0)
-                phase_inout[world] = Phase.START
+                state_inout.arrangement_id[world] = wp.vec2i(episodes[following], 0)
+                state_inout.phase[world] = Phase.START
                 following += 1
             else:
-                arrangement_id_inout[world] = wp.vec2i(-1, 0)
-                phase_inout[world] = Phase.IDLE
+                state_inout.arrangement_id[world] = wp.vec2i(-1, 0)
+                state_inout.phase[world] = Phase.IDLE
         if phase == Phase.OVER or phase == Phase.EMPTY:
-            ending_inout[world] = Ending.RUNNING
-    next_episode_inout[0] = following
+            state_inout.ending[world] = Ending.RUNNING
+    state_inout.next_episode[0] = following
 
 
 @wp.kernel
-def free_idle_worlds_kernel(
-    # State:
-    phase_inout: wp.array[int],  # (world)
-):
+def free_idle_worlds_kernel(state_inout: Worlds):
     """Free the worlds that are idle: their phases become EMPTY, so that `assign_episodes_kernel` assigns episodes to them. Launched over
     world."""
     world = wp.tid()
-    if phase_inout[world] == Phase.IDLE:
-        phase_inout[world] = Phase.EMPTY
+    if state_inout.phase[world] == Phase.IDLE:
+        state_inout.phase[world] = Phase.EMPTY
 
 
 @wp.kernel
@@ -73,10 +68,7 @@ def sample_modes_kernel(
     seed: wp.uint64,
     modes: wp.array[ModeData],  # (split)
     # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    phase: wp.array[int],  # (world)
-    # Out:
-    mode_out: wp.array[int],  # (world)
+    state_inout: Worlds,
 ):
     """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
 
@@ -85,9 +77,9 @@ def sample_modes_kernel(
     the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.START:
+    if state_inout.phase[world] != Phase.START:
         return
-    episode = arrangement_id[world][0]
+    episode = state_inout.arrangement_id[world][0]
     split = int(0)
     for index in range(1, modes.shape[0]):
         if episode >= modes[index].first:
@@ -97,11 +89,11 @@ def sample_modes_kernel(
     if mode.cycle > 0:
         u = (float((episode - mode.first) % mode.cycle) + 0.5) / float(mode.cycle)
     if u < mode.pick_share:
-        mode_out[world] = Mode.PICK
+        state_inout.mode[world] = Mode.PICK
     elif u < mode.pick_or_target_share:
-        mode_out[world] = Mode.TARGET
+        state_inout.mode[world] = Mode.TARGET
     else:
-        mode_out[world] = Mode.MOVE
+        state_inout.mode[world] = Mode.MOVE
 
 
 @wp.func
@@ -129,25 +121,17 @@ def fits_budget(total: float, volume: float, drop: DropData) -> bool:
 
 
 @wp.func
-def assign_slots(
-    layout: LayoutData,
-    catalog: CatalogData,
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    world: int,
-    first: int,
-    count: int,
-) -> bool:
+def assign_slots(layout: LayoutData, catalog: CatalogData, state: Worlds, world: int, first: int, count: int) -> bool:
     """Assign the next free body slot of its class to each instance from `first` to before `count`; False: some have none."""
     singles = int(0)
     compounds = int(0)
     for instance in range(count):
-        compound = catalog.compound[catalog_index[world, instance]]
+        compound = catalog.compound[state.catalog_index[world, instance]]
         if instance >= first:
             slot = singles
             if compound == 1:
                 slot = layout.single_slots + compounds
-            body_slot[world, instance] = slot
+            state.body_slot[world, instance] = slot
         compounds += compound
         singles += 1 - compound
     return singles <= layout.single_slots and compounds <= layout.slots - layout.single_slots
@@ -176,21 +160,7 @@ def draw_counted(catalog: CatalogData, key: wp.uint64, catalog_index: wp.array2d
 
 
 @wp.kernel
-def sample_objects_kernel(
-    # Scene:
-    seed: wp.uint64,
-    layout: LayoutData,
-    catalog: CatalogData,
-    drop: DropData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    mode: wp.array[int],  # (world)
-    phase_inout: wp.array[int],  # (world)
-    ending_inout: wp.array[int],  # (world)
-    # Out:
-    catalog_index_out: wp.array2d[int],  # (world, instance)
-    body_slot_out: wp.array2d[int],  # (world, instance)
-):
+def sample_objects_kernel(seed: wp.uint64, layout: LayoutData, catalog: CatalogData, drop: DropData, state_inout: Worlds):
     """Sample objects up to a volume budget V: with `exceed` until Σ volume ≥ V, else while Σ volume ≤ V. Launched over world.
 
     An object larger than V is resampled; without `exceed`, after the first one, it ends the draw. Where numbers of objects are set, these
@@ -198,37 +168,37 @@ def sample_objects_kernel(
     episode ends (ARRANGEMENT_OVERFLOW).
     """
     world = wp.tid()
-    phase = phase_inout[world]
+    phase = state_inout.phase[world]
     if phase != Phase.START and phase != Phase.IDLE:
         return
-    clear_catalog_indices(catalog_index_out, world, layout.instances)
+    clear_catalog_indices(state_inout.catalog_index, world, layout.instances)
     if phase == Phase.IDLE:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.OBJECTS)
-    repeats = wp.where(mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.OBJECTS)
+    repeats = wp.where(state_inout.mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
     total = float(0.0)
     open = catalog.counted == 0
     if not open:
-        count = draw_counted(catalog, key, catalog_index_out, world)
+        count = draw_counted(catalog, key, state_inout.catalog_index, world)
     for sample in range(MAX_SAMPLES):
         if open:
             candidate = uniform_index(key, sample, catalog.count)
-            repeated = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
+            repeated = repeats == 0 and is_sampled(state_inout.catalog_index, world, count, candidate)
             fits = fits_budget(total, catalog.volume[candidate], drop)
             if drop.exceed == 0 and not repeated and not fits and count > 0:
                 open = False
             if not repeated and fits:
-                catalog_index_out[world, count] = candidate
+                state_inout.catalog_index[world, count] = candidate
                 total += catalog.volume[candidate]
                 count += 1
             full = count == drop.objects or (repeats == 0 and count == catalog.count)
             if full or (drop.exceed == 1 and total >= drop.volume):
                 open = False
-    if not assign_slots(layout, catalog, catalog_index_out, body_slot_out, world, 0, count):
-        clear_catalog_indices(catalog_index_out, world, layout.instances)
-        ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
-        phase_inout[world] = Phase.OVER
+    if not assign_slots(layout, catalog, state_inout, world, 0, count):
+        clear_catalog_indices(state_inout.catalog_index, world, layout.instances)
+        state_inout.ending[world] = Ending.ARRANGEMENT_OVERFLOW
+        state_inout.phase[world] = Phase.OVER
 
 
 @wp.func
@@ -241,93 +211,58 @@ def count_instances(catalog_index: wp.array2d[int], world: int, instances: int) 
 
 
 @wp.kernel
-def sample_distractors_kernel(
-    # Scene:
-    seed: wp.uint64,
-    layout: LayoutData,
-    catalog: CatalogData,
-    looks: LookTable,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    phase_inout: wp.array[int],  # (world)
-    ending_inout: wp.array[int],  # (world)
-    # Out:
-    catalog_index_inout: wp.array2d[int],  # (world, instance)
-    body_slot_inout: wp.array2d[int],  # (world, instance)
-):
+def sample_distractors_kernel(seed: wp.uint64, layout: LayoutData, catalog: CatalogData, looks: LookTable, state_inout: Worlds):
     """Sample distractors, objects without labels, into the instances behind the sampled objects, and the next free slots.
 
     Their number n is drawn from the stream (seed, episode, arrangement, Stream.DISTRACTORS), then each uniformly, with repeats. Without a
     free slot the episode ends (ARRANGEMENT_OVERFLOW). Launched over world.
     """
     world = wp.tid()
-    if phase_inout[world] != Phase.START:
+    if state_inout.phase[world] != Phase.START:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.DISTRACTORS)
     wanted = int(wp.rint(draw_look(looks, key, LookPart.EPISODE, Look.COUNT)[0]))
-    first = count_instances(catalog_index_inout, world, layout.instances)
+    first = count_instances(state_inout.catalog_index, world, layout.instances)
     choices = pixel_key(key, 0)
     count = wp.min(first + wanted, layout.instances)
     for instance in range(first, count):
-        catalog_index_inout[world, instance] = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
-    if not assign_slots(layout, catalog, catalog_index_inout, body_slot_inout, world, first, count):
-        clear_catalog_indices(catalog_index_inout, world, layout.instances)
-        ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
-        phase_inout[world] = Phase.OVER
+        state_inout.catalog_index[world, instance] = catalog.count + uniform_index(choices, instance - first, catalog.distractors)
+    if not assign_slots(layout, catalog, state_inout, world, first, count):
+        clear_catalog_indices(state_inout.catalog_index, world, layout.instances)
+        state_inout.ending[world] = Ending.ARRANGEMENT_OVERFLOW
+        state_inout.phase[world] = Phase.OVER
 
 
 @wp.kernel
-def sample_lights_kernel(
-    # Scene:
-    seed: wp.uint64,
-    drop: DropData,
-    looks: LookTable,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    phase: wp.array[int],  # (world)
-    # Out:
-    light_out: wp.array[int],  # (world)
-    light_yaw_out: wp.array[float],  # (world) [rad]
-    light_exposure_out: wp.array[float],  # (world) [EV]
-):
+def sample_lights_kernel(seed: wp.uint64, drop: DropData, looks: LookTable, state_inout: Worlds):
     """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1 or, without `random_yaw`, 0,
     exposure = s (2 u_2 - 1) for a spread s; but with a distribution of its own, exposure is a look of the episode. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.START:
+    if state_inout.phase[world] != Phase.START:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.LIGHT)
-    light_out[world] = uniform_index(key, 0, drop.lights)
-    light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.random_yaw)
-    light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.LIGHT)
+    state_inout.light[world] = uniform_index(key, 0, drop.lights)
+    state_inout.light_yaw[world] = TAU * uniform(key, 1) * float(drop.random_yaw)
+    state_inout.light_exposure[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
     if looks.distribution[LookPart.EPISODE, Look.EXPOSURE].kind != LookKind.OFF:
-        own = look_key(seed, arrangement_id[world][0], LookPart.EPISODE, 0)
-        light_exposure_out[world] = draw_look(looks, own, LookPart.EPISODE, Look.EXPOSURE)[0]
+        own = look_key(seed, state_inout.arrangement_id[world][0], LookPart.EPISODE, 0)
+        state_inout.light_exposure[world] = draw_look(looks, own, LookPart.EPISODE, Look.EXPOSURE)[0]
 
 
 @wp.kernel
-def sample_bins_kernel(
-    # Scene:
-    seed: wp.uint64,
-    bins: BinData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    phase: wp.array[int],  # (world)
-    # Out:
-    bin_out: wp.array[int],  # (world)
-    bin_pose_out: wp.array[wp.transform],  # (world) [m]
-):
+def sample_bins_kernel(seed: wp.uint64, bins: BinData, state_inout: Worlds):
     """Sample the bin of starting episodes and its pose.
 
     With the samples u_i of the stream (seed, episode, arrangement, Stream.BIN): the first bin whose share exceeds u_0, offset
     from its place s (2 u_1 - 1), s (2 u_2 - 1) for half widths s, yaw = ψ + a (2 u_3 - 1) for its turn ψ. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.START:
+    if state_inout.phase[world] != Phase.START:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.BIN)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.BIN)
     chosen = int(0)
     while chosen < bins.count - 1 and uniform(key, 0) >= bins.share[chosen]:
         chosen += 1
@@ -336,8 +271,8 @@ def sample_bins_kernel(
     y = 2.0 * bins.shift[1] * uniform(key, 2) - bins.shift[1]
     origin = bins.origin[chosen]
     angle = bins.turn[chosen] + (2.0 * bins.yaw * uniform(key, 3) - bins.yaw)
-    bin_out[world] = chosen
-    bin_pose_out[world] = wp.transform(origin + wp.vec3(x, y, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
+    state_inout.bin[world] = chosen
+    state_inout.bin_pose[world] = wp.transform(origin + wp.vec3(x, y, 0.0), wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle))
 
 
 @wp.kernel

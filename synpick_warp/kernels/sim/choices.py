@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
+from synpick_warp.kernels.state import Attempts, Worlds
 from synpick_warp.kernels.structs import CatalogData
 
 wp.set_module_options({"enable_backward": False})
@@ -14,11 +15,8 @@ def list_choices_kernel(
     catalog: CatalogData,
     states: int,
     # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    attempt: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
+    state: Worlds,
+    attempts: Attempts,
     # Out:
     stride_inout: wp.array[int],  # (world)
     next_inout: wp.array[int],  # (one)
@@ -32,16 +30,16 @@ def list_choices_kernel(
     rows = world_out.shape[0]
     for row in range(rows):
         world_out[row] = -1
-    for world in range(phase.shape[0]):
-        is_planned = task[world] == Task.APPROACH
-        if phase[world] == Phase.ACT and steps[world] == 0 and (is_planned or task[world] == Task.LOOK):
-            if attempt[world] == 0:
+    for world in range(state.phase.shape[0]):
+        is_planned = attempts.task[world] == Task.APPROACH
+        if state.phase[world] == Phase.ACT and attempts.steps[world] == 0 and (is_planned or attempts.task[world] == Task.LOOK):
+            if attempts.attempt[world] == 0:
                 objects = int(0)
-                for instance in range(catalog_index.shape[1]):
-                    if catalog_index[world, instance] >= 0 and catalog_index[world, instance] < catalog.count:
+                for instance in range(state.catalog_index.shape[1]):
+                    if state.catalog_index[world, instance] >= 0 and state.catalog_index[world, instance] < catalog.count:
                         objects += 1
                 stride_inout[world] = (objects + states - 1) // states
             stride = wp.max(stride_inout[world], 1)
-            if is_planned and attempt[world] % stride == 0 and attempt[world] // stride < states:
+            if is_planned and attempts.attempt[world] % stride == 0 and attempts.attempt[world] // stride < states:
                 world_out[next_inout[0] % rows] = world
                 next_inout[0] = next_inout[0] + 1

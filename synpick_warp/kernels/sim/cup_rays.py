@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.bitsets import pack_word
 from synpick_warp.kernels.rng import TAU
+from synpick_warp.kernels.state import Attempts, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import CupData, LayoutData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -96,9 +97,9 @@ def cast_ray(start: wp.vec3, direction: wp.vec3, reach: float, pose: wp.transfor
 
 
 @wp.func
-def suction_begins(phase: int, task: int, steps: int, pick: PickData) -> bool:
+def suction_begins(state: Worlds, attempts: Attempts, world: int, pick: PickData) -> bool:
     """True at the end of the last tick of task PRESS, when suction is switched on."""
-    return phase == Phase.ACT and task == Task.PRESS and steps >= pick.press_steps
+    return state.phase[world] == Phase.ACT and attempts.task[world] == Task.PRESS and attempts.steps[world] >= pick.press_steps
 
 
 @wp.func
@@ -108,53 +109,48 @@ def has_bit(bits: int, index: int) -> bool:
 
 
 @wp.func
-def first_instance(
+def first_hit(
     start: wp.vec3,
     direction: wp.vec3,
+    reach: float,
+    depth: float,
     layout: LayoutData,
-    suction: SuctionData,
     surface: SurfaceData,
     world: int,
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-) -> int:
-    """Instance that a ray hits first within reach, the first of several at the same distance; -1: none."""
+    state: Worlds,
+    motion: Motion,
+):
+    """Distance to the first object along a ray [m] and its instance, the first of several at the same distance; -1: none.
+
+    The ray is as long as `reach` [m], and longer by `depth` radii of the object's bounding sphere.
+    """
     nearest = float(MISS)
     hit = int(-1)
     for instance in range(layout.instances):
-        index = catalog_index[world, instance]
+        index = state.catalog_index[world, instance]
         if index >= 0:
-            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
-            # Bounding-sphere test: no point of the ray is farther from its start than its reach.
-            if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
-                distance = cast_ray(start, direction, suction.reach, pose, index, surface)
-                if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
+            pose = motion.body_q[world * layout.bodies + layout.gripper_bodies + state.body_slot[world, instance]]
+            length = reach + depth * surface.radius[index]
+            # Bounding-sphere test: no point of the ray is farther from its start than its length.
+            if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + length:
+                distance = cast_ray(start, direction, length, pose, index, surface)
+                if distance >= 0.0 and (hit < 0 or distance < nearest):
                     nearest = distance
                     hit = instance
-    return hit
+    return nearest, hit
 
 
 @wp.kernel
 def count_seal_rays_kernel(
-    # Scene:
     layout: LayoutData,
     pick: PickData,
     suction: SuctionData,
     cups: CupData,
     surface: SurfaceData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    # Out:
-    hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
-    attached_inout: wp.array2d[int],  # (world, instance)
-    break_force_out: wp.array2d[float],  # (world, cup) [N]
+    state: Worlds,
+    attempts_inout: Attempts,
+    motion: Motion,
+    seals_inout: Seals,
 ):
     """Cast the suction rays where suction is switched on: `hits` receives the number of rays that hit and the cups with a good seal as
     bits, `engaged_words` the bit set of the instances that are hit, `attached` bit k for every cup k of which a ray hits the instance.
@@ -164,63 +160,49 @@ def count_seal_rays_kernel(
     most `tolerated_misses` of the cup's rays miss; with a common valve, if that holds for every cup. Launched over world.
     """
     world = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick):
+    if not suction_begins(state, attempts_inout, world, pick):
         return
     body = world * layout.bodies
     total = int(0)
     sealed = int(0)
     for instance in range(layout.instances):
-        attached_inout[world, instance] = 0
-    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
+        seals_inout.attached[world, instance] = 0
+    tcp_in_world = tcp_pose(motion.body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
     direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
     for cup in range(cups.count):
         place = cups.place[cup]
         hits = int(0)
         for ray in range(suction.rays):
             start = wp.transform_point(tcp_in_world, ray_start(ray, suction) + wp.vec3(place[0], place[1], 0.0))
-            hit = first_instance(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
+            _, hit = first_hit(start, direction, suction.reach, 0.0, layout, surface, world, state, motion)
             if hit >= 0:
                 hits += 1
-                attached_inout[world, hit] = attached_inout[world, hit] | (1 << cup)
+                seals_inout.attached[world, hit] = seals_inout.attached[world, hit] | (1 << cup)
         total += hits
         if suction.rays - hits <= suction.tolerated_misses:
             sealed = sealed | (1 << cup)
     if cups.common_valve != 0 and sealed != (1 << cups.count) - 1:
         sealed = 0
     for cup in range(cups.count):
-        break_force_out[world, cup] = wp.where(has_bit(sealed, cup), suction.good_force, suction.poor_force)
-    hits_out[world] = wp.vec2i(total, sealed)
-    for word in range(engaged_words_out.shape[1]):
-        engaged_words_out[world, word] = pack_word(attached_inout, catalog_index, world, word)
+        seals_inout.break_force[world, cup] = wp.where(has_bit(sealed, cup), suction.good_force, suction.poor_force)
+    attempts_inout.hits[world] = wp.vec2i(total, sealed)
+    for word in range(attempts_inout.engaged_words.shape[1]):
+        attempts_inout.engaged_words[world, word] = pack_word(seals_inout.attached, state.catalog_index, world, word)
 
 
 @wp.kernel
 def engage_seals_kernel(
-    # Scene:
-    layout: LayoutData,
-    pick: PickData,
-    suction: SuctionData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    # In:
-    attached: wp.array2d[int],  # (world, instance)
-    # Out:
-    object_in_tcp_out: wp.array2d[wp.transform],  # (world, instance) [m]
-    seal_force_out: wp.array2d[float],  # (world, instance) [N]
+    layout: LayoutData, pick: PickData, suction: SuctionData, state: Worlds, attempts: Attempts, motion: Motion, seals_inout: Seals
 ):
     """Store the pose of every attached object where suction is switched on: object_in_tcp = tcp_in_world⁻¹ object_in_world.
 
     Seal forces begin at 0. Launched over world, instance.
     """
     world, instance = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick) or attached[world, instance] == 0:
+    if not suction_begins(state, attempts, world, pick) or seals_inout.attached[world, instance] == 0:
         return
     body = world * layout.bodies
-    tcp_in_world = tcp_pose(body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
-    object_in_world = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-    object_in_tcp_out[world, instance] = wp.transform_inverse(tcp_in_world) * object_in_world
-    seal_force_out[world, instance] = 0.0
+    tcp_in_world = tcp_pose(motion.body_q[body + CUP], wp.vec3(0.0, 0.0, -suction.tcp_offset))
+    object_in_world = motion.body_q[body + layout.gripper_bodies + state.body_slot[world, instance]]
+    seals_inout.object_in_tcp[world, instance] = wp.transform_inverse(tcp_in_world) * object_in_world
+    seals_inout.seal_force[world, instance] = 0.0

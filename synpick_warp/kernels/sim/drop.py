@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.codes import Phase, Stream
 from synpick_warp.kernels.rng import TAU, pixel_key, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.sim.arrangement import count_instances
+from synpick_warp.kernels.state import Control, Motion, Worlds
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -41,20 +42,13 @@ def drop_pose(
 
 
 @wp.func
-def top_of_objects(
-    layout: LayoutData,
-    catalog: CatalogData,
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    world: int,
-) -> float:
+def top_of_objects(layout: LayoutData, catalog: CatalogData, state: Worlds, body_q: wp.array[wp.transform], world: int) -> float:
     """Height up to which bounding spheres of a world's objects reach in the world [m]; PARKED_HEIGHT without objects."""
     result = float(PARKED_HEIGHT)
     for instance in range(layout.instances):
-        index = catalog_index[world, instance]
+        index = state.catalog_index[world, instance]
         if index >= 0:
-            body = world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]
+            body = world * layout.bodies + layout.gripper_bodies + state.body_slot[world, instance]
             result = wp.max(result, wp.transform_get_translation(body_q[body])[2] + catalog.radius[index])
     return result
 
@@ -108,20 +102,7 @@ def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int
 
 @wp.kernel
 def reset_worlds_kernel(
-    # Scene:
-    layout: LayoutData,
-    catalog: CatalogData,
-    drop: DropData,
-    # State:
-    phase: wp.array[int],  # (world)
-    # Out:
-    variant_out: wp.array[int],  # (body)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
-    restarted_out: wp.array[wp.bool],  # (world_and_global)
-    progress_out: wp.array[wp.vec4i],  # (world) [ticks]
-    stuck_out: wp.array2d[int],  # (world, instance) [ticks]
+    layout: LayoutData, catalog: CatalogData, drop: DropData, state_inout: Worlds, motion_out: Motion, control_out: Control
 ):
     """Reset worlds in the phases START, IDLE and OVER: all body slots empty and parked, the gripper at home.
 
@@ -129,54 +110,46 @@ def reset_worlds_kernel(
     each parked body cancels its weight. Launched over world.
     """
     world = wp.tid()
-    fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
-    restarted_out[world] = fresh
+    fresh = state_inout.phase[world] == Phase.START or state_inout.phase[world] == Phase.IDLE or state_inout.phase[world] == Phase.OVER
+    state_inout.restarted[world] = fresh
     body = world * layout.bodies + layout.gripper_bodies
     for slot in range(layout.slots):
-        variant_out[body + slot] = -1
+        state_inout.variant[body + slot] = -1
     if not fresh:
         return
     # Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand.
-    progress_out[world] = wp.vec4i(0, 0, 0, 1)
+    state_inout.progress[world] = wp.vec4i(0, 0, 0, 1)
     for instance in range(layout.instances):
-        stuck_out[world, instance] = 0
+        state_inout.stuck[world, instance] = 0
     q = world * layout.coords
     qd = world * layout.dofs
     for axis in range(layout.gripper_dofs):
-        joint_q_out[q + axis] = 0.0
-        joint_qd_out[qd + axis] = 0.0
+        motion_out.joint_q[q + axis] = 0.0
+        motion_out.joint_qd[qd + axis] = 0.0
     for axis in range(3):
-        joint_q_out[q + axis] = drop.gripper_home[axis]
+        motion_out.joint_q[q + axis] = drop.gripper_home[axis]
     parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
     for slot in range(layout.slots):
-        variant_out[body + slot] = catalog.empty_single
+        state_inout.variant[body + slot] = catalog.empty_single
         if slot >= layout.single_slots:
-            variant_out[body + slot] = catalog.empty_compound
+            state_inout.variant[body + slot] = catalog.empty_compound
         first = qd + layout.gripper_dofs + 6 * slot
-        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * slot, first, parked)
+        write_body(motion_out.joint_q, motion_out.joint_qd, q + layout.gripper_dofs + 7 * slot, first, parked)
         for axis in range(6):
-            joint_f_out[first + axis] = 0.0
-        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
+            control_out.joint_f[first + axis] = 0.0
+        control_out.joint_f[first + 2] = catalog.empty_mass * drop.gravity
 
 
 @wp.kernel
 def drop_objects_kernel(
-    # Scene:
     seed: wp.uint64,
     layout: LayoutData,
     catalog: CatalogData,
     drop: DropData,
     bins: BinData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    phase_inout: wp.array[int],  # (world)
-    # Out:
-    variant_out: wp.array[int],  # (body)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
+    state_inout: Worlds,
+    motion_out: Motion,
+    control_out: Control,
 ):
     """Assign objects to their body slots and stack them above the bin, at rest; phase becomes SETTLE. Launched over world.
 
@@ -186,23 +159,23 @@ def drop_objects_kernel(
     on from the last to the first, so that they lie anywhere in the pile.
     """
     world = wp.tid()
-    if phase_inout[world] != Phase.START:
+    if state_inout.phase[world] != Phase.START:
         return
     body = world * layout.bodies + layout.gripper_bodies
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
-    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.DROP)
+    places = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.COMPARTMENT)
     height = bins.rim_height[bins.chosen[world]]
-    count = count_instances(catalog_index, world, layout.instances)
-    pitch = 2.0 * largest_radius(catalog, catalog_index, world, count) + drop.clearance
+    count = count_instances(state_inout.catalog_index, world, layout.instances)
+    pitch = 2.0 * largest_radius(catalog, state_inout.catalog_index, world, count) + drop.clearance
     first = int(0)
     if catalog.distractors > 0 and count > 0:
-        order = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DISTRACTORS)
+        order = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.DISTRACTORS)
         first = uniform_index(pixel_key(order, 1), 0, count)
     for place in range(count):
         instance = (first + place) % count
-        index = catalog_index[world, instance]
-        slot = body_slot[world, instance]
-        variant_out[body + slot] = catalog.variant[index]
+        index = state_inout.catalog_index[world, instance]
+        slot = state_inout.body_slot[world, instance]
+        state_inout.variant[body + slot] = catalog.variant[index]
         q = world * layout.coords + layout.gripper_dofs + 7 * slot
         qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
         radius = catalog.radius[index]
@@ -216,10 +189,10 @@ def drop_objects_kernel(
             half = cell
             bottom = bins.rim_height[bins.chosen[world]] + float(layer) * pitch
         pose = drop_pose(key, instance, radius, bottom + radius, drop.spread, bins, world, center, half)
-        write_body(joint_q_out, joint_qd_out, q, qd, pose)
-        joint_f_out[qd + 2] = 0.0
+        write_body(motion_out.joint_q, motion_out.joint_qd, q, qd, pose)
+        control_out.joint_f[qd + 2] = 0.0
         height += 2.0 * radius + drop.clearance
-    phase_inout[world] = Phase.SETTLE
+    state_inout.phase[world] = Phase.SETTLE
 
 
 @wp.func
@@ -229,35 +202,22 @@ def stands(key: wp.uint64, instance: int, upright: float) -> bool:
 
 
 @wp.kernel
-def raise_objects_kernel(
-    # Scene:
-    seed: wp.uint64,
-    layout: LayoutData,
-    upright: float,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    phase: wp.array[int],  # (world)
-    restarted: wp.array[wp.bool],  # (world_and_global)
-    # Out:
-    joint_q_inout: wp.array[float],  # (coord) [m, rad]
-):
+def raise_objects_kernel(seed: wp.uint64, layout: LayoutData, upright: float, state: Worlds, motion_inout: Motion):
     """Turn a fraction `upright` of the objects that have just been dropped so that their z axis points upwards: yaw = 2π u_1 if u_0 <
     upright.
 
     The samples u are those of the stream (seed, episode, arrangement, Stream.UPRIGHT), two an instance. Launched over world, instance.
     """
     world, instance = wp.tid()
-    if not restarted[world] or phase[world] != Phase.SETTLE or catalog_index[world, instance] < 0:
+    if not state.restarted[world] or state.phase[world] != Phase.SETTLE or state.catalog_index[world, instance] < 0:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.UPRIGHT)
+    key = stream_key(seed, state.arrangement_id[world][0], state.arrangement_id[world][1], Stream.UPRIGHT)
     if not stands(key, instance, upright):
         return
     turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), TAU * uniform(key, 2 * instance + 1))
-    first = world * layout.coords + layout.gripper_dofs + 7 * body_slot[world, instance] + 3
+    first = world * layout.coords + layout.gripper_dofs + 7 * state.body_slot[world, instance] + 3
     for axis in range(4):
-        joint_q_inout[first + axis] = turn[axis]
+        motion_inout.joint_q[first + axis] = turn[axis]
 
 
 @wp.func
@@ -280,13 +240,8 @@ def scatter_objects_kernel(
     upright: float,
     cylinder: wp.array[wp.vec3],  # (body) [m]
     # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    phase: wp.array[int],  # (world)
-    restarted: wp.array[wp.bool],  # (world_and_global)
-    # Out:
-    joint_q_inout: wp.array[float],  # (coord) [m, rad]
+    state: Worlds,
+    motion_inout: Motion,
 ):
     """Move objects that have just been dropped beside or right above each other: ballistic deposition, each at the lowest of PLACES.
 
@@ -294,20 +249,20 @@ def scatter_objects_kernel(
     begins `clearance` above the rim, and above all before it that are nearer than radii and `clearance`. Launched over world.
     """
     world = wp.tid()
-    if not restarted[world] or phase[world] != Phase.SETTLE:
+    if not state.restarted[world] or state.phase[world] != Phase.SETTLE:
         return
-    episode, arrangement = arrangement_id[world][0], arrangement_id[world][1]
+    episode, arrangement = state.arrangement_id[world][0], state.arrangement_id[world][1]
     key = stream_key(seed, episode, arrangement, Stream.SCATTER)
     standing = stream_key(seed, episode, arrangement, Stream.UPRIGHT)
     compartments = stream_key(seed, episode, arrangement, Stream.COMPARTMENT)
     coords = world * layout.coords + layout.gripper_dofs
-    count = count_instances(catalog_index, world, layout.instances)
+    count = count_instances(state.catalog_index, world, layout.instances)
     if count == 0:
         return
     first = uniform_index(key, 0, count)
     for turn in range(count):
         instance = (first + turn) % count
-        index = catalog_index[world, instance]
+        index = state.catalog_index[world, instance]
         own = enclose(standing, instance, upright, cylinder[index], catalog.radius[index])
         chosen = choose_compartment(bins, world, compartments, instance)
         best = wp.vec3()
@@ -319,14 +274,14 @@ def scatter_objects_kernel(
             point = wp.transform_point(bins.pose[world], center)
             for before in range(turn):
                 other = (first + before) % count
-                body = catalog_index[world, other]
+                body = state.catalog_index[world, other]
                 placed = enclose(standing, other, upright, cylinder[body], catalog.radius[body])
-                q = coords + 7 * body_slot[world, other]
-                apart = wp.length(wp.vec2(point[0] - joint_q_inout[q], point[1] - joint_q_inout[q + 1]))
+                q = coords + 7 * state.body_slot[world, other]
+                apart = wp.length(wp.vec2(point[0] - motion_inout.joint_q[q], point[1] - motion_inout.joint_q[q + 1]))
                 if apart < own[0] + placed[0] + drop.clearance:
-                    point[2] = wp.max(point[2], joint_q_inout[q + 2] + placed[2])
+                    point[2] = wp.max(point[2], motion_inout.joint_q[q + 2] + placed[2])
             if place == 0 or point[2] < best[2]:
                 best = point
         best[2] += drop.clearance - own[1]
         for axis in range(3):
-            joint_q_inout[coords + 7 * body_slot[world, instance] + axis] = best[axis]
+            motion_inout.joint_q[coords + 7 * state.body_slot[world, instance] + axis] = best[axis]

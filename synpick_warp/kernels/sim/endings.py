@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Ending, Lost, Mode, Phase, Task
+from synpick_warp.kernels.state import Attempts, Motion, Worlds
 from synpick_warp.kernels.structs import CatalogData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -15,43 +16,28 @@ def delivers(ending: int) -> bool:
 
 
 @wp.kernel
-def judge_tasks_kernel(
-    # Scene:
-    layout: LayoutData,
-    catalog: CatalogData,
-    move: MoveData,
-    pick: PickData,
-    # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    waypoint: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    failures: wp.array[int],  # (world)
-    # Out:
-    ending_out: wp.array[int],  # (world)
-):
+def judge_tasks_kernel(layout: LayoutData, catalog: CatalogData, move: MoveData, pick: PickData, state_inout: Worlds, attempts: Attempts):
     """Write the `Ending` of episodes that complete: all waypoints reached, no object with label left, or too many failed attempts.
 
     Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT:
+    if state_inout.phase[world] != Phase.ACT:
         return
-    if mode[world] == Mode.MOVE:
-        if waypoint[world] >= move.waypoints:
-            ending_out[world] = Ending.FINISHED
+    if state_inout.mode[world] == Mode.MOVE:
+        if state_inout.waypoint[world] >= move.waypoints:
+            state_inout.ending[world] = Ending.FINISHED
         return
-    if task[world] != Task.LOOK:
+    if attempts.task[world] != Task.LOOK:
         return
     left = int(0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0 and catalog_index[world, instance] < catalog.count:
+        if state_inout.catalog_index[world, instance] >= 0 and state_inout.catalog_index[world, instance] < catalog.count:
             left += 1
     if left == 0:
-        ending_out[world] = Ending.EMPTIED
-    elif failures[world] >= pick.failures:
-        ending_out[world] = Ending.GAVE_UP
+        state_inout.ending[world] = Ending.EMPTIED
+    elif attempts.failures[world] >= pick.failures:
+        state_inout.ending[world] = Ending.GAVE_UP
 
 
 @wp.func
@@ -67,14 +53,10 @@ def judge_episodes_kernel(
     layout: LayoutData,
     settle: SettleData,
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
+    state_inout: Worlds,
+    motion: Motion,
     solver_overflow: wp.array[wp.bool],  # (world)
     perception_overflow: wp.array[int],  # (world)
-    progress: wp.array[wp.vec4i],  # (world) [ticks]
-    phase_inout: wp.array[int],  # (world)
-    ending_inout: wp.array[int],  # (world)
     lost_inout: wp.array[int],  # (world)
 ):
     """Move worlds whose episode has an ending to phase OVER; failures override the endings of `judge_tasks_kernel`.
@@ -84,13 +66,15 @@ def judge_episodes_kernel(
     `lost`, bits of `Lost`, ends as 0. Launched over world.
     """
     world = wp.tid()
-    phase = phase_inout[world]
+    phase = state_inout.phase[world]
     lost = lost_inout[world]
     lost_inout[world] = 0
     if phase != Phase.SETTLE and phase != Phase.ACT:
         return
-    ending = ending_inout[world]
-    if phase == Phase.SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
+    ending = state_inout.ending[world]
+    if phase == Phase.SETTLE and (
+        state_inout.progress[world][0] >= settle.max_ticks or state_inout.progress[world][2] > settle.max_redrops
+    ):
         ending = Ending.UNSETTLED
     if perception_overflow[world] != 0:
         ending = Ending.PERCEPTION_OVERFLOW
@@ -102,12 +86,12 @@ def judge_episodes_kernel(
         ending = Ending.PAIR_OVERFLOW
     body = world * layout.bodies
     for link in range(layout.gripper_bodies):
-        if not is_finite(body_q[body + link]):
+        if not is_finite(motion.body_q[body + link]):
             ending = Ending.NOT_FINITE
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0:
-            if not is_finite(body_q[body + layout.gripper_bodies + body_slot[world, instance]]):
+        if state_inout.catalog_index[world, instance] >= 0:
+            if not is_finite(motion.body_q[body + layout.gripper_bodies + state_inout.body_slot[world, instance]]):
                 ending = Ending.NOT_FINITE
     if ending != Ending.RUNNING:
-        ending_inout[world] = ending
-        phase_inout[world] = Phase.OVER
+        state_inout.ending[world] = ending
+        state_inout.phase[world] = Phase.OVER

@@ -8,6 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Mode, Phase, Stream, Task
 from synpick_warp.kernels.rng import stream_key, uniform_index
+from synpick_warp.kernels.state import Attempts, Control, Motion, Plans, Worlds
 from synpick_warp.kernels.structs import TILT, BinData, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -28,24 +29,7 @@ def bin_corner(code: int, bins: BinData, world: int) -> wp.vec3:
 
 
 @wp.kernel
-def begin_moving_kernel(
-    # Scene:
-    seed: wp.uint64,
-    layout: LayoutData,
-    move: MoveData,
-    bins: BinData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    mode: wp.array[int],  # (world)
-    phase: wp.array[int],  # (world)
-    frame_inout: wp.array[int],  # (world)
-    joint_q_inout: wp.array[float],  # (coord) [m, rad]
-    joint_qd_inout: wp.array[float],  # (dof) [m/s, rad/s]
-    # Out:
-    corner_order_out: wp.array2d[int],  # (world, waypoint)
-    setpoint_out: wp.array[wp.vec3],  # (world) [m]
-    waypoint_out: wp.array[int],  # (world)
-):
+def begin_moving_kernel(seed: wp.uint64, layout: LayoutData, move: MoveData, bins: BinData, state_inout: Worlds, motion_inout: Motion):
     """Count frames; in the first frame of mode MOVE, sample the order of the corners and place the gripper above the first one.
 
     The order is a Fisher-Yates shuffle of the four corners for each round; rounds take the compartments in turn, from a random one on.
@@ -53,32 +37,32 @@ def begin_moving_kernel(
     Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT:
-        frame_inout[world] = -1
+    if state_inout.phase[world] != Phase.ACT:
+        state_inout.frame[world] = -1
         return
-    frame_inout[world] = frame_inout[world] + 1
-    if frame_inout[world] > 0 or mode[world] != Mode.MOVE:
+    state_inout.frame[world] = state_inout.frame[world] + 1
+    if state_inout.frame[world] > 0 or state_inout.mode[world] != Mode.MOVE:
         return
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.CORNERS)
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.CORNERS)
     for visit in range(move.waypoints):
-        corner_order_out[world, visit] = visit % ROUND
+        state_inout.corner_order[world, visit] = visit % ROUND
     for visit in range(move.waypoints):
         left = ROUND - visit % ROUND
         other = visit + uniform_index(key, visit, left)
-        kept = corner_order_out[world, visit]
-        corner_order_out[world, visit] = corner_order_out[world, other]
-        corner_order_out[world, other] = kept
+        kept = state_inout.corner_order[world, visit]
+        state_inout.corner_order[world, visit] = state_inout.corner_order[world, other]
+        state_inout.corner_order[world, other] = kept
     chosen = bins.chosen[world]
     compartments = bins.first_compartment[chosen + 1] - bins.first_compartment[chosen]
     first = uniform_index(key, move.waypoints, compartments)
     for visit in range(move.waypoints):
-        corner_order_out[world, visit] = corner_order_out[world, visit] + ROUND * ((first + visit // ROUND) % compartments)
-    corner = bin_corner(corner_order_out[world, 0], bins, world)
+        state_inout.corner_order[world, visit] = state_inout.corner_order[world, visit] + ROUND * ((first + visit // ROUND) % compartments)
+    corner = bin_corner(state_inout.corner_order[world, 0], bins, world)
     setpoint = wp.transform_point(bins.pose[world], wp.vec3(corner[0], corner[1], move.start_height))
     setpoint = wp.vec3(setpoint[0], setpoint[1], setpoint[2] + move.tcp_offset)
-    setpoint_out[world] = setpoint
-    waypoint_out[world] = 0
-    place_gripper(layout, world, setpoint, 0.0, joint_q_inout, joint_qd_inout)
+    state_inout.setpoint[world] = setpoint
+    state_inout.waypoint[world] = 0
+    place_gripper(layout, world, setpoint, 0.0, motion_inout.joint_q, motion_inout.joint_qd)
 
 
 @wp.func
@@ -123,22 +107,7 @@ def task_setpoint(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tc
 
 
 @wp.kernel
-def advance_setpoints_kernel(
-    # Scene:
-    move: MoveData,
-    pick: PickData,
-    bins: BinData,
-    # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    corner_order: wp.array2d[int],  # (world, waypoint)
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    task_inout: wp.array[int],  # (world)
-    steps_inout: wp.array[int],  # (world)
-    waypoint_inout: wp.array[int],  # (world)
-    setpoint_inout: wp.array[wp.vec3],  # (world) [m]
-):
+def advance_setpoints_kernel(move: MoveData, pick: PickData, bins: BinData, state_inout: Worlds, plan: Plans, attempts_inout: Attempts):
     """Advance the setpoints by one step of physics, at constant speed.
 
     Mode MOVE: towards the next corner, over the rim into another compartment; a reached one increments `waypoint`. Picking: APPROACH to
@@ -146,28 +115,28 @@ def advance_setpoints_kernel(
     tick, by `tasks.advance_tasks_kernel`. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT:
+    if state_inout.phase[world] != Phase.ACT:
         return
-    setpoint = setpoint_inout[world]
-    if mode[world] == Mode.MOVE:
-        waypoint = waypoint_inout[world]
+    setpoint = state_inout.setpoint[world]
+    if state_inout.mode[world] == Mode.MOVE:
+        waypoint = state_inout.waypoint[world]
         if waypoint < move.waypoints:
-            code = corner_order[world, waypoint]
+            code = state_inout.corner_order[world, waypoint]
             target = wp.transform_point(bins.pose[world], bin_corner(code, bins, world))
             target = wp.vec3(target[0], target[1], target[2] + move.tcp_offset)
             next = target
-            if waypoint > 0 and corner_order[world, wp.max(waypoint - 1, 0)] // ROUND != code // ROUND:
+            if waypoint > 0 and state_inout.corner_order[world, wp.max(waypoint - 1, 0)] // ROUND != code // ROUND:
                 height = (
                     wp.transform_get_translation(bins.pose[world])[2] + bins.rim_height[bins.chosen[world]] + PASS_HEIGHT + move.tcp_offset
                 )
                 next = pass_over(setpoint, target, height)
             setpoint = step_towards(setpoint, next, move.speed * move.step)
-            setpoint_inout[world] = setpoint
+            state_inout.setpoint[world] = setpoint
             if setpoint == target:
-                waypoint_inout[world] = waypoint + 1
+                state_inout.waypoint[world] = waypoint + 1
         return
-    task = task_inout[world]
-    steps_inout[world] = steps_inout[world] + 1
+    task = attempts_inout.task[world]
+    attempts_inout.steps[world] = attempts_inout.steps[world] + 1
     if task < Task.APPROACH:
         return
     speed = pick.speed
@@ -175,12 +144,12 @@ def advance_setpoints_kernel(
         speed = pick.near_speed
     elif task == Task.LIFT:
         speed = pick.lift_speed
-    target = task_setpoint(task, point[world], normal[world], pick, move.tcp_offset)
+    target = task_setpoint(task, plan.point[world], plan.normal[world], pick, move.tcp_offset)
     setpoint = step_towards(setpoint, target, speed * move.step)
-    setpoint_inout[world] = setpoint
+    state_inout.setpoint[world] = setpoint
     if setpoint == target and (task == Task.APPROACH or task == Task.DESCEND):
-        task_inout[world] = task + 1
-        steps_inout[world] = 0
+        attempts_inout.task[world] = task + 1
+        attempts_inout.steps[world] = 0
 
 
 @wp.func
@@ -201,19 +170,7 @@ def impedance_force(
 
 @wp.kernel
 def drive_gripper_kernel(
-    # Scene:
-    layout: LayoutData,
-    move: MoveData,
-    pick: PickData,
-    # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    setpoint: wp.array[wp.vec3],  # (world) [m]
-    joint_q: wp.array[float],  # (coord) [m, rad]
-    joint_qd: wp.array[float],  # (dof) [m/s, rad/s]
-    # Out:
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
+    layout: LayoutData, move: MoveData, pick: PickData, state: Worlds, attempts: Attempts, motion: Motion, control_out: Control
 ):
     """Write the gripper's joint forces: impedance control plus gravity compensation m g; without a task, gravity compensation only.
 
@@ -222,18 +179,18 @@ def drive_gripper_kernel(
     world = wp.tid()
     q = world * layout.coords
     qd = world * layout.dofs
-    offset = setpoint[world] - wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
-    velocity = wp.vec3(joint_qd[qd], joint_qd[qd + 1], joint_qd[qd + 2])
+    offset = state.setpoint[world] - wp.vec3(motion.joint_q[q], motion.joint_q[q + 1], motion.joint_q[q + 2])
+    velocity = wp.vec3(motion.joint_qd[qd], motion.joint_qd[qd + 1], motion.joint_qd[qd + 2])
     force = wp.vec3(0.0, 0.0, 0.0)
-    if phase[world] == Phase.ACT:
-        if mode[world] == Mode.MOVE:
+    if state.phase[world] == Phase.ACT:
+        if state.mode[world] == Mode.MOVE:
             force = impedance_force(offset, velocity, move.stiffness, move.damping, move.force, move.mass, move.step)
-        elif task[world] >= Task.APPROACH:
+        elif attempts.task[world] >= Task.APPROACH:
             force = impedance_force(offset, velocity, pick.stiffness, pick.damping, pick.force, move.mass, move.step)
-    joint_f_out[qd] = force[0]
-    joint_f_out[qd + 1] = force[1]
-    joint_f_out[qd + 2] = force[2] + move.mass * move.gravity
-    joint_f_out[qd + TILT] = 0.0
+    control_out.joint_f[qd] = force[0]
+    control_out.joint_f[qd + 1] = force[1]
+    control_out.joint_f[qd + 2] = force[2] + move.mass * move.gravity
+    control_out.joint_f[qd + TILT] = 0.0
 
 
 @wp.kernel

@@ -5,6 +5,7 @@ import warp as wp
 from synpick_warp.codes import Lost, Phase, Stream
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.sim.drop import choose_compartment, drop_pose, top_of_objects, write_body
+from synpick_warp.kernels.state import Contacts, Motion, Worlds
 from synpick_warp.kernels.structs import BinData, CatalogData, DropData, LayoutData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -20,76 +21,51 @@ BINS_AWAY = wp.constant(2000.0)
 
 
 @wp.kernel
-def measure_penetration_kernel(
-    # State:
-    contact_count: wp.array[int],  # (one)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    point0: wp.array[wp.vec3],  # (contact) [m]
-    point1: wp.array[wp.vec3],  # (contact) [m]
-    normal: wp.array[wp.vec3],  # (contact)
-    margin0: wp.array[float],  # (contact) [m]
-    margin1: wp.array[float],  # (contact) [m]
-    shape_body: wp.array[int],  # (shape)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    # Out:
-    penetration_out: wp.array[float],  # (body) [m]
-):
+def measure_penetration_kernel(contacts: Contacts, motion: Motion, state_out: Worlds):
     """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0), by atomics.
 
     `penetration` must be cleared before. Launched over contact.
     """
     contact = wp.tid()
-    if contact >= contact_count[0]:
+    if contact >= contacts.count[0]:
         return
     a = int(-1)
     b = int(-1)
-    if shape0[contact] >= 0:
-        a = shape_body[shape0[contact]]
-    if shape1[contact] >= 0:
-        b = shape_body[shape1[contact]]
-    p = point0[contact]
-    q = point1[contact]
+    if contacts.shape0[contact] >= 0:
+        a = contacts.shape_body[contacts.shape0[contact]]
+    if contacts.shape1[contact] >= 0:
+        b = contacts.shape_body[contacts.shape1[contact]]
+    p = contacts.point0[contact]
+    q = contacts.point1[contact]
     if a >= 0:
-        p = wp.transform_point(body_q[a], p)
+        p = wp.transform_point(motion.body_q[a], p)
     if b >= 0:
-        q = wp.transform_point(body_q[b], q)
-    penetration = margin0[contact] + margin1[contact] - wp.dot(normal[contact], q - p)
+        q = wp.transform_point(motion.body_q[b], q)
+    penetration = contacts.margin0[contact] + contacts.margin1[contact] - wp.dot(contacts.normal[contact], q - p)
     if a >= 0:
-        wp.atomic_max(penetration_out, a, penetration)
+        wp.atomic_max(state_out.penetration, a, penetration)
     if b >= 0:
-        wp.atomic_max(penetration_out, b, penetration)
+        wp.atomic_max(state_out.penetration, b, penetration)
 
 
 @wp.kernel
-def measure_displacement_kernel(
-    # Scene:
-    layout: LayoutData,
-    catalog: CatalogData,
-    # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    previous_pose_inout: wp.array2d[wp.transform],  # (world, instance) [m]
-    # Out:
-    displacement_out: wp.array2d[float],  # (world, instance) [m]
-):
+def measure_displacement_kernel(layout: LayoutData, catalog: CatalogData, state_inout: Worlds, motion: Motion):
     """Displacement of each object over the last tick [m]: the bound |Δp| + θ r on the motion of its points, with rotation angle θ.
 
     r is the bounding radius. Over a tick instead of by velocity: a solver that has not converged makes a pile vibrate in place. Launched
     over world, instance.
     """
     world, instance = wp.tid()
-    index = catalog_index[world, instance]
+    index = state_inout.catalog_index[world, instance]
     if index < 0:
         return
-    pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
-    relative = wp.transform_inverse(previous_pose_inout[world, instance]) * pose
-    distance = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_pose_inout[world, instance]))
+    pose = motion.body_q[world * layout.bodies + layout.gripper_bodies + state_inout.body_slot[world, instance]]
+    relative = wp.transform_inverse(state_inout.previous_pose[world, instance]) * pose
+    distance = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(state_inout.previous_pose[world, instance]))
     q = wp.transform_get_rotation(relative)
     angle = 2.0 * wp.atan2(wp.length(wp.vec3(q[0], q[1], q[2])), wp.abs(q[3]))
-    displacement_out[world, instance] = distance + angle * catalog.radius[index]
-    previous_pose_inout[world, instance] = pose
+    state_inout.displacement[world, instance] = distance + angle * catalog.radius[index]
+    state_inout.previous_pose[world, instance] = pose
 
 
 @wp.func
@@ -114,24 +90,14 @@ def is_outside(position: wp.vec3, bins: BinData, world: int) -> bool:
 
 @wp.kernel
 def redrop_objects_kernel(
-    # Scene:
     seed: wp.uint64,
     layout: LayoutData,
     catalog: CatalogData,
     drop: DropData,
     settle: SettleData,
     bins: BinData,
-    # State:
-    arrangement_id: wp.array[wp.vec2i],  # (world)
-    phase: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    penetration: wp.array[float],  # (body) [m]
-    stuck_inout: wp.array2d[int],  # (world, instance) [ticks]
-    progress_inout: wp.array[wp.vec4i],  # (world) [ticks]
-    joint_q_inout: wp.array[float],  # (coord) [m, rad]
-    joint_qd_inout: wp.array[float],  # (dof) [m/s, rad/s]
+    state_inout: Worlds,
+    motion_inout: Motion,
 ):
     """Drop objects again that left the bin or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
@@ -140,24 +106,24 @@ def redrop_objects_kernel(
     over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.SETTLE:
+    if state_inout.phase[world] != Phase.SETTLE:
         return
-    progress = progress_inout[world]
-    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.REDROP)
-    places = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.COMPARTMENT)
+    progress = state_inout.progress[world]
+    key = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.REDROP)
+    places = stream_key(seed, state_inout.arrangement_id[world][0], state_inout.arrangement_id[world][1], Stream.COMPARTMENT)
     height = bins.rim_height[bins.chosen[world]]
     body = world * layout.bodies + layout.gripper_bodies
     if drop.layers == 1:
-        top = top_of_objects(layout, catalog, catalog_index, body_slot, body_q, world)
+        top = top_of_objects(layout, catalog, state_inout, motion_inout.body_q, world)
         height = wp.max(height, top - wp.transform_get_translation(bins.pose[world])[2] + drop.clearance)
     for instance in range(layout.instances):
-        index = catalog_index[world, instance]
+        index = state_inout.catalog_index[world, instance]
         if index >= 0:
-            slot = body_slot[world, instance]
-            stuck = stuck_inout[world, instance] + 1
-            if penetration[body + slot] < settle.stuck_depth:
+            slot = state_inout.body_slot[world, instance]
+            stuck = state_inout.stuck[world, instance] + 1
+            if state_inout.penetration[body + slot] < settle.stuck_depth:
                 stuck = 0
-            position = wp.transform_get_translation(body_q[body + slot])
+            position = wp.transform_get_translation(motion_inout.body_q[body + slot])
             if stuck > settle.stuck_ticks or is_outside(position, bins, world):
                 stuck = 0
                 radius = catalog.radius[index]
@@ -167,46 +133,36 @@ def redrop_objects_kernel(
                 pose = drop_pose(key, progress[2], radius, height + radius, drop.spread, bins, world, center, half)
                 height += 2.0 * radius + drop.clearance
                 q = world * layout.coords + layout.gripper_dofs + 7 * slot
-                write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)
+                write_body(motion_inout.joint_q, motion_inout.joint_qd, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)
                 progress = wp.vec4i(progress[0], -1, progress[2] + 1, 1)
-            stuck_inout[world, instance] = stuck
-    progress_inout[world] = progress
+            state_inout.stuck[world, instance] = stuck
+    state_inout.progress[world] = progress
 
 
 @wp.kernel
-def judge_rest_kernel(
-    # Scene:
-    layout: LayoutData,
-    settle: SettleData,
-    restless: float,
-    # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    displacement: wp.array2d[float],  # (world, instance) [m]
-    phase_inout: wp.array[int],  # (world)
-    progress_inout: wp.array[wp.vec4i],  # (world) [ticks]
-):
+def judge_rest_kernel(layout: LayoutData, settle: SettleData, restless: float, state_inout: Worlds):
     """Count ticks at rest; after `rest_ticks` of them remove the guide walls, after as many again begin phase ACT.
 
     A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`. Up to a fraction
     `restless` of its objects may have displacements between the two. Launched over world.
     """
     world = wp.tid()
-    if phase_inout[world] != Phase.SETTLE:
+    if state_inout.phase[world] != Phase.SETTLE:
         return
-    ticks = progress_inout[world][0] + 1
-    resting = progress_inout[world][1] + 1
-    guides = progress_inout[world][3]
+    ticks = state_inout.progress[world][0] + 1
+    resting = state_inout.progress[world][1] + 1
+    guides = state_inout.progress[world][3]
     allowed = settle.rest_threshold
     if ticks > settle.late_ticks:
         allowed = settle.relaxed_rest_threshold
     objects = int(0)
     moving = int(0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0:
+        if state_inout.catalog_index[world, instance] >= 0:
             objects += 1
-            if displacement[world, instance] > allowed:
+            if state_inout.displacement[world, instance] > allowed:
                 moving += 1
-            if displacement[world, instance] > wp.max(allowed, settle.relaxed_rest_threshold):
+            if state_inout.displacement[world, instance] > wp.max(allowed, settle.relaxed_rest_threshold):
                 resting = 0
     if float(moving) > restless * float(objects) + COUNT_ROUNDING:
         resting = 0
@@ -215,8 +171,8 @@ def judge_rest_kernel(
             guides = 0
             resting = 0
         else:
-            phase_inout[world] = Phase.ACT
-    progress_inout[world] = wp.vec4i(ticks, resting, progress_inout[world][2], guides)
+            state_inout.phase[world] = Phase.ACT
+    state_inout.progress[world] = wp.vec4i(ticks, resting, state_inout.progress[world][2], guides)
 
 
 @wp.kernel
@@ -264,7 +220,7 @@ def place_bins_kernel(
     layout: LayoutData,
     bins: BinData,
     # State:
-    progress: wp.array[wp.vec4i],  # (world) [ticks]
+    state: Worlds,
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
@@ -278,6 +234,6 @@ def place_bins_kernel(
     pose = bins.pose[world]
     if bins.shape_bin[part] != bins.chosen[world]:
         pose = wp.transform(wp.vec3(0.0, 0.0, BINS_AWAY), wp.quat_identity())
-    elif bins.shape_guide[part] == 1 and progress[world][3] == 0:
+    elif bins.shape_guide[part] == 1 and state.progress[world][3] == 0:
         pose = shape_pose(False)
     shape_transform_out[world * layout.shapes + bins.shape[part]] = pose

@@ -13,6 +13,7 @@ Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z
 import warp as wp
 
 from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
+from synpick_warp.kernels.state import Control, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -226,16 +227,10 @@ def apply_seal_forces_kernel(
     body_inv_mass: wp.array[float],  # (body) [1/kg]
     body_inv_inertia: wp.array[wp.mat33],  # (body) [1/(kg·m²)]
     # State:
-    body_slot: wp.array2d[int],  # (world, instance)
-    object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
-    break_force: wp.array2d[float],  # (world, cup) [N]
-    body_q: wp.array[wp.transform],  # (body) [m]
-    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
-    attached_inout: wp.array2d[int],  # (world, instance)
-    seal_force_inout: wp.array2d[float],  # (world, instance) [N]
-    cup_force_inout: wp.array2d[float],  # (world, cup) [N]
-    peak_inout: wp.array[wp.vec2],  # (world) [N]
-    joint_f_inout: wp.array[float],  # (dof) [N, N·m]
+    state: Worlds,
+    seals_inout: Seals,
+    motion: Motion,
+    control_inout: Control,
 ):
     """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
 
@@ -245,36 +240,36 @@ def apply_seal_forces_kernel(
     world = wp.tid()
     seals = int(0)
     for instance in range(layout.instances):
-        seals += attached_inout[world, instance]
-        seal_force_inout[world, instance] = 0.0
-    cup_force_inout[world, 0] = 0.0
+        seals += seals_inout.attached[world, instance]
+        seals_inout.seal_force[world, instance] = 0.0
+    seals_inout.cup_force[world, 0] = 0.0
     if seals == 0:
         return
     cup = world * layout.bodies + CUP
-    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], wp.vec3(0.0, 0.0, -suction.tcp_offset))
+    tcp = tcp_motion(motion.body_q[cup], motion.body_qd[cup], body_com[cup], wp.vec3(0.0, 0.0, -suction.tcp_offset))
     gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
     gripper_dof = world * layout.dofs
     for instance in range(layout.instances):
-        if attached_inout[world, instance] != 0:
-            body = world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]
-            grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-            rotation = wp.transform_get_rotation(body_q[body])
+        if seals_inout.attached[world, instance] != 0:
+            body = world * layout.bodies + layout.gripper_bodies + state.body_slot[world, instance]
+            grip_in_world = motion.body_q[body] * wp.transform_inverse(seals_inout.object_in_tcp[world, instance])
+            object_arm = tcp.position - wp.transform_point(motion.body_q[body], body_com[body])
+            rotation = wp.transform_get_rotation(motion.body_q[body])
             object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
-            object_angular_velocity = wp.spatial_bottom(body_qd[body])
-            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
+            object_angular_velocity = wp.spatial_bottom(motion.body_qd[body])
+            slip = tcp.velocity - wp.spatial_top(motion.body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
             error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
             offset = tcp.position - wp.transform_get_translation(grip_in_world)
             spin = tcp.angular_velocity - object_angular_velocity
             wrench = seal_wrench(offset, error, slip, spin, add_inverse_masses(object_inverse, gripper_inverse), suction)
             force = tension_and_shear(wrench.force, tcp.axis)
-            first_dof = gripper_dof + layout.gripper_dofs + 6 * body_slot[world, instance]
-            seal_force_inout[world, instance] = force
-            cup_force_inout[world, 0] = cup_force_inout[world, 0] + force
-            peak_inout[world] = wp.max(peak_inout[world], wp.vec2(force, force / break_force[world, 0]))
-            if force > break_force[world, 0]:
-                attached_inout[world, instance] = 0
-                push_object(wp.vec3(), wp.vec3(), joint_f_inout, first_dof)
+            first_dof = gripper_dof + layout.gripper_dofs + 6 * state.body_slot[world, instance]
+            seals_inout.seal_force[world, instance] = force
+            seals_inout.cup_force[world, 0] = seals_inout.cup_force[world, 0] + force
+            seals_inout.peak[world] = wp.max(seals_inout.peak[world], wp.vec2(force, force / seals_inout.break_force[world, 0]))
+            if force > seals_inout.break_force[world, 0]:
+                seals_inout.attached[world, instance] = 0
+                push_object(wp.vec3(), wp.vec3(), control_inout.joint_f, first_dof)
             else:
-                push_object(wrench.force, wrench.torque + wp.cross(object_arm, wrench.force), joint_f_inout, first_dof)
-                pull_gripper(wrench.force, wrench.torque, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof)
+                push_object(wrench.force, wrench.torque + wp.cross(object_arm, wrench.force), control_inout.joint_f, first_dof)
+                pull_gripper(wrench.force, wrench.torque, tcp.wrist_arm, tcp.wrist_axis, control_inout.joint_f, gripper_dof)

@@ -23,6 +23,7 @@ from synpick_warp.kernels.sim.seal import (
     tcp_motion,
     tension_and_shear,
 )
+from synpick_warp.kernels.state import Control, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import CupData, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -242,16 +243,10 @@ def apply_array_forces_kernel(
     body_inv_mass: wp.array[float],  # (body) [1/kg]
     body_inv_inertia: wp.array[wp.mat33],  # (body) [1/(kg·m²)]
     # State:
-    body_slot: wp.array2d[int],  # (world, instance)
-    object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
-    body_q: wp.array[wp.transform],  # (body) [m]
-    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
-    attached_inout: wp.array2d[int],  # (world, instance)
-    break_force_inout: wp.array2d[float],  # (world, cup) [N]
-    seal_force_inout: wp.array2d[float],  # (world, instance) [N]
-    cup_force_inout: wp.array2d[float],  # (world, cup) [N]
-    peak_inout: wp.array[wp.vec2],  # (world) [N]
-    joint_f_inout: wp.array[float],  # (dof) [N, N·m]
+    state: Worlds,
+    seals_inout: Seals,
+    motion: Motion,
+    control_inout: Control,
 ):
     """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the cup's break force.
 
@@ -262,31 +257,33 @@ def apply_array_forces_kernel(
     world = wp.tid()
     objects = int(0)
     for instance in range(layout.instances):
-        objects += wp.where(attached_inout[world, instance] != 0, 1, 0)
-        seal_force_inout[world, instance] = 0.0
+        objects += wp.where(seals_inout.attached[world, instance] != 0, 1, 0)
+        seals_inout.seal_force[world, instance] = 0.0
     for cup in range(cups.count):
-        cup_force_inout[world, cup] = 0.0
+        seals_inout.cup_force[world, cup] = 0.0
     if objects == 0:
         return
     head = world * layout.bodies + CUP
     gripper_dof = world * layout.dofs
     broken = int(0)
     for instance in range(layout.instances):
-        held = attached_inout[world, instance]
+        held = seals_inout.attached[world, instance]
         if held != 0:
-            slot = body_slot[world, instance]
+            slot = state.body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
-            tcp = tcp_motion(body_q[head], body_qd[head], body_com[head], middle_of_cups(held, cups))
-            pose, grip = body_q[body], object_in_tcp[world, instance]
+            tcp = tcp_motion(motion.body_q[head], motion.body_qd[head], body_com[head], middle_of_cups(held, cups))
+            pose, grip = motion.body_q[body], seals_inout.object_in_tcp[world, instance]
             mass, inertia = body_inv_mass[body], body_inv_inertia[body]
-            seals = solve_seals(held, objects, tcp, pose, body_qd[body], body_com[body], mass, inertia, grip, suction, cups)
-            shared = share_wrench(held, seals, tcp, world, gripper_dof, suction, cups, break_force_inout, cup_force_inout, joint_f_inout)
-            seal_force_inout[world, instance] = shared.peak[0]
-            peak_inout[world] = wp.max(peak_inout[world], shared.peak)
+            seals = solve_seals(held, objects, tcp, pose, motion.body_qd[body], body_com[body], mass, inertia, grip, suction, cups)
+            shared = share_wrench(
+                held, seals, tcp, world, gripper_dof, suction, cups, seals_inout.break_force, seals_inout.cup_force, control_inout.joint_f
+            )
+            seals_inout.seal_force[world, instance] = shared.peak[0]
+            seals_inout.peak[world] = wp.max(seals_inout.peak[world], shared.peak)
             broken += held - shared.cups
-            attached_inout[world, instance] = shared.cups
+            seals_inout.attached[world, instance] = shared.cups
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
-            push_object(shared.force, shared.torque, joint_f_inout, first_dof)
+            push_object(shared.force, shared.torque, control_inout.joint_f, first_dof)
     if cups.common_valve != 0 and broken > 0:
         for cup in range(cups.count):
-            break_force_inout[world, cup] = suction.poor_force
+            seals_inout.break_force[world, cup] = suction.poor_force

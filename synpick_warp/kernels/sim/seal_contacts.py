@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.sim.cup_rays import CUP
+from synpick_warp.kernels.state import Contacts, Seals, Worlds
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -23,19 +24,7 @@ def is_attached(layout: LayoutData, world: int, body: int, body_slot: wp.array2d
 
 
 @wp.kernel
-def ignore_attached_contacts_kernel(
-    # Scene:
-    layout: LayoutData,
-    shape_body: wp.array[int],  # (shape)
-    # State:
-    contact_count: wp.array[int],  # (one)
-    body_slot: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    # Out:
-    margin_out: wp.array[float],  # (contact) [m]
-):
+def ignore_attached_contacts_kernel(layout: LayoutData, contacts_inout: Contacts, state: Worlds, seals: Seals):
     """Disable contacts between a gripper head and its attached objects, which would fight the seal: set their margin to -APART.
 
     The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
@@ -43,10 +32,10 @@ def ignore_attached_contacts_kernel(
     pair of bodies, and the solver's time grows with the square of a pair's contacts. Launched over contact.
     """
     contact = wp.tid()
-    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
+    if contact >= contacts_inout.count[0] or contacts_inout.shape0[contact] < 0 or contacts_inout.shape1[contact] < 0:
         return
-    a = shape_body[shape0[contact]]
-    b = shape_body[shape1[contact]]
+    a = contacts_inout.shape_body[contacts_inout.shape0[contact]]
+    b = contacts_inout.shape_body[contacts_inout.shape1[contact]]
     if a < 0 or b < 0:
         return
     cup = a
@@ -56,5 +45,5 @@ def ignore_attached_contacts_kernel(
         other = a
     if cup % layout.bodies != CUP:
         return
-    if is_attached(layout, cup // layout.bodies, other, body_slot, attached):
-        margin_out[contact] = -APART
+    if is_attached(layout, cup // layout.bodies, other, state.body_slot, seals.attached):
+        contacts_inout.margin0[contact] = -APART

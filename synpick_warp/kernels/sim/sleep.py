@@ -7,12 +7,25 @@ a tick and may wake in any substep. A sleeping body keeps its pose at zero veloc
 import warp as wp
 
 from synpick_warp.codes import Phase
+from synpick_warp.kernels.state import Attempts, Contacts, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
 # Consecutive ticks in which an object must be quiet, that is move at most by the threshold, before it falls asleep.
 QUIET_TICKS = wp.constant(3)
+
+
+@wp.struct
+class Sleepers:
+    """Per body slot of each world: sleep flag, island, and quiet time."""
+
+    asleep: wp.array2d[int]
+    """(world, slot): 1: asleep; 0: awake."""
+    island: wp.array2d[int]
+    """(world, slot): slot that names the island of a sleeping body: the smallest of its slots."""
+    quiet: wp.array2d[int]
+    """(world, slot): consecutive ticks in which the body moved by at most `physics.sleep` [ticks]."""
 
 
 @wp.func
@@ -40,7 +53,7 @@ def list_awake_pairs_kernel(
     threads: int,
     shape_body: wp.array[int],  # (shape)
     # State:
-    asleep: wp.array2d[int],  # (world, slot)
+    sleepers: Sleepers,
     # In:
     overlap: wp.array[wp.vec2i],  # (overlap)
     overlap_count: wp.array[int],  # (one)
@@ -56,7 +69,7 @@ def list_awake_pairs_kernel(
     for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):
         one = shape_body[overlap[index][0]]
         other = shape_body[overlap[index][1]]
-        if (one >= 0 and not is_asleep(layout, asleep, one)) or (other >= 0 and not is_asleep(layout, asleep, other)):
+        if (one >= 0 and not is_asleep(layout, sleepers.asleep, one)) or (other >= 0 and not is_asleep(layout, sleepers.asleep, other)):
             pair_out[wp.atomic_add(pair_count_inout, 0, 1)] = overlap[index]
 
 
@@ -66,12 +79,8 @@ def wake_touched_kernel(
     layout: LayoutData,
     threads: int,
     # State:
-    contact_count: wp.array[int],  # (one)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    shape_body: wp.array[int],  # (shape)
-    asleep: wp.array2d[int],  # (world, slot)
-    island: wp.array2d[int],  # (world, slot)
+    contacts: Contacts,
+    sleepers: Sleepers,
     # Out:
     woken_out: wp.array2d[int],  # (world, slot)
 ):
@@ -80,16 +89,16 @@ def wake_touched_kernel(
     Contacts begin at twice the contact margin, before surfaces meet. Grid-stride loop over the contacts: launched over `threads`.
     """
     thread = wp.tid()
-    for contact in range(thread, wp.min(contact_count[0], shape0.shape[0]), threads):
-        one = body_of(shape_body, shape0[contact])
-        other = body_of(shape_body, shape1[contact])
+    for contact in range(thread, wp.min(contacts.count[0], contacts.shape0.shape[0]), threads):
+        one = body_of(contacts.shape_body, contacts.shape0[contact])
+        other = body_of(contacts.shape_body, contacts.shape1[contact])
         if one >= 0 and other >= 0:
-            one_sleeps = is_asleep(layout, asleep, one)
-            if one_sleeps != is_asleep(layout, asleep, other):
+            one_sleeps = is_asleep(layout, sleepers.asleep, one)
+            if one_sleeps != is_asleep(layout, sleepers.asleep, other):
                 sleeper = wp.where(one_sleeps, one, other)
                 world = sleeper // layout.bodies
                 slot = sleeper - world * layout.bodies - layout.gripper_bodies
-                woken_out[world, island[world, slot]] = 1
+                woken_out[world, sleepers.island[world, slot]] = 1
 
 
 @wp.kernel
@@ -97,39 +106,31 @@ def hold_sleepers_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    joint_q: wp.array[float],  # (coord) [m, rad]
-    joint_qd: wp.array[float],  # (dof) [m/s, rad/s]
-    body_q: wp.array[wp.transform],  # (body) [m]
-    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
-    island: wp.array2d[int],  # (world, slot)
+    before: Motion,
     woken: wp.array2d[int],  # (world, slot)
-    asleep_inout: wp.array2d[int],  # (world, slot)
+    sleepers_inout: Sleepers,
     # Out:
-    quiet_out: wp.array2d[int],  # (world, slot) [ticks]
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    body_q_out: wp.array[wp.transform],  # (body) [m]
-    body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    after_out: Motion,
 ):
     """Restore pose and velocity of sleeping bodies after a substep, in which the solver lets them fall; then wake those of woken islands.
 
     Launched over world, slot.
     """
     world, slot = wp.tid()
-    if asleep_inout[world, slot] == 0:
+    if sleepers_inout.asleep[world, slot] == 0:
         return
     q = world * layout.coords + layout.gripper_dofs + 7 * slot
     qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
     body = world * layout.bodies + layout.gripper_bodies + slot
     for axis in range(7):
-        joint_q_out[q + axis] = joint_q[q + axis]
+        after_out.joint_q[q + axis] = before.joint_q[q + axis]
     for axis in range(6):
-        joint_qd_out[qd + axis] = joint_qd[qd + axis]
-    body_q_out[body] = body_q[body]
-    body_qd_out[body] = body_qd[body]
-    if woken[world, island[world, slot]] != 0:
-        asleep_inout[world, slot] = 0
-        quiet_out[world, slot] = 0
+        after_out.joint_qd[qd + axis] = before.joint_qd[qd + axis]
+    after_out.body_q[body] = before.body_q[body]
+    after_out.body_qd[body] = before.body_qd[body]
+    if woken[world, sleepers_inout.island[world, slot]] != 0:
+        sleepers_inout.asleep[world, slot] = 0
+        sleepers_inout.quiet[world, slot] = 0
 
 
 @wp.func
@@ -154,10 +155,7 @@ def begin_islands_kernel(
 @wp.kernel
 def join_islands_kernel(
     # State:
-    contact_count: wp.array[int],  # (one)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
-    shape_body: wp.array[int],  # (shape)
+    contacts: Contacts,
     # Out:
     parent_inout: wp.array[int],  # (body)
 ):
@@ -167,10 +165,10 @@ def join_islands_kernel(
     any order of threads. Launched over contact.
     """
     contact = wp.tid()
-    if contact >= contact_count[0]:
+    if contact >= contacts.count[0]:
         return
-    one = body_of(shape_body, shape0[contact])
-    other = body_of(shape_body, shape1[contact])
+    one = body_of(contacts.shape_body, contacts.shape0[contact])
+    other = body_of(contacts.shape_body, contacts.shape1[contact])
     if one < 0 or other < 0:
         return
     one = find_root(parent_inout, one)
@@ -199,21 +197,15 @@ def judge_sleep_kernel(
     layout: LayoutData,
     threshold: float,
     # State:
-    phase: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    displacement: wp.array2d[float],  # (world, instance) [m]
-    removed: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
+    state: Worlds,
+    attempts: Attempts,
+    seals: Seals,
     parent: wp.array[int],  # (body)
+    sleepers_inout: Sleepers,
     # Out:
     restless_inout: wp.array[int],  # (body), zero before the launch
     woken_inout: wp.array2d[int],  # (world, slot)
-    asleep_inout: wp.array2d[int],  # (world, slot)
-    island_inout: wp.array2d[int],  # (world, slot)
-    quiet_inout: wp.array2d[int],  # (world, slot) [ticks]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    body_qd_out: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    motion_out: Motion,
 ):
     """Put islands to sleep in which every object was quiet for QUIET_TICKS ticks and none is attached to a cup or touches the gripper; wake
     sleeping islands of which an object was attached or removed. Outside of phase ACT all are awake.
@@ -222,35 +214,35 @@ def judge_sleep_kernel(
     """
     world = wp.tid()
     first = world * layout.bodies + layout.gripper_bodies
-    if phase[world] != Phase.ACT:
+    if state.phase[world] != Phase.ACT:
         for slot in range(layout.slots):
-            asleep_inout[world, slot] = 0
-            quiet_inout[world, slot] = 0
+            sleepers_inout.asleep[world, slot] = 0
+            sleepers_inout.quiet[world, slot] = 0
             woken_inout[world, slot] = 0
         return
     for body in range(world * layout.bodies, first):
         restless_inout[find_root(parent, body)] = 1
     for instance in range(layout.instances):
-        slot = body_slot[world, instance]
-        is_gone = removed[world, instance] != 0
-        if is_gone or catalog_index[world, instance] >= 0:
-            is_held = is_gone or attached[world, instance] != 0
-            quiet = wp.where(not is_held and displacement[world, instance] <= threshold, quiet_inout[world, slot] + 1, 0)
-            quiet_inout[world, slot] = quiet
-            if asleep_inout[world, slot] == 0 and quiet < QUIET_TICKS:
+        slot = state.body_slot[world, instance]
+        is_gone = attempts.removed[world, instance] != 0
+        if is_gone or state.catalog_index[world, instance] >= 0:
+            is_held = is_gone or seals.attached[world, instance] != 0
+            quiet = wp.where(not is_held and state.displacement[world, instance] <= threshold, sleepers_inout.quiet[world, slot] + 1, 0)
+            sleepers_inout.quiet[world, slot] = quiet
+            if sleepers_inout.asleep[world, slot] == 0 and quiet < QUIET_TICKS:
                 restless_inout[find_root(parent, first + slot)] = 1
-            if asleep_inout[world, slot] != 0 and is_held:
-                woken_inout[world, island_inout[world, slot]] = 1
+            if sleepers_inout.asleep[world, slot] != 0 and is_held:
+                woken_inout[world, sleepers_inout.island[world, slot]] = 1
     for instance in range(layout.instances):
-        slot = body_slot[world, instance]
-        if removed[world, instance] != 0 or catalog_index[world, instance] >= 0:
-            if asleep_inout[world, slot] != 0:
-                if woken_inout[world, island_inout[world, slot]] != 0:
-                    asleep_inout[world, slot] = 0
-                    quiet_inout[world, slot] = 0
+        slot = state.body_slot[world, instance]
+        if attempts.removed[world, instance] != 0 or state.catalog_index[world, instance] >= 0:
+            if sleepers_inout.asleep[world, slot] != 0:
+                if woken_inout[world, sleepers_inout.island[world, slot]] != 0:
+                    sleepers_inout.asleep[world, slot] = 0
+                    sleepers_inout.quiet[world, slot] = 0
             elif restless_inout[find_root(parent, first + slot)] == 0:
-                asleep_inout[world, slot] = 1
-                island_inout[world, slot] = find_root(parent, first + slot) - first
-                stop(layout, world, slot, joint_qd_out, body_qd_out)
+                sleepers_inout.asleep[world, slot] = 1
+                sleepers_inout.island[world, slot] = find_root(parent, first + slot) - first
+                stop(layout, world, slot, motion_out.joint_qd, motion_out.body_qd)
     for slot in range(layout.slots):
         woken_inout[world, slot] = 0

@@ -6,6 +6,7 @@ A row of the log, called "place", is an instance; the rows of the gripper shaft 
 import warp as wp
 
 from synpick_warp.codes import Mode, Phase, Task
+from synpick_warp.kernels.state import Attempts, Contacts, Control, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -17,14 +18,42 @@ COUNTS_PER_NEWTON = wp.constant(1048576.0)
 MAGNITUDE = wp.constant(3)
 
 
+@wp.struct
+class StepLog:
+    """Step log of a tick: poses, velocities, contact and seal forces, and what the gripper does in each step."""
+
+    pose: wp.array3d[wp.transform]
+    """(world, step, place): body to world at the step's end [m]."""
+    velocity: wp.array3d[wp.vec3]
+    """(world, step, place): linear velocity of the centre of mass [m/s]."""
+    angular_velocity: wp.array3d[wp.vec3]
+    """(world, step, place): angular velocity in the world's axes [rad/s]."""
+    contact_force: wp.array3d[wp.vec3]
+    """(world, step, place): vector sum of all contact forces on the body, mean over the step [N]."""
+    contact_load: wp.array3d[float]
+    """(world, step, place): sum of their magnitudes, mean over the step [N]."""
+    seal_force: wp.array3d[float]
+    """(world, step, instance): tension and shear of the instance's seal, that of a seal that broke in the step included [N]; 0: no seal."""
+    attached: wp.array3d[wp.uint8]
+    """(world, step, instance): 1: a seal holds the instance at the step's end."""
+    setpoint: wp.array2d[wp.vec3]
+    """(world, step): setpoint of the wrist in the step [m]; NaN: none."""
+    impedance_force: wp.array2d[wp.vec3]
+    """(world, step): impedance force on the gripper, without gravity compensation [N]."""
+    task: wp.array2d[wp.int8]
+    """(world, step): `Task` at the step's end."""
+    cup_force: wp.array3d[float]
+    """(world, step, cup): tension and shear of each cup's seals in the step, as `seal_force` [N]."""
+
+
 @wp.func
-def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2d[int], body_slot: wp.array2d[int]) -> int:
+def body_of(layout: LayoutData, world: int, place: int, state: Worlds) -> int:
     """Body index of row `place` of the step log: of an instance, then of the gripper shaft and the cup; -1: no such instance."""
     if place >= layout.instances:
         return world * layout.bodies + place - layout.instances
-    if catalog_index[world, place] < 0:
+    if state.catalog_index[world, place] < 0:
         return -1
-    return world * layout.bodies + layout.gripper_bodies + body_slot[world, place]
+    return world * layout.bodies + layout.gripper_bodies + state.body_slot[world, place]
 
 
 @wp.func
@@ -37,12 +66,8 @@ def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
 
 @wp.kernel
 def sum_contacts_kernel(
-    # Scene:
-    shape_body: wp.array[int],  # (shape)
     # State:
-    contact_count: wp.array[int],  # (one)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
+    contacts: Contacts,
     # In:
     contact_force: wp.array[wp.spatial_vector],  # (contact) [N, N·m]
     # Out:
@@ -53,29 +78,26 @@ def sum_contacts_kernel(
     Forces that are not finite are left out. Launched over contact.
     """
     contact = wp.tid()
-    if contact >= contact_count[0]:
+    if contact >= contacts.count[0]:
         return
     force = wp.spatial_top(contact_force[contact])
     if not wp.isfinite(force):
         return
     for side in range(2):
-        shape = shape0[contact]
+        shape = contacts.shape0[contact]
         if side == 1:
-            shape = shape1[contact]
+            shape = contacts.shape1[contact]
             force = -force
-        if shape >= 0 and shape_body[shape] >= 0:
-            add_force(shape_body[shape], force, total_inout)
+        if shape >= 0 and contacts.shape_body[shape] >= 0:
+            add_force(contacts.shape_body[shape], force, total_inout)
 
 
 @wp.kernel
 def sum_supports_kernel(
     # Scene:
     layout: LayoutData,
-    shape_body: wp.array[int],  # (shape)
     # State:
-    contact_count: wp.array[int],  # (one)
-    shape0: wp.array[int],  # (contact)
-    shape1: wp.array[int],  # (contact)
+    contacts: Contacts,
     # In:
     contact_force: wp.array[wp.spatial_vector],  # (contact) [N, N·m]
     # Out:
@@ -86,14 +108,14 @@ def sum_supports_kernel(
     Column `other` is the body's index in its world; the last one is for everything static: bins and table. Launched over contact.
     """
     contact = wp.tid()
-    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
+    if contact >= contacts.count[0] or contacts.shape0[contact] < 0 or contacts.shape1[contact] < 0:
         return
     upward = contact_force[contact][2]
     if not wp.isfinite(upward):
         return
     counts = wp.int64(wp.rint(upward * COUNTS_PER_NEWTON))
-    a = shape_body[shape0[contact]]
-    b = shape_body[shape1[contact]]
+    a = contacts.shape_body[contacts.shape0[contact]]
+    b = contacts.shape_body[contacts.shape1[contact]]
     static = total_inout.shape[1] - 1
     if a >= 0:
         wp.atomic_add(total_inout, a, wp.where(b >= 0, b % layout.bodies, static), counts)
@@ -107,8 +129,7 @@ def record_supports_kernel(
     layout: LayoutData,
     scale: float,
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
+    state: Worlds,
     # In:
     total: wp.array2d[wp.int64],  # (body, other)
     # Out:
@@ -119,10 +140,10 @@ def record_supports_kernel(
     The last axis indexes supporters: the instances, then one entry for all static bodies. Launched over world, instance, supporter.
     """
     world, instance, supporter = wp.tid()
-    body = body_of(layout, world, instance, catalog_index, body_slot)
+    body = body_of(layout, world, instance, state)
     other = total.shape[1] - 1
     if supporter < layout.instances:
-        other = body_of(layout, world, supporter, catalog_index, body_slot)
+        other = body_of(layout, world, supporter, state)
         if other >= 0:
             other = other % layout.bodies
     support = float(0.0)
@@ -137,7 +158,7 @@ def save_impedance_force_kernel(
     layout: LayoutData,
     weight: float,
     # State:
-    joint_f: wp.array[float],  # (dof) [N, N·m]
+    control: Control,
     # Out:
     force_out: wp.array[wp.vec3],  # (world) [N]
 ):
@@ -146,39 +167,26 @@ def save_impedance_force_kernel(
     """
     world = wp.tid()
     first = world * layout.dofs
-    force_out[world] = wp.vec3(joint_f[first], joint_f[first + 1], joint_f[first + 2] - weight)
+    force_out[world] = wp.vec3(control.joint_f[first], control.joint_f[first + 1], control.joint_f[first + 2] - weight)
 
 
 @wp.kernel
-def record_motion_kernel(
-    # Scene:
-    layout: LayoutData,
-    step: int,
-    # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
-    # Out:
-    pose_out: wp.array3d[wp.transform],  # (world, step, place) [m]
-    velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [m/s]
-    angular_velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [rad/s]
-):
+def record_motion_kernel(layout: LayoutData, step: int, state: Worlds, motion: Motion, log_out: StepLog):
     """Record poses and velocities of objects, gripper shaft and cup at the end of a step; NaN for instances that are not in the scene.
 
     Launched over world, place.
     """
     world, place = wp.tid()
-    body = body_of(layout, world, place, catalog_index, body_slot)
+    body = body_of(layout, world, place, state)
     if body < 0:
         unknown = wp.vec3(wp.nan, wp.nan, wp.nan)
-        pose_out[world, step, place] = wp.transform(unknown, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
-        velocity_out[world, step, place] = unknown
-        angular_velocity_out[world, step, place] = unknown
+        log_out.pose[world, step, place] = wp.transform(unknown, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
+        log_out.velocity[world, step, place] = unknown
+        log_out.angular_velocity[world, step, place] = unknown
         return
-    pose_out[world, step, place] = body_q[body]
-    velocity_out[world, step, place] = wp.spatial_top(body_qd[body])
-    angular_velocity_out[world, step, place] = wp.spatial_bottom(body_qd[body])
+    log_out.pose[world, step, place] = motion.body_q[body]
+    log_out.velocity[world, step, place] = wp.spatial_top(motion.body_qd[body])
+    log_out.angular_velocity[world, step, place] = wp.spatial_bottom(motion.body_qd[body])
 
 
 @wp.kernel
@@ -188,17 +196,12 @@ def record_forces_kernel(
     step: int,
     substep_fraction: float,
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    seal_force: wp.array2d[float],  # (world, instance) [N]
+    state: Worlds,
+    seals: Seals,
     # In:
     total: wp.array2d[wp.int64],  # (body, column)
     # Out:
-    contact_force_out: wp.array3d[wp.vec3],  # (world, step, place) [N]
-    contact_load_out: wp.array3d[float],  # (world, step, place) [N]
-    seal_force_out: wp.array3d[float],  # (world, step, instance) [N]
-    attached_out: wp.array3d[wp.uint8],  # (world, step, instance)
+    log_out: StepLog,
 ):
     """Record contact and seal forces of a step; instances that are not in the scene have NaN, and 0 in `attached`.
 
@@ -207,23 +210,23 @@ def record_forces_kernel(
     step's end. Launched over world, place.
     """
     world, place = wp.tid()
-    body = body_of(layout, world, place, catalog_index, body_slot)
+    body = body_of(layout, world, place, state)
     force = wp.vec3(wp.nan, wp.nan, wp.nan)
     magnitude = float(wp.nan)
     if body >= 0:
         scale = substep_fraction / COUNTS_PER_NEWTON
         force = wp.vec3(scale * float(total[body, 0]), scale * float(total[body, 1]), scale * float(total[body, 2]))
         magnitude = scale * float(total[body, MAGNITUDE])
-    contact_force_out[world, step, place] = force
-    contact_load_out[world, step, place] = magnitude
+    log_out.contact_force[world, step, place] = force
+    log_out.contact_load[world, step, place] = magnitude
     if place < layout.instances:
         seal = float(wp.nan)
         holds = int(0)
         if body >= 0:
-            seal = seal_force[world, place]
-            holds = wp.where(attached[world, place] != 0, 1, 0)
-        seal_force_out[world, step, place] = seal
-        attached_out[world, step, place] = wp.uint8(holds)
+            seal = seals.seal_force[world, place]
+            holds = wp.where(seals.attached[world, place] != 0, 1, 0)
+        log_out.seal_force[world, step, place] = seal
+        log_out.attached[world, step, place] = wp.uint8(holds)
 
 
 @wp.kernel
@@ -231,32 +234,27 @@ def record_gripper_kernel(
     # Scene:
     step: int,
     # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    setpoint: wp.array[wp.vec3],  # (world) [m]
-    cup_force: wp.array2d[float],  # (world, cup) [N]
+    state: Worlds,
+    attempts: Attempts,
+    seals: Seals,
     # In:
     force: wp.array[wp.vec3],  # (world) [N]
     # Out:
-    setpoint_out: wp.array2d[wp.vec3],  # (world, step) [m]
-    force_out: wp.array2d[wp.vec3],  # (world, step) [N]
-    task_out: wp.array2d[wp.int8],  # (world, step)
-    cup_force_out: wp.array3d[float],  # (world, step, cup) [N]
+    log_out: StepLog,
 ):
     """Record the gripper's task, setpoint (NaN without one), impedance force and forces of its cups in a step. Launched over world."""
     world = wp.tid()
     current_task = int(Task.NONE)
-    if phase[world] == Phase.ACT:
-        current_task = task[world]
+    if state.phase[world] == Phase.ACT:
+        current_task = attempts.task[world]
     target = wp.vec3(wp.nan, wp.nan, wp.nan)
-    if phase[world] == Phase.ACT and (mode[world] == Mode.MOVE or current_task >= Task.APPROACH):
-        target = setpoint[world]
-    setpoint_out[world, step] = target
-    force_out[world, step] = force[world]
-    task_out[world, step] = wp.int8(current_task)
-    for cup in range(cup_force.shape[1]):
-        cup_force_out[world, step, cup] = cup_force[world, cup]
+    if state.phase[world] == Phase.ACT and (state.mode[world] == Mode.MOVE or current_task >= Task.APPROACH):
+        target = state.setpoint[world]
+    log_out.setpoint[world, step] = target
+    log_out.impedance_force[world, step] = force[world]
+    log_out.task[world, step] = wp.int8(current_task)
+    for cup in range(seals.cup_force.shape[1]):
+        log_out.cup_force[world, step, cup] = seals.cup_force[world, cup]
 
 
 @wp.kernel
@@ -264,15 +262,12 @@ def save_drop_poses_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    phase: wp.array[int],  # (world)
-    progress: wp.array[wp.vec4i],  # (world) [ticks]
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
+    state: Worlds,
+    motion: Motion,
     # Out:
     drop_out: wp.array2d[wp.transform],  # (world, instance) [m]
 ):
     """Save the drop poses of objects: their poses before the first tick of phase SETTLE. Launched over world, instance."""
     world, instance = wp.tid()
-    if phase[world] == Phase.SETTLE and progress[world][0] == 0 and catalog_index[world, instance] >= 0:
-        drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+    if state.phase[world] == Phase.SETTLE and state.progress[world][0] == 0 and state.catalog_index[world, instance] >= 0:
+        drop_out[world, instance] = motion.body_q[world * layout.bodies + layout.gripper_bodies + state.body_slot[world, instance]]

@@ -7,6 +7,7 @@ from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member, has_members, pa
 from synpick_warp.kernels.sim.drop import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
+from synpick_warp.kernels.state import Attempts, Control, Motion, Observations, Plans, Seals, Worlds
 from synpick_warp.kernels.structs import TILT, BinData, DropData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -22,23 +23,7 @@ SINCE_SUCCESS = wp.constant(1024)
 
 @wp.kernel
 def begin_picking_kernel(
-    # Scene:
-    layout: LayoutData,
-    # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    # Out:
-    task_out: wp.array[int],  # (world)
-    steps_out: wp.array[int],  # (world)
-    attempt_out: wp.array[int],  # (world)
-    outcome_out: wp.array[int],  # (world)
-    failures_out: wp.array[int],  # (world)
-    target_out: wp.array[int],  # (world)
-    yaw_out: wp.array[float],  # (world) [rad]
-    overflow_out: wp.array[int],  # (world)
-    removed_out: wp.array2d[int],  # (world, instance)
-    tilt_out: wp.array[float],  # (coord) [rad]
+    layout: LayoutData, state: Worlds, attempts_out: Attempts, plan_out: Plans, observation_out: Observations, control_out: Control
 ):
     """Reset the attempt state of worlds outside of phase ACT or in its first frame, in which the picking modes begin with task LOOK.
 
@@ -46,79 +31,64 @@ def begin_picking_kernel(
     contour exceeds its capacity) become 0. Launched over world.
     """
     world = wp.tid()
-    outcome_out[world] = Outcome.NONE
-    if phase[world] == Phase.ACT and frame[world] > 0:
+    attempts_out.outcome[world] = Outcome.NONE
+    if state.phase[world] == Phase.ACT and state.frame[world] > 0:
         return
-    task_out[world] = Task.NONE
-    if phase[world] == Phase.ACT and mode[world] != Mode.MOVE:
-        task_out[world] = Task.LOOK
-    steps_out[world] = 0
-    attempt_out[world] = -1
-    failures_out[world] = 0
-    target_out[world] = -1
-    yaw_out[world] = 0.0
-    overflow_out[world] = 0
-    tilt_out[world * layout.coords + TILT] = 0.0
+    attempts_out.task[world] = Task.NONE
+    if state.phase[world] == Phase.ACT and state.mode[world] != Mode.MOVE:
+        attempts_out.task[world] = Task.LOOK
+    attempts_out.steps[world] = 0
+    attempts_out.attempt[world] = -1
+    attempts_out.failures[world] = 0
+    plan_out.target[world] = -1
+    plan_out.yaw[world] = 0.0
+    observation_out.overflow[world] = 0
+    control_out.joint_target_q[world * layout.coords + TILT] = 0.0
     for instance in range(layout.instances):
-        removed_out[world, instance] = 0
+        attempts_out.removed[world, instance] = 0
 
 
 @wp.kernel
-def clear_seals_kernel(
-    # State:
-    phase: wp.array[int],  # (world)
-    # Out:
-    attached_out: wp.array2d[int],  # (world, instance)
-):
+def clear_seals_kernel(state: Worlds, seals_out: Seals):
     """Release all seals of worlds outside of phase ACT: the last episode may have ended during a lift. Launched over world, instance."""
     world, instance = wp.tid()
-    if phase[world] != Phase.ACT:
-        attached_out[world, instance] = 0
+    if state.phase[world] != Phase.ACT:
+        seals_out.attached[world, instance] = 0
 
 
 @wp.kernel
 def remove_lost_kernel(
-    # Scene:
     layout: LayoutData,
     settle: SettleData,
     pick: PickData,
     bins: BinData,
-    # State:
-    phase: wp.array[int],  # (world)
-    body_slot: wp.array2d[int],  # (world, instance)
-    displacement: wp.array2d[float],  # (world, instance) [m]
-    body_q: wp.array[wp.transform],  # (body) [m]
-    catalog_index_inout: wp.array2d[int],  # (world, instance)
-    # Out:
-    removed_out: wp.array2d[int],  # (world, instance)
-    attached_out: wp.array2d[int],  # (world, instance)
+    state_inout: Worlds,
+    motion: Motion,
+    attempts_out: Attempts,
+    seals_out: Seals,
 ):
     """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the bin; `removed` becomes LOST.
 
     `displacement` is an object's motion in the last tick. Launched over world, instance.
     """
     world, instance = wp.tid()
-    if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
+    if state_inout.phase[world] != Phase.ACT or state_inout.catalog_index[world, instance] < 0:
         return
-    position = wp.transform_get_translation(body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]])
-    beside = is_outside(position, bins, world) and displacement[world, instance] < settle.relaxed_rest_threshold
+    position = wp.transform_get_translation(
+        motion.body_q[world * layout.bodies + layout.gripper_bodies + state_inout.body_slot[world, instance]]
+    )
+    beside = is_outside(position, bins, world) and state_inout.displacement[world, instance] < settle.relaxed_rest_threshold
     if beside or position[2] < pick.floor:
-        catalog_index_inout[world, instance] = -1
-        removed_out[world, instance] = Removal.LOST
-        attached_out[world, instance] = 0
+        state_inout.catalog_index[world, instance] = -1
+        attempts_out.removed[world, instance] = Removal.LOST
+        seals_out.attached[world, instance] = 0
 
 
 @wp.kernel
-def pack_attached_kernel(
-    # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    # Out:
-    attached_words_out: wp.array2d[wp.uint32],  # (world, word)
-):
+def pack_attached_kernel(state: Worlds, seals: Seals, attempts_out: Attempts):
     """Pack the attached instances of each world into a bit set. Launched over world, word."""
     world, word = wp.tid()
-    attached_words_out[world, word] = pack_word(attached, catalog_index, world, word)
+    attempts_out.attached_words[world, word] = pack_word(seals.attached, state.catalog_index, world, word)
 
 
 @wp.func
@@ -144,193 +114,133 @@ def count_failures(failures: int, outcome: int, mode: int, pick: PickData) -> in
 
 
 @wp.kernel
-def advance_tasks_kernel(
-    # Scene:
-    move: MoveData,
-    pick: PickData,
-    # State:
-    phase: wp.array[int],  # (world)
-    mode: wp.array[int],  # (world)
-    setpoint: wp.array[wp.vec3],  # (world) [m]
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    target: wp.array[int],  # (world)
-    engaged_words: wp.array2d[wp.uint32],  # (world, word)
-    attached_words: wp.array2d[wp.uint32],  # (world, word)
-    task_inout: wp.array[int],  # (world)
-    steps_inout: wp.array[int],  # (world)
-    failures_inout: wp.array[int],  # (world)
-    # Out:
-    outcome_out: wp.array[int],  # (world)
-):
+def advance_tasks_kernel(move: MoveData, pick: PickData, state: Worlds, plan: Plans, attempts_inout: Attempts):
     """Task transitions at the end of a tick: PRESS to LIFT; end of an attempt after LIFT, or after a LOOK without target (NOTHING_SEEN).
 
     The end writes `outcome`, counts failures and starts LOOK; `kernels.sim.gripper` has the transitions between. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
+    if state.phase[world] != Phase.ACT or state.mode[world] == Mode.MOVE:
         return
-    task = task_inout[world]
+    task = attempts_inout.task[world]
     outcome = int(Outcome.NONE)
-    if task == Task.PRESS and steps_inout[world] >= pick.press_steps:
-        task_inout[world] = Task.LIFT
-        steps_inout[world] = 0
+    if task == Task.PRESS and attempts_inout.steps[world] >= pick.press_steps:
+        attempts_inout.task[world] = Task.LIFT
+        attempts_inout.steps[world] = 0
     elif (
         task == Task.LIFT
-        and wp.length(setpoint[world] - task_setpoint(Task.LIFT, point[world], normal[world], pick, move.tcp_offset)) < ARRIVED
+        and wp.length(state.setpoint[world] - task_setpoint(Task.LIFT, plan.point[world], plan.normal[world], pick, move.tcp_offset))
+        < ARRIVED
     ):
-        outcome = judge_attempt(target[world], engaged_words, attached_words, world)
-    elif task == Task.LOOK and target[world] < 0 and steps_inout[world] > 0:
+        outcome = judge_attempt(plan.target[world], attempts_inout.engaged_words, attempts_inout.attached_words, world)
+    elif task == Task.LOOK and plan.target[world] < 0 and attempts_inout.steps[world] > 0:
         outcome = Outcome.NOTHING_SEEN
     if outcome != Outcome.NONE:
-        outcome_out[world] = outcome
-        failures_inout[world] = count_failures(failures_inout[world], outcome, mode[world], pick)
-        task_inout[world] = Task.LOOK
-        steps_inout[world] = 0
+        attempts_inout.outcome[world] = outcome
+        attempts_inout.failures[world] = count_failures(attempts_inout.failures[world], outcome, state.mode[world], pick)
+        attempts_inout.task[world] = Task.LOOK
+        attempts_inout.steps[world] = 0
 
 
 @wp.kernel
-def count_target_failures_kernel(
-    # State:
-    phase: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    outcome: wp.array[int],  # (world)
-    target: wp.array[int],  # (world)
-    # Out:
-    target_failures_inout: wp.array2d[int],  # (world, instance)
-):
+def count_target_failures_kernel(state: Worlds, attempts_inout: Attempts, plan: Plans):
     """Count the failed attempts at each instance where an attempt has ended in this tick; 0 before the second frame of phase ACT.
 
     1 for each in the episode, plus SINCE_SUCCESS for each since the world's last success. Launched over world, instance.
     """
     world, instance = wp.tid()
-    if phase[world] != Phase.ACT or frame[world] == 0:
-        target_failures_inout[world, instance] = 0
-    elif outcome[world] >= Outcome.DROPPED and target[world] == instance:
-        target_failures_inout[world, instance] = target_failures_inout[world, instance] + SINCE_SUCCESS + 1
-    elif outcome[world] == Outcome.TARGET_PICKED or outcome[world] == Outcome.OTHER_PICKED:
-        target_failures_inout[world, instance] = target_failures_inout[world, instance] % SINCE_SUCCESS
+    if state.phase[world] != Phase.ACT or state.frame[world] == 0:
+        attempts_inout.target_failures[world, instance] = 0
+    elif attempts_inout.outcome[world] >= Outcome.DROPPED and plan.target[world] == instance:
+        attempts_inout.target_failures[world, instance] = attempts_inout.target_failures[world, instance] + SINCE_SUCCESS + 1
+    elif attempts_inout.outcome[world] == Outcome.TARGET_PICKED or attempts_inout.outcome[world] == Outcome.OTHER_PICKED:
+        attempts_inout.target_failures[world, instance] = attempts_inout.target_failures[world, instance] % SINCE_SUCCESS
 
 
 @wp.kernel
 def end_attempts_kernel(
-    # Scene:
     layout: LayoutData,
     drop: DropData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    attached_words: wp.array2d[wp.uint32],  # (world, word)
-    # Out:
-    catalog_index_out: wp.array2d[int],  # (world, instance)
-    removed_out: wp.array2d[int],  # (world, instance)
-    attached_out: wp.array2d[int],  # (world, instance)
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    tilt_out: wp.array[float],  # (coord) [rad]
+    state_inout: Worlds,
+    attempts_inout: Attempts,
+    seals_out: Seals,
+    motion_out: Motion,
+    control_out: Control,
 ):
     """At task LOOK: release and remove attached objects (`removed` becomes PICKED), and place the gripper at `gripper_home`, cup upright.
 
     Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT or task[world] != Task.LOOK:
+    if state_inout.phase[world] != Phase.ACT or attempts_inout.task[world] != Task.LOOK:
         return
     for instance in range(layout.instances):
-        if has_member(attached_words, world, instance):
-            catalog_index_out[world, instance] = -1
-            removed_out[world, instance] = Removal.PICKED
-        attached_out[world, instance] = 0
-    place_gripper(layout, world, drop.gripper_home, 0.0, joint_q_out, joint_qd_out)
-    tilt_out[world * layout.coords + TILT] = 0.0
+        if has_member(attempts_inout.attached_words, world, instance):
+            state_inout.catalog_index[world, instance] = -1
+            attempts_inout.removed[world, instance] = Removal.PICKED
+        seals_out.attached[world, instance] = 0
+    place_gripper(layout, world, drop.gripper_home, 0.0, motion_out.joint_q, motion_out.joint_qd)
+    control_out.joint_target_q[world * layout.coords + TILT] = 0.0
 
 
 @wp.kernel
-def park_removed_kernel(
-    # Scene:
-    layout: LayoutData,
-    # State:
-    body_slot: wp.array2d[int],  # (world, instance)
-    removed: wp.array2d[int],  # (world, instance)
-    # Out:
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    joint_f_out: wp.array[float],  # (dof) [N, N·m]
-):
+def park_removed_kernel(layout: LayoutData, state: Worlds, attempts: Attempts, motion_out: Motion, control_out: Control):
     """Park removed objects far below, each at its own position; in every tick, since they are simulated on and fall some centimetres.
 
     Launched over world, instance.
     """
     world, instance = wp.tid()
-    if removed[world, instance] == 0:
+    if attempts.removed[world, instance] == 0:
         return
-    slot = body_slot[world, instance]
+    slot = state.body_slot[world, instance]
     q = world * layout.coords + layout.gripper_dofs + 7 * slot
     qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
     position = wp.vec3(PARKED_PITCH * float(slot + 1), 0.0, PARKED_HEIGHT)
-    write_body(joint_q_out, joint_qd_out, q, qd, wp.transform(position, wp.quat_identity()))
+    write_body(motion_out.joint_q, motion_out.joint_qd, q, qd, wp.transform(position, wp.quat_identity()))
     for axis in range(6):
-        joint_f_out[qd + axis] = 0.0
+        control_out.joint_f[qd + axis] = 0.0
 
 
 @wp.kernel
-def begin_attempts_kernel(
-    # State:
-    phase: wp.array[int],  # (world)
-    target: wp.array[int],  # (world)
-    task_inout: wp.array[int],  # (world)
-    attempt_inout: wp.array[int],  # (world)
-    # Out:
-    steps_out: wp.array[int],  # (world)
-    hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
-):
+def begin_attempts_kernel(state: Worlds, plan: Plans, attempts_inout: Attempts):
     """Begin an attempt in worlds at task LOOK after perception: no ray hits, no engaged instances; with a target, change to APPROACH.
 
     Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT or task_inout[world] != Task.LOOK:
+    if state.phase[world] != Phase.ACT or attempts_inout.task[world] != Task.LOOK:
         return
-    attempt_inout[world] = attempt_inout[world] + 1
-    steps_out[world] = 0
-    hits_out[world] = wp.vec2i(0, 0)
-    for word in range(engaged_words_out.shape[1]):
-        engaged_words_out[world, word] = NO_MEMBERS
-    if target[world] >= 0:
-        task_inout[world] = Task.APPROACH
+    attempts_inout.attempt[world] = attempts_inout.attempt[world] + 1
+    attempts_inout.steps[world] = 0
+    attempts_inout.hits[world] = wp.vec2i(0, 0)
+    for word in range(attempts_inout.engaged_words.shape[1]):
+        attempts_inout.engaged_words[world, word] = NO_MEMBERS
+    if plan.target[world] >= 0:
+        attempts_inout.task[world] = Task.APPROACH
 
 
 @wp.kernel
 def place_grippers_kernel(
-    # Scene:
     layout: LayoutData,
     move: MoveData,
     pick: PickData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    tilt: wp.array[float],  # (world) [rad]
-    # Out:
-    setpoint_out: wp.array[wp.vec3],  # (world) [m]
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    tilt_out: wp.array[float],  # (coord) [rad]
+    state_inout: Worlds,
+    attempts: Attempts,
+    plan: Plans,
+    motion_out: Motion,
+    control_out: Control,
 ):
     """Place the gripper far above the grasp point, its cup tilted, where an APPROACH begins; the setpoint starts there.
 
     Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT or task[world] != Task.APPROACH or steps[world] != 0:
+    if state_inout.phase[world] != Phase.ACT or attempts.task[world] != Task.APPROACH or attempts.steps[world] != 0:
         return
-    setpoint = point[world] + move.tcp_offset * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
-    setpoint_out[world] = setpoint
-    place_gripper(layout, world, setpoint, tilt[world], joint_q_out, joint_qd_out)
-    tilt_out[world * layout.coords + TILT] = tilt[world]
+    setpoint = plan.point[world] + move.tcp_offset * plan.normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
+    state_inout.setpoint[world] = setpoint
+    place_gripper(layout, world, setpoint, plan.tilt[world], motion_out.joint_q, motion_out.joint_qd)
+    control_out.joint_target_q[world * layout.coords + TILT] = plan.tilt[world]
 
 
 @wp.kernel
@@ -338,7 +248,7 @@ def set_shaft_collision_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    mode: wp.array[int],  # (world)
+    state: Worlds,
     # Out:
     shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
@@ -347,4 +257,4 @@ def set_shaft_collision_kernel(
     Launched over world.
     """
     world = wp.tid()
-    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_pose(mode[world] == Mode.MOVE)
+    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_pose(state.mode[world] == Mode.MOVE)

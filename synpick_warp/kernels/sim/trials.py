@@ -7,6 +7,7 @@ from synpick_warp.kernels.bitsets import NO_MEMBERS, has_member, has_members
 from synpick_warp.kernels.grasps import Grasps
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.tasks import ARRIVED, judge_attempt
+from synpick_warp.kernels.state import Attempts, Control, Motion, Plans, Seals, Worlds
 from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -156,36 +157,31 @@ def begin_trials_kernel(
     layout: LayoutData,
     # State:
     row: wp.array[int],  # (world)
-    removed: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
+    attempts_inout: Attempts,
+    state: Worlds,
+    motion: Motion,
     # Out:
     progress_inout: Progress,
-    task_out: wp.array[int],  # (world)
-    steps_out: wp.array[int],  # (world)
-    failures_out: wp.array[int],  # (world)
-    hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
 ):
     """Reset attempt state and `Progress` of worlds that begin a trial (`row` is not -1), with task APPROACH. Launched over world."""
     world = wp.tid()
     if row[world] < 0:
         return
-    task_out[world] = Task.APPROACH
-    steps_out[world] = 0
-    failures_out[world] = NO_FAILURES
-    hits_out[world] = wp.vec2i(0, 0)
-    for word in range(engaged_words_out.shape[1]):
-        engaged_words_out[world, word] = NO_MEMBERS
+    attempts_inout.task[world] = Task.APPROACH
+    attempts_inout.steps[world] = 0
+    attempts_inout.failures[world] = NO_FAILURES
+    attempts_inout.hits[world] = wp.vec2i(0, 0)
+    for word in range(attempts_inout.engaged_words.shape[1]):
+        attempts_inout.engaged_words[world, word] = NO_MEMBERS
     progress_inout.ticks[world] = 0
     progress_inout.settling[world] = ATTEMPT
     progress_inout.held[world] = 0
     progress_inout.peak_force[world] = 0.0
     progress_inout.load[world] = 0.0
-    progress_inout.lost[world] = count_lost(removed, world)
+    progress_inout.lost[world] = count_lost(attempts_inout.removed, world)
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
-        progress_inout.pose[world, instance] = body_q[body + body_slot[world, instance]]
+        progress_inout.pose[world, instance] = motion.body_q[body + state.body_slot[world, instance]]
 
 
 @wp.kernel
@@ -208,95 +204,65 @@ def set_friction_kernel(
 
 @wp.kernel
 def place_near_kernel(
-    # Scene:
     layout: LayoutData,
     move: MoveData,
     course: TrialData,
-    # State:
-    phase: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    tilt: wp.array[float],  # (world) [rad]
-    task_inout: wp.array[int],  # (world)
-    # Out:
-    setpoint_out: wp.array[wp.vec3],  # (world) [m]
-    joint_q_out: wp.array[float],  # (coord) [m, rad]
-    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
-    tilt_out: wp.array[float],  # (coord) [rad]
+    state_inout: Worlds,
+    attempts_inout: Attempts,
+    plan: Plans,
+    motion_out: Motion,
+    control_out: Control,
 ):
     """Place the gripper at distance `course.near` from the grasp point in worlds that begin a trial; DESCEND replaces task APPROACH.
 
     `tilt_out` is the drive target of the tilt joint. Launched over world.
     """
     world = wp.tid()
-    if phase[world] != Phase.ACT or task_inout[world] != Task.APPROACH or steps[world] != 0:
+    if state_inout.phase[world] != Phase.ACT or attempts_inout.task[world] != Task.APPROACH or attempts_inout.steps[world] != 0:
         return
-    task_inout[world] = Task.DESCEND
-    setpoint = point[world] + (move.tcp_offset + course.near) * normal[world]
-    setpoint_out[world] = setpoint
-    place_gripper(layout, world, setpoint, tilt[world], joint_q_out, joint_qd_out)
-    tilt_out[world * layout.coords + TILT] = tilt[world]
+    attempts_inout.task[world] = Task.DESCEND
+    setpoint = plan.point[world] + (move.tcp_offset + course.near) * plan.normal[world]
+    state_inout.setpoint[world] = setpoint
+    place_gripper(layout, world, setpoint, plan.tilt[world], motion_out.joint_q, motion_out.joint_qd)
+    control_out.joint_target_q[world * layout.coords + TILT] = plan.tilt[world]
 
 
 @wp.kernel
-def watch_seals_kernel(
-    # State:
-    attached: wp.array2d[int],  # (world, instance)
-    # Out:
-    progress_inout: Progress,
-):
+def watch_seals_kernel(seals: Seals, progress_inout: Progress):
     """Count the steps with an attached object in running attempts; once a step, after the seal forces. Launched over world."""
     world = wp.tid()
     if progress_inout.trial[world] < 0 or progress_inout.settling[world] != ATTEMPT:
         return
-    for instance in range(attached.shape[1]):
-        if attached[world, instance] != 0:
+    for instance in range(seals.attached.shape[1]):
+        if seals.attached[world, instance] != 0:
             progress_inout.held[world] = progress_inout.held[world] + 1
             return
 
 
 @wp.kernel
-def advance_trials_kernel(
-    # Scene:
-    move: MoveData,
-    pick: PickData,
-    course: TrialData,
-    # State:
-    phase: wp.array[int],  # (world)
-    setpoint: wp.array[wp.vec3],  # (world) [m]
-    point: wp.array[wp.vec3],  # (world) [m]
-    normal: wp.array[wp.vec3],  # (world)
-    target: wp.array[int],  # (world)
-    engaged_words: wp.array2d[wp.uint32],  # (world, word)
-    attached_words: wp.array2d[wp.uint32],  # (world, word)
-    task_inout: wp.array[int],  # (world)
-    steps_inout: wp.array[int],  # (world)
-    # Out:
-    outcome_out: wp.array[int],  # (world)
-):
+def advance_trials_kernel(move: MoveData, pick: PickData, course: TrialData, state: Worlds, plan: Plans, attempts_inout: Attempts):
     """State machine of trials at the end of a tick: PRESS to LIFT by time; LIFT to LOOK after lift and hold, or once nothing is attached.
 
     The transition to LOOK writes `outcome`. Launched over world.
     """
     world = wp.tid()
-    task = task_inout[world]
-    if phase[world] != Phase.ACT or (task != Task.PRESS and task != Task.LIFT):
+    task = attempts_inout.task[world]
+    if state.phase[world] != Phase.ACT or (task != Task.PRESS and task != Task.LIFT):
         return
     if task == Task.PRESS:
-        if steps_inout[world] < pick.press_steps:
+        if attempts_inout.steps[world] < pick.press_steps:
             return
-        task_inout[world] = Task.LIFT
-        steps_inout[world] = 0
-    if has_members(attached_words, world):
-        goal = task_setpoint(Task.LIFT, point[world], normal[world], pick, move.tcp_offset)
-        if task == Task.PRESS or wp.length(setpoint[world] - goal) >= ARRIVED:
+        attempts_inout.task[world] = Task.LIFT
+        attempts_inout.steps[world] = 0
+    if has_members(attempts_inout.attached_words, world):
+        goal = task_setpoint(Task.LIFT, plan.point[world], plan.normal[world], pick, move.tcp_offset)
+        if task == Task.PRESS or wp.length(state.setpoint[world] - goal) >= ARRIVED:
             return
-        if course.hold_steps > 0 and steps_inout[world] < course.lift_steps + course.hold_steps:
+        if course.hold_steps > 0 and attempts_inout.steps[world] < course.lift_steps + course.hold_steps:
             return
-    outcome_out[world] = judge_attempt(target[world], engaged_words, attached_words, world)
-    task_inout[world] = Task.LOOK
-    steps_inout[world] = 0
+    attempts_inout.outcome[world] = judge_attempt(plan.target[world], attempts_inout.engaged_words, attempts_inout.attached_words, world)
+    attempts_inout.task[world] = Task.LOOK
+    attempts_inout.steps[world] = 0
 
 
 @wp.kernel
@@ -306,16 +272,10 @@ def judge_trials_kernel(
     course: TrialData,
     # State:
     grasps: Grasps,
-    phase: wp.array[int],  # (world)
-    ending: wp.array[int],  # (world)
-    outcome: wp.array[int],  # (world)
-    hits: wp.array[wp.vec2i],  # (world)
-    attached_words: wp.array2d[wp.uint32],  # (world, word)
-    peak: wp.array[wp.vec2],  # (world) [N]
-    catalog_index: wp.array2d[int],  # (world, instance)
-    removed: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
+    state: Worlds,
+    attempts: Attempts,
+    seals: Seals,
+    motion: Motion,
     # Out:
     progress_inout: Progress,
     labels_out: Labels,
@@ -333,17 +293,17 @@ def judge_trials_kernel(
     settling = progress_inout.settling[world] - 1
     if progress_inout.settling[world] == ATTEMPT:
         progress_inout.ticks[world] = progress_inout.ticks[world] + 1
-        progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], peak[world][0])
-        progress_inout.load[world] = wp.max(progress_inout.load[world], peak[world][1])
-        if outcome[world] == Outcome.NONE and phase[world] == Phase.ACT:
+        progress_inout.peak_force[world] = wp.max(progress_inout.peak_force[world], seals.peak[world][0])
+        progress_inout.load[world] = wp.max(progress_inout.load[world], seals.peak[world][1])
+        if attempts.outcome[world] == Outcome.NONE and state.phase[world] == Phase.ACT:
             return
         picked = int(-1)
         for instance in range(layout.instances):
-            if picked < 0 and has_member(attached_words, world, instance):
+            if picked < 0 and has_member(attempts.attached_words, world, instance):
                 picked = instance
-        labels_out.outcome[trial] = outcome[world]
-        labels_out.ending[trial] = wp.where(outcome[world] == Outcome.NONE, ending[world], 0)
-        labels_out.hits[trial] = hits[world]
+        labels_out.outcome[trial] = attempts.outcome[world]
+        labels_out.ending[trial] = wp.where(attempts.outcome[world] == Outcome.NONE, state.ending[world], 0)
+        labels_out.hits[trial] = attempts.hits[world]
         labels_out.picked[trial] = picked
         labels_out.peak_force[trial] = progress_inout.peak_force[world]
         labels_out.load[trial] = progress_inout.load[world]
@@ -351,12 +311,14 @@ def judge_trials_kernel(
         labels_out.held[trial] = progress_inout.held[world]
         settling = course.settle_ticks
     progress_inout.settling[world] = settling
-    if settling > 0 and phase[world] == Phase.ACT:
+    if settling > 0 and state.phase[world] == Phase.ACT:
         return
     target = grasps.target[trial // course.repeats]
-    moved, farthest = measure_motion(layout, world, target, course.moved_distance, catalog_index, body_slot, body_q, progress_inout.pose)
+    moved, farthest = measure_motion(
+        layout, world, target, course.moved_distance, state.catalog_index, state.body_slot, motion.body_q, progress_inout.pose
+    )
     labels_out.moved[trial] = moved
     labels_out.farthest[trial] = farthest
-    labels_out.lost[trial] = count_lost(removed, world) - progress_inout.lost[world]
+    labels_out.lost[trial] = count_lost(attempts.removed, world) - progress_inout.lost[world]
     progress_inout.trial[world] = -1
     wp.atomic_add(done_inout, 0, 1)

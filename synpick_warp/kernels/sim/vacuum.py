@@ -9,7 +9,8 @@ import warp as wp
 
 from synpick_warp.kernels.bitsets import pack_word
 from synpick_warp.kernels.rng import TAU
-from synpick_warp.kernels.sim.cup_rays import CUP, SurfaceData, cast_ray, suction_begins, tcp_pose
+from synpick_warp.kernels.sim.cup_rays import CUP, SurfaceData, first_hit, suction_begins, tcp_pose
+from synpick_warp.kernels.state import Attempts, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import CupData, LayoutData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
@@ -54,117 +55,80 @@ class Leak:
     """Area through which air enters [m²]."""
 
 
-@wp.func
-def surface_below(
-    start: wp.vec3,
-    direction: wp.vec3,
-    layout: LayoutData,
-    suction: SuctionData,
-    surface: SurfaceData,
-    world: int,
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-):
-    """Distance to the first surface along a ray [m] and its instance, -1 without one.
+@wp.struct
+class MouthRays:
+    """What lies below the rays of a cup's mouth, and what follows for the cup; scratch."""
 
-    A ray passes through the whole of each object: it ends at the bottom of a pocket, however deep, but not in a hole.
-    """
-    nearest = float(0.0)
-    hit = int(-1)
-    for instance in range(layout.instances):
-        index = catalog_index[world, instance]
-        if index >= 0:
-            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
-            radius = surface.radius[index]
-            length = BACK + suction.reach + 2.0 * radius
-            if wp.length(wp.transform_get_translation(pose) - start) <= radius + length:
-                distance = cast_ray(start, direction, length, pose, index, surface)
-                if distance >= 0.0 and (hit < 0 or distance < nearest):
-                    nearest = distance
-                    hit = instance
-    return nearest, hit
+    depth: wp.array3d[float]
+    """(world, cup, ray): depth of the first surface below the lip [m]."""
+    owner: wp.array3d[int]
+    """(world, cup, ray): its instance; -1: none."""
+    leak: wp.array2d[Leak]
+    """(world, cup): where air enters."""
 
 
 @wp.kernel
 def cast_mouth_rays_kernel(
-    # Scene:
     layout: LayoutData,
     pick: PickData,
     suction: SuctionData,
     cups: CupData,
     surface: SurfaceData,
     mouth: MouthData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    body_q: wp.array[wp.transform],  # (body) [m]
-    # Out:
-    depth_out: wp.array3d[float],  # (world, cup, ray) [m]
-    owner_out: wp.array3d[int],  # (world, cup, ray)
+    state: Worlds,
+    attempts: Attempts,
+    motion: Motion,
+    rays_out: MouthRays,
 ):
     """Write what lies below each ray of a cup's mouth where suction is switched on: instance, -1 for none, and its depth below the lip.
 
     Launched over world, cup, ray.
     """
     world, cup, ray = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick):
+    if not suction_begins(state, attempts, world, pick):
         return
-    tcp_in_world = tcp_pose(body_q[world * layout.bodies + CUP], cups.place[cup])
+    tcp_in_world = tcp_pose(motion.body_q[world * layout.bodies + CUP], cups.place[cup])
     place = mouth.ray[ray]
     start = wp.transform_point(tcp_in_world, wp.vec3(place[0], place[1], BACK))
     direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
-    distance, hit = surface_below(start, direction, layout, suction, surface, world, catalog_index, body_slot, body_q)
-    depth_out[world, cup, ray] = distance - BACK
-    owner_out[world, cup, ray] = hit
+    # A ray passes through the whole of each object: it ends at the bottom of a pocket, however deep, but not in a hole.
+    distance, hit = first_hit(start, direction, BACK + suction.reach, 2.0, layout, surface, world, state, motion)
+    rays_out.depth[world, cup, ray] = distance - BACK
+    rays_out.owner[world, cup, ray] = hit
 
 
 @wp.func
-def count_owner(instance: int, world: int, cup: int, reach: float, depth: wp.array3d[float], owner: wp.array3d[int]) -> int:
+def count_owner(instance: int, world: int, cup: int, reach: float, rays: MouthRays) -> int:
     """Number of a cup's rays that hit an instance within reach."""
     count = int(0)
-    for ray in range(owner.shape[2]):
-        if owner[world, cup, ray] == instance and depth[world, cup, ray] <= reach:
+    for ray in range(rays.owner.shape[2]):
+        if rays.owner[world, cup, ray] == instance and rays.depth[world, cup, ray] <= reach:
             count += 1
     return count
 
 
 @wp.func
-def lip_slope(
-    instance: int, world: int, cup: int, reach: float, mouth: MouthData, depth: wp.array3d[float], owner: wp.array3d[int]
-) -> wp.vec2:
+def lip_slope(instance: int, world: int, cup: int, reach: float, mouth: MouthData, rays: MouthRays) -> wp.vec2:
     """Slope of the plane through the surface below the lip (least squares), to which the cup tilts; 0 where the lip stands out."""
     slope = wp.vec2(0.0, 0.0)
     for ray in range(mouth.lip):
-        if owner[world, cup, ray] != instance or depth[world, cup, ray] > reach:
+        if rays.owner[world, cup, ray] != instance or rays.depth[world, cup, ray] > reach:
             return wp.vec2(0.0, 0.0)
-        slope += depth[world, cup, ray] * wp.vec2(mouth.ray[ray][0], mouth.ray[ray][1])
+        slope += rays.depth[world, cup, ray] * wp.vec2(mouth.ray[ray][0], mouth.ray[ray][1])
     slope *= 2.0 / (float(mouth.lip) * mouth.radius * mouth.radius)
     return slope * wp.min(1.0, mouth.tilt / wp.max(wp.length(slope), 1.0e-9))
 
 
 @wp.func
-def drop_below(ray: int, world: int, cup: int, slope: wp.vec2, mouth: MouthData, depth: wp.array3d[float]) -> float:
+def drop_below(ray: int, world: int, cup: int, slope: wp.vec2, mouth: MouthData, rays: MouthRays) -> float:
     """Depth of the surface below the plane of the tilted lip at a ray [m]."""
     place = mouth.ray[ray]
-    return depth[world, cup, ray] - slope[0] * place[0] - slope[1] * place[1]
+    return rays.depth[world, cup, ray] - slope[0] * place[0] - slope[1] * place[1]
 
 
 @wp.func
 def gap_below_lip(
-    ray: int,
-    instance: int,
-    world: int,
-    cup: int,
-    top: float,
-    slope: wp.vec2,
-    mouth: MouthData,
-    reach: float,
-    depth: wp.array3d[float],  # (world, cup, ray) [m]
-    owner: wp.array3d[int],  # (world, cup, ray)
+    ray: int, instance: int, world: int, cup: int, top: float, slope: wp.vec2, mouth: MouthData, reach: float, rays: MouthRays
 ) -> float:
     """Height of the gap between lip and surface at a ray of the lip [m].
 
@@ -173,60 +137,46 @@ def gap_below_lip(
     """
     lowest = float(mouth.compliance)
     for other in range(mouth.lip):
-        if owner[world, cup, other] == instance and depth[world, cup, other] <= reach:
+        if rays.owner[world, cup, other] == instance and rays.depth[world, cup, other] <= reach:
             apart = wp.abs(ray - other)
             way = mouth.compliance * TAU * float(wp.min(apart, mouth.lip - apart)) / float(mouth.lip)
-            lowest = wp.min(lowest, drop_below(other, world, cup, slope, mouth, depth) - top + way)
-    return drop_below(ray, world, cup, slope, mouth, depth) - top - lowest
+            lowest = wp.min(lowest, drop_below(other, world, cup, slope, mouth, rays) - top + way)
+    return drop_below(ray, world, cup, slope, mouth, rays) - top - lowest
 
 
 @wp.kernel
-def measure_leaks_kernel(
-    # Scene:
-    pick: PickData,
-    suction: SuctionData,
-    mouth: MouthData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    # In:
-    depth: wp.array3d[float],  # (world, cup, ray) [m]
-    owner: wp.array3d[int],  # (world, cup, ray)
-    # Out:
-    leak_out: wp.array2d[Leak],  # (world, cup)
-):
+def measure_leaks_kernel(pick: PickData, suction: SuctionData, mouth: MouthData, state: Worlds, attempts: Attempts, rays_inout: MouthRays):
     """Measure where air enters below each cup where suction is switched on.
 
     A cup seals with the instance that most of its rays hit, the first of several: between two objects, or beside one, air enters. Launched
     over world, cup.
     """
     world, cup = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick):
+    if not suction_begins(state, attempts, world, pick):
         return
     leak = Leak()
     leak.instance = -1
-    for ray in range(owner.shape[2]):
-        instance = owner[world, cup, ray]
-        if instance >= 0 and (ray == 0 or owner[world, cup, ray - 1] != instance):
-            count = count_owner(instance, world, cup, suction.reach, depth, owner)
+    for ray in range(rays_inout.owner.shape[2]):
+        instance = rays_inout.owner[world, cup, ray]
+        if instance >= 0 and (ray == 0 or rays_inout.owner[world, cup, ray - 1] != instance):
+            count = count_owner(instance, world, cup, suction.reach, rays_inout)
             if count > leak.hits or (count == leak.hits and instance < leak.instance):
                 leak.instance = instance
                 leak.hits = count
-    slope = lip_slope(leak.instance, world, cup, suction.reach, mouth, depth, owner)
+    slope = lip_slope(leak.instance, world, cup, suction.reach, mouth, rays_inout)
     top = float(suction.reach)
-    for ray in range(owner.shape[2]):
-        covered = leak.instance >= 0 and owner[world, cup, ray] == leak.instance
-        if covered and (ray >= mouth.lip or depth[world, cup, ray] <= suction.reach):
+    for ray in range(rays_inout.owner.shape[2]):
+        covered = leak.instance >= 0 and rays_inout.owner[world, cup, ray] == leak.instance
+        if covered and (ray >= mouth.lip or rays_inout.depth[world, cup, ray] <= suction.reach):
             leak.covered += mouth.ray[ray][2]
-            top = wp.min(top, drop_below(ray, world, cup, slope, mouth, depth))
+            top = wp.min(top, drop_below(ray, world, cup, slope, mouth, rays_inout))
         else:
             leak.open += mouth.ray[ray][2]
     arc = TAU * mouth.radius / float(mouth.lip)
     for ray in range(mouth.lip):
-        if leak.instance >= 0 and owner[world, cup, ray] == leak.instance and depth[world, cup, ray] <= suction.reach:
-            leak.open += arc * gap_below_lip(ray, leak.instance, world, cup, top, slope, mouth, suction.reach, depth, owner)
-    leak_out[world, cup] = leak
+        if leak.instance >= 0 and rays_inout.owner[world, cup, ray] == leak.instance and rays_inout.depth[world, cup, ray] <= suction.reach:
+            leak.open += arc * gap_below_lip(ray, leak.instance, world, cup, top, slope, mouth, suction.reach, rays_inout)
+    rays_inout.leak[world, cup] = leak
 
 
 @wp.func
@@ -239,47 +189,38 @@ def vacuum_left(open: float, mouth: MouthData) -> float:
 
 @wp.kernel
 def set_vacuum_kernel(
-    # Scene:
     layout: LayoutData,
     pick: PickData,
     cups: CupData,
     mouth: MouthData,
-    # State:
-    phase: wp.array[int],  # (world)
-    task: wp.array[int],  # (world)
-    steps: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    # In:
-    leak: wp.array2d[Leak],  # (world, cup)
-    # Out:
-    hits_out: wp.array[wp.vec2i],  # (world)
-    engaged_words_out: wp.array2d[wp.uint32],  # (world, word)
-    attached_inout: wp.array2d[int],  # (world, instance)
-    break_force_out: wp.array2d[float],  # (world, cup) [N]
+    state: Worlds,
+    attempts_inout: Attempts,
+    seals_inout: Seals,
+    rays: MouthRays,
 ):
     """Attach objects and set break forces where suction is switched on; outputs as of `count_seal_rays_kernel`.
 
     A cup that has nothing below it has the break force 0. With a common valve the leaks of all cups add up. Launched over world.
     """
     world = wp.tid()
-    if not suction_begins(phase[world], task[world], steps[world], pick):
+    if not suction_begins(state, attempts_inout, world, pick):
         return
     for instance in range(layout.instances):
-        attached_inout[world, instance] = 0
+        seals_inout.attached[world, instance] = 0
     total = float(0.0)
     for cup in range(cups.count):
-        total += leak[world, cup].open
+        total += rays.leak[world, cup].open
     hits = int(0)
     sealed = int(0)
     for cup in range(cups.count):
-        below = leak[world, cup]
+        below = rays.leak[world, cup]
         left = vacuum_left(wp.where(cups.common_valve != 0, total, below.open), mouth)
-        break_force_out[world, cup] = mouth.pressure * left * below.covered
+        seals_inout.break_force[world, cup] = mouth.pressure * left * below.covered
         if below.instance >= 0:
             hits += below.hits
-            attached_inout[world, below.instance] = attached_inout[world, below.instance] | (1 << cup)
+            seals_inout.attached[world, below.instance] = seals_inout.attached[world, below.instance] | (1 << cup)
             if left >= GOOD:
                 sealed = sealed | (1 << cup)
-    hits_out[world] = wp.vec2i(hits, sealed)
-    for word in range(engaged_words_out.shape[1]):
-        engaged_words_out[world, word] = pack_word(attached_inout, catalog_index, world, word)
+    attempts_inout.hits[world] = wp.vec2i(hits, sealed)
+    for word in range(attempts_inout.engaged_words.shape[1]):
+        attempts_inout.engaged_words[world, word] = pack_word(seals_inout.attached, state.catalog_index, world, word)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
+from synpick_warp.kernels.encoding.dct import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU, convert_colors_kernel, transform_blocks_kernel
 from synpick_warp.kernels.encoding.huffman import (
     CODE_BITS,
     HuffmanTables,
@@ -27,7 +27,6 @@ from synpick_warp.kernels.encoding.stuffing import (
     join_intervals_kernel,
     place_intervals_kernel,
 )
-from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
 from synpick_warp.stages.arrays import allocate_struct, device_array, struct_arrays

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -26,7 +27,7 @@ from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
-from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.launch import launch_images
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.stereo import STEREO_LAYERS, StereoRenderer
 
@@ -34,6 +35,18 @@ MAX_CLASS = 65535
 """Largest obj_id that fits into the layer `classes`."""
 MOTION_LAYERS = {"flow", "scene_flow"}
 """Layers computed from the motions of bodies."""
+KERNELS = {
+    "normals": render_normals_kernel,
+    "albedo": render_albedo_kernel,
+    "nocs": render_nocs_kernel,
+    "classes": render_classes_kernel,
+    "flow": render_flow_kernel,
+    "scene_flow": render_scene_flow_kernel,
+    "depth_sensor": render_depth_sensor_kernel,
+    "suction_seal": render_suction_seal_kernel,
+    "suction_wrench": render_suction_wrench_kernel,
+}
+"""Kernel of each layer but those of `STEREO_LAYERS`; its output is named as the layer."""
 BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
 
 
@@ -97,40 +110,16 @@ class LayerRenderer:
         scene = self.scene
         if self.motions is not None:
             self.compute_motions(snapshot, views, last)
-        surface = [scene.meshes, scene.surfaces, scene.grid, bodies, gbuffer, views]
-        sensor = [scene.meshes, scene.surfaces, scene.grid, snapshot.episode, snapshot.frame]
-        sensor += [self.sensor, bodies, gbuffer, views]
-        motion = [scene.grid, snapshot.follows, self.motions, gbuffer, views]
-        objects = [scene.meshes, scene.grid, scene.obj_id, bodies, gbuffer, views]
-        classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
-        wrench = [scene.meshes, scene.surfaces, scene.grid, scene.obj_id, scene.suction_maps, bodies, gbuffer, views]
-        seal = [*wrench[:5], scene.table, *wrench[5:]]
-        count = views.count
-        launches = {
-            "normals": lambda: self._launch(render_normals_kernel, count, surface, out.normals),
-            "albedo": lambda: self._launch(render_albedo_kernel, count, surface, out.albedo),
-            "nocs": lambda: self._launch(render_nocs_kernel, count, objects, out.nocs),
-            "classes": lambda: self._launch(render_classes_kernel, count, classes, out.classes),
-            "flow": lambda: self._launch(render_flow_kernel, count, motion, out.flow),
-            "scene_flow": lambda: self._launch(render_scene_flow_kernel, count, motion, out.scene_flow),
-            "depth_sensor": lambda: self._launch(render_depth_sensor_kernel, count, sensor, out.depth_sensor),
-            "suction_seal": lambda: self._launch(render_suction_seal_kernel, count, seal, out.suction_seal),
-            "suction_wrench": lambda: self._launch(render_suction_wrench_kernel, count, wrench, out.suction_wrench),
-        }
+        batch = SimpleNamespace(bodies=bodies, gbuffer=gbuffer, views=views, suction=scene.suction_maps)
         for name in self.names:
             if name not in STEREO_LAYERS:
-                launches[name]()
+                pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
+                launch_images(KERNELS[name], pixels, scene, self, snapshot, batch, out=out)
         if self.stereo is not None:
             self.stereo.render(snapshot, bodies, gbuffer, views, out)
 
     def compute_motions(self, snapshot: Snapshot, views: Any, last: Any) -> None:
         """Compute the motion of every body, and of the table, from this frame back to the previous one; arguments as of `render`."""
-        inputs = [snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
-        inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
-        inputs += [views, last.rotation, last.center]
+        inputs = [snapshot.bundle, views, last.rotation, last.center]
         dim = (views.count, self.motions.known.shape[1])
         wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
-
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
-        """Launch a kernel over all pixels of `count` views."""
-        launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

@@ -88,9 +88,8 @@ class StereoRenderer:
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         own = [getattr(self.images, eye) for eye in self.eyes]
         images = {eye: getattr(out, eye) if image is None else image for eye, image in zip(self.eyes, own, strict=True)}
-        worlds = [snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_yaw]
         for eye, image in images.items():
-            inputs = [scene.paths, scene.grid, *worlds, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
+            inputs = [scene.paths, scene.grid, snapshot.bundle, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
             launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
         if self.scratch is not None:
             for first in range(0, views.count, self.slots):

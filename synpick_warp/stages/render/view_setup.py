@@ -10,10 +10,9 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.calibration.lens import LensMap
-from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views
+from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views, compute_rays_kernel
 from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.lens import NUMBERS, Lenses
-from synpick_warp.kernels.render.visibility.lens_rays import compute_rays_kernel
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel

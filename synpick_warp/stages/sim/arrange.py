@@ -9,6 +9,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
 from synpick_warp.kernels.sim import arrangement, drop, endings, rest
+from synpick_warp.kernels.state import Worlds
 from synpick_warp.scenes.build import without_distractors
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, count_columns, drop_data, mode_data, mode_rows
@@ -50,18 +51,15 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
         `Mode` (episode) int32, and number of objects in the first arrangement (episode) int64. A world's slots may suffice for fewer.
     """
     count, seed = len(episodes), wp.uint64(config.bake.seed)
-    identity = wp.array(np.stack([episodes, np.zeros_like(episodes)], axis=1), dtype=wp.vec2i, device=device)
-    mode, ending = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
-    phase = wp.full(count, int(Phase.START), dtype=wp.int32, device=device)
-    wp.launch(
-        arrangement.sample_modes_kernel,
-        dim=count,
-        inputs=[seed, mode_data(mode_rows(config.bake, config.splits), device), identity, phase],
-        outputs=[mode],
-        device=device,
-    )
+    state, room = Worlds(), config.arrangement.max_objects
+    state.arrangement_id = wp.array(np.stack([episodes, np.zeros_like(episodes)], axis=1), dtype=wp.vec2i, device=device)
+    state.mode, state.ending = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
+    state.phase = wp.full(count, int(Phase.START), dtype=wp.int32, device=device)
+    state.catalog_index, state.body_slot = (wp.empty((count, room), dtype=wp.int32, device=device) for _ in range(2))
+    modes = mode_data(mode_rows(config.bake, config.splits), device)
+    wp.launch(arrangement.sample_modes_kernel, dim=count, inputs=[seed, modes, state], device=device)
     layout, objects = structs.LayoutData(), structs.CatalogData()
-    layout.instances = layout.single_slots = config.arrangement.max_objects
+    layout.instances = layout.single_slots = room
     layout.slots = 2 * layout.instances
     objects.count = len(catalog)
     objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
@@ -70,15 +68,8 @@ def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray
         setattr(objects, name, value)
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     rules = drop_data(labelled, config.render, config.pick, config.move, config.physics.gravity, 1)
-    index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
-    wp.launch(
-        arrangement.sample_objects_kernel,
-        dim=count,
-        inputs=[seed, layout, objects, rules, identity, mode, phase, ending],
-        outputs=[index, slot],
-        device=device,
-    )
-    return mode.numpy(), np.count_nonzero(index.numpy() >= 0, axis=1)
+    wp.launch(arrangement.sample_objects_kernel, dim=count, inputs=[seed, layout, objects, rules, state], device=device)
+    return state.mode.numpy(), np.count_nonzero(state.catalog_index.numpy() >= 0, axis=1)
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
@@ -96,7 +87,8 @@ def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: in
 def measure_penetration(state: WorldState, physics: Physics) -> None:
     """Measure the deepest penetration of each body from the contacts of the last step."""
     state.penetration.zero_()
-    launch(rest.measure_penetration_kernel, physics.contacts.rigid_contact_max, state, physics.state, contact_arrays(physics))
+    threads, contacts = physics.contacts.rigid_contact_max, contact_arrays(physics)
+    launch(rest.measure_penetration_kernel, threads, state, physics.state, contacts=contacts)
 
 
 def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) -> None:

@@ -37,7 +37,7 @@ class TwoSpeedLaw:
     def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
         """Place the gripper `appear_height` above the grasp."""
         sources = (scene, state, attempts, plan, physics.state)
-        launch(tasks.place_grippers_kernel, len(state.phase), *sources, tilt_out=physics.control.joint_target_q)
+        launch(tasks.place_grippers_kernel, len(state.phase), *sources, physics.control)
 
     def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
         """Advance the setpoints by a step."""
@@ -62,7 +62,7 @@ def begin_picking(
 ) -> None:
     """Reset the attempt state where picking begins, with task LOOK, and clear the outcomes of the last tick."""
     sources = (scene, state, attempts, observation, plan)
-    launch(tasks.begin_picking_kernel, len(state.phase), *sources, tilt_out=physics.control.joint_target_q)
+    launch(tasks.begin_picking_kernel, len(state.phase), *sources, physics.control)
 
 
 def clear_seals(state: WorldState, seals: SealState) -> None:
@@ -109,7 +109,7 @@ def advance_tasks(
     law.end_tick(scene, state, attempts, plan)
     if scene.tries_another:
         launch(tasks.count_target_failures_kernel, attempts.target_failures.shape, state, attempts, plan)
-    launch(tasks.end_attempts_kernel, len(state.phase), *sources, physics.state, tilt_out=physics.control.joint_target_q)
+    launch(tasks.end_attempts_kernel, len(state.phase), *sources, physics.state, physics.control)
 
 
 def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, physics: Physics) -> None:

@@ -15,12 +15,14 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.kernels.sim import arrangement, gripper, rest
+from synpick_warp.kernels.state import Contacts
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
 from synpick_warp.newton_patches.contact_matching import complete_matching
 from synpick_warp.newton_patches.narrow_phase import resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
+from synpick_warp.stages.arrays import bundle
 from synpick_warp.stages.launch import launch
 from synpick_warp.system.processes.threads import is_only_launcher
 
@@ -343,8 +345,7 @@ def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]
     }
 
 
-def contact_arrays(physics: Physics) -> SimpleNamespace:
-    """Arrays of the contacts, and the body of each shape, by the names of kernels' parameters."""
-    names = ("shape0", "shape1", "point0", "point1", "normal", "margin0", "margin1")
-    arrays = {name: getattr(physics.contacts, f"rigid_contact_{name}") for name in names}
-    return SimpleNamespace(**arrays, contact_count=physics.contacts.rigid_contact_count, shape_body=physics.model.shape_body)
+def contact_arrays(physics: Physics) -> Any:
+    """The struct `Contacts`: arrays of the contacts, and the body of each shape."""
+    arrays = {name: getattr(physics.contacts, f"rigid_contact_{name}") for name in Contacts.vars if name != "shape_body"}
+    return bundle(Contacts, SimpleNamespace(**arrays), physics.model)

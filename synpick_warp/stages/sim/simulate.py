@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import newton
 import numpy as np
@@ -20,7 +19,7 @@ from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
-from synpick_warp.stages.constants import SceneData, fill, make_scene_data
+from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
@@ -273,19 +272,12 @@ class Simulation:
     def _take_snapshot(self) -> None:
         """Copy the state of the worlds into the snapshot of the record, with the previous frame beside it, and pack the status rows."""
         state, snapshot, status, worlds = self.state, self.record.snapshot, self.record.status, self.layout.worlds
-        launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, now=_frame_poses(snapshot))
+        launch(pack.take_snapshot_kernel, worlds, self.scene, state, self.attempts, self.physics.state, snapshot)
         tables = {"status_out": status.table, "measure_out": status.measures}
-        launch(pack.pack_status_kernel, worlds, state, self.attempts, self.seals, live=snapshot.live, target=self.plan.target, **tables)
+        launch(pack.pack_status_kernel, worlds, snapshot, state, self.attempts, self.seals, self.plan, **tables)
         launch(pack.copy_sets_kernel, status.engaged.shape, self.attempts, out=status)
-        outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
-        outputs += [snapshot.last_fixture_visible]
-        wp.launch(pack.link_frames_kernel, dim=worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=self.device)
+        launch(pack.link_frames_kernel, worlds, snapshot, self.last)
         wp.copy(snapshot.bin, state.bin)
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_yaw, state.light_yaw)
         wp.copy(snapshot.light_exposure, state.light_exposure)
-
-
-def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
-    """Fill the struct `FramePoses` from arrays of the same names."""
-    return fill(pack.FramePoses, arrays)

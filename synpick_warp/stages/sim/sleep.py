@@ -6,16 +6,15 @@ and the order of threads, and are part of a world's state.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import newton
 import warp as wp
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels.sim import sleep
+from synpick_warp.kernels.state import Motion
 from synpick_warp.newton_patches.broad_phase import SeparatingBroadPhase
 from synpick_warp.newton_patches.solver import FusedSteel
-from synpick_warp.stages.arrays import allocate, device_array
+from synpick_warp.stages.arrays import allocate, array_group, bundle
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
@@ -25,16 +24,8 @@ THREADS = 64
 """Threads per world of the grid-stride loops over the overlaps and contacts of all worlds."""
 
 
-@dataclass(frozen=True, eq=False)
-class SleepState:
+class SleepState(array_group(sleep.Sleepers, "world", "slot", units={"quiet": "ticks"})):
     """Per body slot of each world: sleep flag, island, and quiet time."""
-
-    asleep: wp.array = device_array("world", "slot", dtype=wp.int32)
-    """1: asleep; 0: awake."""
-    island: wp.array = device_array("world", "slot", dtype=wp.int32)
-    """Slot that names the island of a sleeping body: the smallest of its slots."""
-    quiet: wp.array = device_array("world", "slot", dtype=wp.int32, unit="ticks")
-    """Consecutive ticks in which the body moved by at most `physics.sleep`."""
 
 
 class Sleep:
@@ -71,20 +62,20 @@ class Sleep:
 
     def touch(self) -> None:
         """Mark sleeping islands in contact with an awake body. Runs between collision detection and solver."""
-        sources = self._scene, self.state, contact_arrays(self._physics)
-        launch(sleep.wake_touched_kernel, self._threads, *sources, threads=self._threads, woken=self._woken)
+        given = {"threads": self._threads, "woken": self._woken, "contacts": contact_arrays(self._physics)}
+        launch(sleep.wake_touched_kernel, self._threads, self._scene, self.state, **given)
 
     def hold(self, before: newton.State, after: newton.State) -> None:
         """Restore the sleeping bodies to their state before the substep, and wake the marked islands. Runs after the solver."""
-        given = {"woken": self._woken, "quiet": self.state.quiet}
-        launch(sleep.hold_sleepers_kernel, self.state.asleep.shape, self._scene, self.state, before, out=after, **given)
+        motions = {"before": bundle(Motion, before), "after": bundle(Motion, after)}
+        launch(sleep.hold_sleepers_kernel, self.state.asleep.shape, self._scene, self.state, woken=self._woken, **motions)
 
     def judge(self, state: WorldState, attempts: AttemptState, seals: SealState, threshold: float) -> None:
         """Put islands to sleep whose objects moved by at most `threshold` [m] in each of the last ticks, and wake those of which an
         object was attached or removed. Runs at the end of a tick."""
-        scene, physics, contacts = self._scene, self._physics, contact_arrays(self._physics)
+        scene, physics = self._scene, self._physics
         launch(sleep.begin_islands_kernel, len(self._parent), parent=self._parent)
-        launch(sleep.join_islands_kernel, physics.contacts.rigid_contact_max, contacts, parent=self._parent)
+        launch(sleep.join_islands_kernel, physics.contacts.rigid_contact_max, contacts=contact_arrays(physics), parent=self._parent)
         self._restless.zero_()
         scratch = {"parent": self._parent, "restless": self._restless, "woken": self._woken}
         sources = (scene, state, attempts, seals, self.state, physics.state)

@@ -13,43 +13,20 @@ from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.schema import Gripper
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
-from synpick_warp.stages.arrays import allocate, device_array, unpack_words
+from synpick_warp.stages.arrays import allocate, array_group, device_array, unpack_words
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
+_PLACES = dict.fromkeys(("pose", "velocity", "angular_velocity", "contact_force", "contact_load"), ("world", "step", "place"))
+_OTHERS = dict.fromkeys(("seal_force", "attached"), ("world", "step", "instance")) | {"cup_force": ("world", "step", "cup")}
+_FORCES = dict.fromkeys(("contact_force", "contact_load", "seal_force", "impedance_force", "cup_force"), "N")
+_UNITS = _FORCES | {"pose": "m", "velocity": "m/s", "angular_velocity": "rad/s", "setpoint": "m"}
 
-@dataclass(frozen=True, eq=False)
-class StepArrays:
-    """Step log of a tick: pose, velocities [m/s, rad/s] and contact forces [N] of each body, seal forces [N] (0: no seal), and the
-    gripper's task, setpoint (NaN: none) and impedance force.
 
-    The dimension "place" holds the instances, then gripper shaft and cup.
-    """
-
-    pose: wp.array = device_array("world", "step", "place", dtype=wp.transformf, unit="m")
-    """Body to world at the step's end."""
-    velocity: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="m/s")
-    """Linear velocity of the centre of mass."""
-    angular_velocity: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="rad/s")
-    """Angular velocity in the world's axes."""
-    contact_force: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="N")
-    """Vector sum of all contact forces on the body, mean over the step."""
-    contact_load: wp.array = device_array("world", "step", "place", dtype=wp.float32, unit="N")
-    """Sum of their magnitudes, mean over the step."""
-    seal_force: wp.array = device_array("world", "step", "instance", dtype=wp.float32, unit="N")
-    """Tension and shear of the instance's seal, that of a seal that broke in the step included; 0: no seal."""
-    attached: wp.array = device_array("world", "step", "instance", dtype=wp.uint8)
-    """1: a seal holds the instance at the step's end."""
-    setpoint: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="m")
-    """Setpoint of the wrist in the step; NaN: none."""
-    impedance_force: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="N")
-    """Impedance force on the gripper, without gravity compensation."""
-    task: wp.array = device_array("world", "step", dtype=wp.int8)
-    """`Task` at the step's end."""
-    cup_force: wp.array = device_array("world", "step", "cup", dtype=wp.float32, unit="N")
-    """Tension and shear of each cup's seals in the step, as `seal_force`."""
+class StepArrays(array_group(step_log.StepLog, "world", "step", units=_UNITS, **_PLACES, **_OTHERS)):
+    """Step log of a tick. The dimension "place" holds the instances, then gripper shaft and cup."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +138,12 @@ class StepRecorder:
 
     def after_solve(self, contact_f: wp.array) -> None:
         """Add the contact forces of a solver substep: the force of each contact on its first shape (contact) spatial vector [N]."""
-        physics, given = self._physics, {"contact_force": contact_f, "total_inout": self._total}
+        physics, given = self._physics, {"contact_force": contact_f, "total_inout": self._total, "contacts": contact_arrays(self._physics)}
         if self._steps:
-            launch(step_log.sum_contacts_kernel, physics.contacts.rigid_contact_max, contact_arrays(physics), **given)
+            launch(step_log.sum_contacts_kernel, physics.contacts.rigid_contact_max, **given)
         if self.record.supports is not None:
             given["total_inout"] = self._supports
-            launch(step_log.sum_supports_kernel, physics.contacts.rigid_contact_max, self._scene, contact_arrays(physics), **given)
+            launch(step_log.sum_supports_kernel, physics.contacts.rigid_contact_max, self._scene, **given)
 
     def end_step(self, step: int, current: newton.State) -> None:
         """Record step `step` of the tick from the state at its end."""
@@ -174,11 +151,10 @@ class StepRecorder:
         if log is None:
             return
         places, sources = (worlds, self._sizes["place"]), (self._scene, self._state)
-        launch(step_log.record_motion_kernel, places, *sources, current, step=step, out=log)
+        launch(step_log.record_motion_kernel, places, *sources, current, step=step, log=log.bundle)
         given = {"substep_fraction": self._substep_fraction, "total": self._total}
         launch(step_log.record_forces_kernel, places, *sources, self._seals, step=step, out=log, **given)
-        given = {"force": self._force, "force_out": log.impedance_force}
-        launch(step_log.record_gripper_kernel, worlds, *sources, self._attempts, self._seals, step=step, out=log, **given)
+        launch(step_log.record_gripper_kernel, worlds, *sources, self._attempts, self._seals, step=step, out=log, force=self._force)
 
     def end_tick(self) -> None:
         """Complete the record at the end of a tick."""

@@ -5,7 +5,6 @@ and seal_contacts.
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import newton
@@ -16,11 +15,14 @@ from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts, vacuum
 from synpick_warp.scenes.collision.hulls import plane_table
 from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.constants import SceneData, fill
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+
+MOUTH_RAYS = struct_arrays(vacuum.MouthRays, "world", "cup", "ray", leak=("world", "cup"), units={"depth": "m"})
 
 
 class SuctionHold:
@@ -40,8 +42,8 @@ class SuctionHold:
         self._meshes = render_scene.keep
         self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
         self.mouth = None if settings.vacuum is None else _mouth_data(settings, device)
-        self.rays = settings.rays + settings.mouth_rays
-        self._scratch: dict[str, wp.array] = {}
+        self.ray_count = settings.rays + settings.mouth_rays
+        self._scratch: Any = None
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
@@ -55,14 +57,12 @@ class SuctionHold:
     def _evacuate(self, *sources: Any, seals: SealState) -> None:
         """Measure leaks below the cups, and attach what the vacuum that is left holds."""
         cups, device = seals.break_force.shape, seals.break_force.device
-        rays = (*cups, self.rays)
-        if not self._scratch:
-            shapes = {"depth": (rays, wp.float32), "owner": (rays, wp.int32), "leak": (cups, vacuum.Leak)}
-            self._scratch = {name: wp.zeros(shape, dtype=dtype, device=device) for name, (shape, dtype) in shapes.items()}
-        scratch = SimpleNamespace(**self._scratch)
-        launch(vacuum.cast_mouth_rays_kernel, rays, *sources, self, scratch)
-        launch(vacuum.measure_leaks_kernel, cups, *sources, self, scratch)
-        launch(vacuum.set_vacuum_kernel, cups[0], *sources, seals, self, scratch)
+        if self._scratch is None:
+            sizes = {"world": cups[0], "cup": cups[1], "ray": self.ray_count}
+            self._scratch = allocate_struct(MOUTH_RAYS, sizes, device)
+        launch(vacuum.cast_mouth_rays_kernel, (*cups, self.ray_count), *sources, self, rays=self._scratch)
+        launch(vacuum.measure_leaks_kernel, cups, *sources, self, rays=self._scratch)
+        launch(vacuum.set_vacuum_kernel, cups[0], *sources, seals, self, rays=self._scratch)
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Add the seals' wrenches to the joint forces of objects and gripper, and break overloaded seals.
@@ -74,9 +74,8 @@ class SuctionHold:
 
     def ignore_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
-        contacts = physics.contacts
-        sources, margin = (scene, state, seals, contact_arrays(physics)), contacts.rigid_contact_margin0
-        launch(seal_contacts.ignore_attached_contacts_kernel, contacts.rigid_contact_max, *sources, margin_out=margin)
+        threads, contacts = physics.contacts.rigid_contact_max, contact_arrays(physics)
+        launch(seal_contacts.ignore_attached_contacts_kernel, threads, scene, state, seals, contacts=contacts)
 
 
 class ArrayHold(SuctionHold):

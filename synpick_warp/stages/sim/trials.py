@@ -61,8 +61,8 @@ class TrialLaw(gripper.TwoSpeedLaw):
         if self.course.near == 0.0:
             super().begin(scene, state, attempts, plan, physics)
             return
-        given = {"course": self.course, "tilt_out": physics.control.joint_target_q}
-        launch(kernels.place_near_kernel, len(state.phase), scene, state, attempts, plan, physics.state, **given)
+        sources = (scene, state, attempts, plan, physics.state, physics.control)
+        launch(kernels.place_near_kernel, len(state.phase), *sources, course=self.course)
 
     def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
         """Task transitions: end PRESS by time, and LIFT after the hold or once nothing is attached."""

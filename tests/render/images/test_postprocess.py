@@ -21,6 +21,8 @@ from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.system.hardware.device import pick_device
@@ -61,15 +63,10 @@ def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops:
     height, width = radiance.shape[:2]
     scene = SimpleNamespace(grid=build_grid(width, height), lights=lights, width=width, height=height, device=device)
 
-    def device_array(values: list[Any], kind: Any = wp.int32) -> wp.array:
-        return wp.array(values, dtype=kind, device=device)
-
-    world = SimpleNamespace(
-        episode=device_array(at.episode),
-        frame=device_array(at.frame),
-        light=device_array([0] * views),
-        light_exposure=device_array([stops] * views, wp.float32),
-    )
+    world = allocate(Snapshot, {"world": views, "instance": 1, "fixture": 1}, device)
+    world.episode.assign(at.episode)
+    world.frame.assign(at.frame)
+    world.light_exposure.fill_(stops)
     out = SimpleNamespace(
         color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device),
         effects=wp.zeros(views, dtype=EffectParameters, device=device),

@@ -135,16 +135,7 @@ def box_pixels(box: wp.vec4i) -> int:
 
 
 @wp.kernel
-def list_border_boxes_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    instances: int,
-    chunk: int,
-    # Out:
-    boxes_inout: BorderBoxes,
-):
+def list_border_boxes_kernel(grid: ImageGrid, bodies: ViewBodies, instances: int, chunk: int, boxes_inout: BorderBoxes):
     """List the instances whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk. `length` starts at 0.
 
     Launched over view, instance.

@@ -6,6 +6,7 @@ from synpick_warp.codes import Effect, Stream
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,8 +36,7 @@ class EffectRanges:
 @kernel_of_views
 def sample_effects_kernel(
     # State:
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
+    snapshot: Snapshots,
     # In:
     ranges: EffectRanges,
     views: AnyViews,
@@ -50,7 +50,7 @@ def sample_effects_kernel(
     """
     view = wp.tid()
     world = views.world[view]
-    key = view_key(ranges.seed, episode[world], frame[world], views.camera[view], Stream.EFFECTS)
+    key = view_key(ranges.seed, snapshot.episode[world], snapshot.frame[world], views.camera[view], Stream.EFFECTS)
     parameters = EffectParameters()
     for index in range(wp.static(len(Effect))):
         parameters[index] = ranges.low[index] + (ranges.high[index] - ranges.low[index]) * uniform(key, index)

@@ -9,6 +9,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, c
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -136,14 +137,7 @@ def is_occluded(
 
 @wp.func
 def in_shadow(
-    gbuffer: GBuffer,
-    bodies: ViewBodies,
-    grid: ImageGrid,
-    sensor: SensorParameters,
-    focal_baseline: float,
-    view: int,
-    row: int,
-    column: int,
+    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int
 ) -> bool:
     """True if the projector, at the right of the depth image's camera, or the infrared camera, at its left, does not see a pixel's
     surface."""
@@ -213,8 +207,7 @@ def render_depth_sensor_kernel(
     surfaces: AnySurfaces,
     grid: ImageGrid,
     # State:
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
+    snapshot: Snapshots,
     # In:
     sensor: SensorParameters,
     bodies: ViewBodies,
@@ -238,7 +231,7 @@ def render_depth_sensor_kernel(
     depth_sensor_out[view, row, column] = wp.uint16(0)
     camera = views.camera[view]
     world = views.world[view]
-    key = view_key(sensor.seed, episode[world], frame[world], camera, Stream.DEPTH_NOISE)
+    key = view_key(sensor.seed, snapshot.episode[world], snapshot.frame[world], camera, Stream.DEPTH_NOISE)
     displacement = sensor.lateral_noise * lattice_normals(key, grid, sensor.noise_width, row, column, 0)
     at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
     at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)

@@ -25,6 +25,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, body_of, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False})
@@ -70,14 +71,7 @@ def right_camera_hit(scene: AnyScene, bodies: ViewBodies, views: AnyViews, view:
 
 @wp.func
 def dot_light(
-    scene: AnyScene,
-    sensor: SensorParameters,
-    bodies: ViewBodies,
-    views: AnyViews,
-    view: int,
-    point: wp.vec3,
-    surface: Surface,
-    brdf: Brdf,
+    scene: AnyScene, sensor: SensorParameters, bodies: ViewBodies, views: AnyViews, view: int, point: wp.vec3, surface: Surface, brdf: Brdf
 ) -> float:
     """Brightness of projected dots at a surface point, `point` in the camera's axes [m]: that of a white surface is the pattern's by
     cosine / z², in the open."""
@@ -118,10 +112,7 @@ def render_infrared_kernel(
     scene: AnyScene,
     grid: ImageGrid,
     # State:
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
+    snapshot: Snapshots,
     # In:
     sensor: SensorParameters,
     bodies: ViewBodies,
@@ -142,8 +133,8 @@ def render_infrared_kernel(
     if not in_image(grid, row, column):
         return
     world = views.world[view]
-    which = light[world]
-    yaw = light_yaw[world]
+    which = snapshot.light[world]
+    yaw = snapshot.light_yaw[world]
     ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
     offset = wp.where(eye == 0, 0.0, sensor.baseline)
@@ -165,7 +156,7 @@ def render_infrared_kernel(
         ambient = unoccluded_light(scene.lights, which, yaw, brdf)
         radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
         dots = dot_light(scene, sensor, bodies, views, view, point, surface, brdf)
-    key = view_key(sensor.seed, episode[world], frame[world], views.camera[view], Stream.INFRARED_NOISE)
+    key = view_key(sensor.seed, snapshot.episode[world], snapshot.frame[world], views.camera[view], Stream.INFRARED_NOISE)
     noise = normal_pair(pixel_key(key, (eye * grid.height + row) * grid.width + column), 0)[0]
     value = sensor.ambient * scene.lights.exposure[which] * radiance + dots + sensor.infrared_noise * noise
     image_out[view, row, column] = wp.uint8(wp.rint(255.0 * wp.clamp(value, 0.0, 1.0)))

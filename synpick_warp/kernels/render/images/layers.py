@@ -29,6 +29,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.lens import distort
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,16 +67,8 @@ def position_of(pose: wp.transformf) -> wp.vec3d:
 
 @kernel_of_views
 def compute_motions_kernel(
-    # Scene:
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
-    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
-    follows: wp.array[int],  # (world)
-    last_catalog_index: wp.array2d[int],  # (world, instance)
-    last_pose: wp.array2d[wp.transformf],  # (world, instance) [m]
-    last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
-    last_fixture_visible: wp.array2d[int],  # (world, fixture)
+    snapshot: Snapshots,
     # In:
     views: AnyViews,
     last_rotation: wp.array[wp.mat33d],  # (view)
@@ -91,7 +84,7 @@ def compute_motions_kernel(
     """
     view, body = wp.tid()
     world = views.world[view]
-    known = follows[world]
+    known = snapshot.follows[world]
     now = wp.transform_identity(dtype=float)
     then = now
     to_camera = views.cameras.rotation[view]
@@ -102,14 +95,14 @@ def compute_motions_kernel(
     if body == motions_out.known.shape[1] - 1:
         known *= moves
     elif body < views.instances:
-        now = pose[world, body]
-        then = last_pose[world, body]
-        if catalog_index[world, body] < 0 or last_catalog_index[world, body] != catalog_index[world, body]:
+        now = snapshot.pose[world, body]
+        then = snapshot.last_pose[world, body]
+        if snapshot.catalog_index[world, body] < 0 or snapshot.last_catalog_index[world, body] != snapshot.catalog_index[world, body]:
             known = 0
     else:
-        now = fixture_pose[world, body - views.instances]
-        then = last_fixture_pose[world, body - views.instances]
-        known *= last_fixture_visible[world, body - views.instances]
+        now = snapshot.fixture_pose[world, body - views.instances]
+        then = snapshot.last_fixture_pose[world, body - views.instances]
+        known *= snapshot.last_fixture_visible[world, body - views.instances]
     motions_out.known[view, body] = known
     if known == 0:
         return
@@ -296,7 +289,7 @@ def render_scene_flow_kernel(
     # Scene:
     grid: ImageGrid,
     # State:
-    follows: wp.array[int],  # (world)
+    snapshot: Snapshots,
     # In:
     motions: BodyMotions,
     gbuffer: GBuffer,
@@ -312,7 +305,9 @@ def render_scene_flow_kernel(
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    displacement = point_displacement(motions, gbuffer, views.cameras, view, row, column, follows[views.world[view]], views.instances)
+    displacement = point_displacement(
+        motions, gbuffer, views.cameras, view, row, column, snapshot.follows[views.world[view]], views.instances
+    )
     scene_flow_out[view, row, column] = displacement
 
 
@@ -321,7 +316,7 @@ def render_flow_kernel(
     # Scene:
     grid: ImageGrid,
     # State:
-    follows: wp.array[int],  # (world)
+    snapshot: Snapshots,
     # In:
     motions: BodyMotions,
     gbuffer: GBuffer,
@@ -341,7 +336,7 @@ def render_flow_kernel(
         return
     intrinsics = views.cameras.intrinsics[view]
     ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    d = point_displacement(motions, gbuffer, views.cameras, view, row, column, follows[views.world[view]], views.instances)
+    d = point_displacement(motions, gbuffer, views.cameras, view, row, column, snapshot.follows[views.world[view]], views.instances)
     depth = gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:

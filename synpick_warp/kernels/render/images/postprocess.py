@@ -20,6 +20,7 @@ from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import view_key
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -59,8 +60,7 @@ def postprocess_kernel(
     grid: ImageGrid,
     lights: Lights,
     # State:
-    light: wp.array[int],  # (world)
-    light_exposure: wp.array[float],  # (world) [EV]
+    snapshot: Snapshots,
     # In:
     views: AnyViews,
     image: ShadedImage,
@@ -77,7 +77,9 @@ def postprocess_kernel(
     if not in_image(grid, row, column):
         return
     world = views.world[view]
-    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * resolve_radiance(image, view, row, column)
+    value = (
+        lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world]) * resolve_radiance(image, view, row, column)
+    )
     color_out[view, row, column] = wp.vec3ub(encode_display(value[0], tone), encode_display(value[1], tone), encode_display(value[2], tone))
 
 
@@ -183,10 +185,7 @@ def postprocess_effects_kernel(
     grid: ImageGrid,
     lights: Lights,
     # State:
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_exposure: wp.array[float],  # (world) [EV]
+    snapshot: Snapshots,
     # In:
     settings: PostProcessSettings,
     effects: wp.array[EffectParameters],  # (view)
@@ -218,9 +217,9 @@ def postprocess_effects_kernel(
         corner = corner_slope(intrinsics, grid.width, grid.height)
         ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
         value *= vignette_factor(parameters[Effect.VIGNETTE], ray, corner)
-    value *= lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world])
+    value *= lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world])
     value = wp.cw_mul(value, color_gains(parameters))
-    key = view_key(settings.seed, episode[world], frame[world], camera, Stream.COLOR_NOISE)
+    key = view_key(settings.seed, snapshot.episode[world], snapshot.frame[world], camera, Stream.COLOR_NOISE)
     value = add_sensor_noise(value, parameters, key, row * grid.width + column)
     color = wp.vec3ub(
         encode_display(value[0], settings.tone), encode_display(value[1], settings.tone), encode_display(value[2], settings.tone)

@@ -194,7 +194,7 @@ def render_suction_seal_kernel(
     views: AnyViews,
     first: int,
     # Out:
-    seal_out: wp.array3d[float],  # (view, row, column)
+    suction_seal_out: wp.array3d[float],  # (view, row, column)
 ):
     """Seal map: `seal_score` of a cup at each pixel; 0 if something else is in the cup's way, and without instance or label.
 
@@ -209,7 +209,7 @@ def render_suction_seal_kernel(
         score = seal_score(meshes, bodies.mesh[view, cup.body], cup, suction.radius)
         if score > 0.0 and is_obstructed(meshes, table, bodies, view, cup, suction.radius, views.instances):
             score = 0.0
-    seal_out[view, row, column] = score
+    suction_seal_out[view, row, column] = score
 
 
 @kernel_of_views
@@ -226,7 +226,7 @@ def render_suction_wrench_kernel(
     views: AnyViews,
     first: int,
     # Out:
-    wrench_out: wp.array3d[float],  # (view, row, column)
+    suction_wrench_out: wp.array3d[float],  # (view, row, column)
 ):
     """Wrench map: `wrench_score` of a cup at each pixel under a load of 1 kg at the object's centre of mass; 0 without instance or label.
 
@@ -241,7 +241,7 @@ def render_suction_wrench_kernel(
         center = suction.center_of_mass[bodies.mesh[view, cup.body]]
         weight = bodies.world_rotation[view, cup.body] * wp.vec3(0.0, 0.0, -GRAVITY)
         score = wrench_score(cup, center, weight, suction.radius)
-    wrench_out[view, row, column] = score
+    suction_wrench_out[view, row, column] = score
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -45,8 +46,8 @@ def shade_floor_kernel(
     scene: DressedScene,
     grid: ImageGrid,
     drop: float,
-    # State: worlds
-    light: wp.array[int],  # (world)
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -66,5 +67,5 @@ def shade_floor_kernel(
     if int(gbuffer.segment[view, row, column]) == Segment.NOTHING:
         direction = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)))
         if direction[2] < -HORIZON:
-            sky = light[views.world[view]]
+            sky = snapshot.light[views.world[view]]
             radiance_inout[view, row, column] = floor_radiance(scene, drop, bodies, views.cameras, view, sky, direction)

@@ -164,17 +164,7 @@ def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, ro
 
 
 @kernel_of_views(cuda_max_registers=FILTER_REGISTERS)
-def filter_blocks_kernel(
-    # Scene:
-    coarse: CoarseGrid,
-    # In:
-    guide: Guide,
-    coarse_light: CoarseLight,
-    views: AnyViews,
-    first: int,
-    # Out:
-    blocks_out: CoarseLight,
-):
+def filter_blocks_kernel(coarse: CoarseGrid, guide: Guide, coarse_light: CoarseLight, views: AnyViews, first: int, blocks_out: CoarseLight):
     """Narrow filter: bilateral mean over the block of 4 x 4 around each coarse pixel, and the variance of the mean visibility ratio.
 
     The variance of a mean is that of its samples over their effective number, (Σ w)² / Σ w². All members of `blocks_out` are written.
@@ -271,16 +261,7 @@ def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.v
 
 @kernel_of_views(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
-    # Scene:
-    coarse: CoarseGrid,
-    # In:
-    guide: Guide,
-    blocks: CoarseLight,
-    views: AnyViews,
-    variance_scale: float,
-    first: int,
-    # Out:
-    ratios_out: RatioImages,
+    coarse: CoarseGrid, guide: Guide, blocks: CoarseLight, views: AnyViews, variance_scale: float, first: int, ratios_out: RatioImages
 ):
     """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
 
@@ -332,17 +313,7 @@ def choose_widths_kernel(
 
 
 @kernel_of_views
-def smooth_ratios_kernel(
-    # Scene:
-    coarse: CoarseGrid,
-    # In:
-    guide: Guide,
-    ratios: RatioImages,
-    views: AnyViews,
-    first: int,
-    # Out:
-    ratios_out: RatioImages,
-):
+def smooth_ratios_kernel(coarse: CoarseGrid, guide: Guide, ratios: RatioImages, views: AnyViews, first: int, ratios_out: RatioImages):
     """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths. All members of `ratios_out` are written.
 
     Launched over view, coarse pixel (tile order, from flat index `first` on).

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, Movin
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,16 +68,7 @@ class LightHistory:
 
 
 @kernel_of_views
-def advance_history_kernel(
-    # State: worlds
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    # In:
-    views: AnyViews,
-    # Out:
-    history_inout: LightHistory,
-    moving_out: MovingBodies,
-):
+def advance_history_kernel(snapshot: Snapshots, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies):
     """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
     frame's.
 
@@ -85,9 +77,11 @@ def advance_history_kernel(
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.slot[view]
-    moving_out.holds[view] = int(history_inout.episode[slot] == episode[world] and history_inout.frame[slot] + 1 == frame[world])
-    history_inout.episode[slot] = episode[world]
-    history_inout.frame[slot] = frame[world]
+    moving_out.holds[view] = int(
+        history_inout.episode[slot] == snapshot.episode[world] and history_inout.frame[slot] + 1 == snapshot.frame[world]
+    )
+    history_inout.episode[slot] = snapshot.episode[world]
+    history_inout.frame[slot] = snapshot.frame[world]
 
 
 @wp.func

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import TAU
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -102,17 +103,13 @@ def draw_material(table: LookTable, surfaces: DressedSurfaces, base: int, key: w
 
 @kernel_of_views
 def dress_bodies_kernel(
-    # Scene:
     seed: wp.uint64,
     meshes: Meshes,
     table: LookTable,
-    # State:
-    episode: wp.array[int],  # (world)
-    # In:
+    snapshot: Snapshots,
     views: AnyViews,
     bodies: ViewBodies,
     first_row: int,
-    # Out:
     surfaces_inout: DressedSurfaces,
 ):
     """Materials of the bodies of each view, of its table and of its background: those of their meshes, changed by what the episode draws.
@@ -144,7 +141,7 @@ def dress_bodies_kernel(
         slot = body
     elif body == instances:
         part = LookPart.BIN
-    key = look_key(seed, episode[world], wp.max(part, 0), slot)
+    key = look_key(seed, snapshot.episode[world], wp.max(part, 0), slot)
     material = draw_material(table, surfaces_inout, base, key, part)
     surfaces_inout.color[row] = material.color
     surfaces_inout.metallic[row] = material.metallic

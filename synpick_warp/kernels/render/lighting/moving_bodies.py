@@ -7,6 +7,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -113,16 +114,8 @@ def list_moving_body(
 def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,
-    # State: worlds
-    bin: wp.array[int],  # (world)
-    catalog_index: wp.array2d[int],  # (world, instance)
-    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
-    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
-    fixture_visible: wp.array2d[int],  # (world, fixture)
-    last_catalog_index: wp.array2d[int],  # (world, instance)
-    last_pose: wp.array2d[wp.transformf],  # (world, instance) [m]
-    last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
-    last_fixture_visible: wp.array2d[int],  # (world, fixture)
+    # State:
+    snapshot: Snapshots,
     # In:
     view_world: wp.array[int],  # (view)
     instances: int,
@@ -149,16 +142,16 @@ def find_moving_bodies_kernel(
         now = wp.transform_identity(dtype=float)
         then = wp.transform_identity(dtype=float)
         if body < instances:
-            mesh = catalog_index[world, body]
-            last_mesh = last_catalog_index[world, body]
-            now = pose[world, body]
-            then = last_pose[world, body]
+            mesh = snapshot.catalog_index[world, body]
+            last_mesh = snapshot.last_catalog_index[world, body]
+            now = snapshot.pose[world, body]
+            then = snapshot.last_pose[world, body]
         else:
             fixture = body - instances
-            mesh = wp.where(fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
-            last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, fixture_mesh(meshes, bin[world], fixture), -1)
-            now = fixture_pose[world, fixture]
-            then = last_fixture_pose[world, fixture]
+            mesh = wp.where(snapshot.fixture_visible[world, fixture] != 0, fixture_mesh(meshes, snapshot.bin[world], fixture), -1)
+            last_mesh = wp.where(snapshot.last_fixture_visible[world, fixture] != 0, fixture_mesh(meshes, snapshot.bin[world], fixture), -1)
+            now = snapshot.fixture_pose[world, fixture]
+            then = snapshot.last_fixture_pose[world, fixture]
         change = float(mesh != last_mesh)
         drift_frames = wp.where(mesh != last_mesh, 0, MAX_FRAMES)
         if mesh == last_mesh and mesh >= 0:

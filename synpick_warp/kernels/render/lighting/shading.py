@@ -37,6 +37,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -255,9 +256,8 @@ def shade_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -275,7 +275,7 @@ def shade_kernel(
     """
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
-        sky = world_sky(light, light_yaw, views.world[view])
+        sky = world_sky(snapshot.light, snapshot.light_yaw, views.world[view])
         radiance_inout[view, row, column] = shade_pixel(
             scene, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, radiance_inout, views, view, row, column, 1
         )
@@ -287,9 +287,8 @@ def shade_samples_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -306,7 +305,7 @@ def shade_samples_kernel(
     """
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
-        sky = world_sky(light, light_yaw, views.world[view])
+        sky = world_sky(snapshot.light, snapshot.light_yaw, views.world[view])
         radiance_inout[view, row, column] = shade_pixel(
             scene,
             coarse,

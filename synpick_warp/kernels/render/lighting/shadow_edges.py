@@ -16,6 +16,7 @@ from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_dire
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -65,16 +66,7 @@ def listed_pixel(coarse: CoarseGrid, cell: wp.array3d[int], view: int, chunk: in
 
 
 @kernel_of_views
-def list_edge_cells_kernel(
-    # Scene:
-    coarse: CoarseGrid,
-    # In:
-    views: AnyViews,
-    first: int,
-    # Out:
-    shadows_inout: LampShadows,
-    lists_inout: EdgeLists,
-):
+def list_edge_cells_kernel(coarse: CoarseGrid, views: AnyViews, first: int, shadows_inout: LampShadows, lists_inout: EdgeLists):
     """Stream compaction: `cell` receives the pixels of the shadow grid that `near_edge` marks, in any order; the marks are cleared.
 
     `count`, which must be 0, receives the number at CELLS. Launched over view, pixel of the shadow grid (tile order, from flat index
@@ -103,16 +95,13 @@ def pixel_plane(
 
 @kernel_of_views
 def list_edge_pixels_kernel(
-    # Scene:
     meshes: Meshes,
     coarse: CoarseGrid,
-    # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
     threads: int,
     first: int,
-    # Out:
     shadows_inout: LampShadows,
     lists_inout: EdgeLists,
 ):
@@ -173,22 +162,17 @@ def trace_pixel_edges(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_edges_kernel(
-    # Scene:
     meshes: Meshes,
     table: Table,
     coarse: CoarseGrid,
     lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
-    # In:
+    snapshot: Snapshots,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     lists: EdgeLists,
     views: AnyViews,
     threads: int,
     first: int,
-    # Out:
     shadows_inout: LampShadows,
 ):
     """Adaptive sampling: trace shadow rays from each listed pixel to each lamp whose shadow is steep; the results replace the steepness in
@@ -202,8 +186,8 @@ def trace_shadow_edges_kernel(
     if view >= views.count:
         return
     world = views.world[view]
-    which = light[world]
-    heading = unit_heading(light_yaw[world])
+    which = snapshot.light[world]
+    heading = unit_heading(snapshot.light_yaw[world])
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
         steepness = shadows_inout.edge[view, row, column]
@@ -218,8 +202,8 @@ def filter_shadow_edges_kernel(
     meshes: Meshes,
     coarse: CoarseGrid,
     lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -239,7 +223,7 @@ def filter_shadow_edges_kernel(
     view, chunk, start = list_place(lists, wp.tid() + first, threads)
     if view >= views.count:
         return
-    lamps = lights.lamps[light[views.world[view]]]
+    lamps = lights.lamps[snapshot.light[views.world[view]]]
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
         plane, _normal = pixel_plane(meshes, bodies, gbuffer, views, view, row, column)

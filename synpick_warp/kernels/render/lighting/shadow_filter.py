@@ -21,6 +21,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -134,14 +135,7 @@ def lamp_fractions(even: wp.uint64, odd: wp.uint64, weight: int, lamps: int, ray
 
 @wp.func
 def grid_plane(
-    meshes: Meshes,
-    coarse: CoarseGrid,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    view: int,
-    row: int,
-    column: int,
+    meshes: Meshes, coarse: CoarseGrid, bodies: ViewBodies, gbuffer: GBuffer, views: AnyViews, view: int, row: int, column: int
 ) -> Plane:
     """Tangent plane at the middle pixel of a pixel of the shadow grid, which must show a surface."""
     pixel = middle_pixel(coarse, row, column)
@@ -181,8 +175,8 @@ def filter_shadows_kernel(
     meshes: Meshes,
     coarse: CoarseGrid,
     lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -200,7 +194,7 @@ def filter_shadows_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    which = light[views.world[view]]
+    which = snapshot.light[views.world[view]]
     if lights.lamps[which] == 0 or int(rays_segment(rays[view, row, column])) == Segment.NOTHING:
         return
     plane = grid_plane(meshes, coarse, bodies, gbuffer, views, view, row, column)
@@ -322,8 +316,8 @@ def measure_steepness_kernel(
     meshes: Meshes,
     coarse: CoarseGrid,
     lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -342,7 +336,7 @@ def measure_steepness_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    which = light[views.world[view]]
+    which = snapshot.light[views.world[view]]
     if lights.lamps[which] == 0:
         return
     index = flat_index(coarse.grid, view, row, column)

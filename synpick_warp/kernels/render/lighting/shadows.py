@@ -16,6 +16,7 @@ from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_block
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -238,9 +239,8 @@ def trace_shadow_rays_kernel(
     table: Table,
     coarse: CoarseGrid,
     lights: Lights,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -259,7 +259,7 @@ def trace_shadow_rays_kernel(
     if not in_image(coarse.grid, row, column):
         return
     world = views.world[view]
-    which = light[world]
+    which = snapshot.light[world]
     rays = lights.lamps[which] * lights.lamp_rays[which]
     if rays == 0:
         return
@@ -271,7 +271,7 @@ def trace_shadow_rays_kernel(
     if segment != Segment.NOTHING:
         camera_direction = camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
         position = hit_position(views.cameras, view, camera_direction, depth)
-        heading = unit_heading(light_yaw[world])
+        heading = unit_heading(snapshot.light_yaw[world])
         hit = read_hit(gbuffer, view, pixel[0], pixel[1])
         normal = visible_normal(meshes, bodies, view, hit, views.instances, views.cameras.to_world[view] * camera_direction)
         packed_normal = pack_normal(wp.transpose(views.cameras.to_world[view]) * normal)

@@ -76,14 +76,7 @@ def no_hit() -> Hit:
 
 @wp.func
 def trace_bodies(
-    meshes: Meshes,
-    bodies: ViewBodies,
-    view: int,
-    first: int,
-    body_mask: wp.uint64,
-    ray: wp.vec3,
-    instances: int,
-    nearest: Hit,
+    meshes: Meshes, bodies: ViewBodies, view: int, first: int, body_mask: wp.uint64, ray: wp.vec3, instances: int, nearest: Hit
 ) -> Hit:
     """Closest hit of a camera ray among the bodies in a word of `ViewBodies.body_mask`, front to back, so that most are skipped; `nearest`
     unless one of them is nearer. `first`: rank of the lowest bit."""
@@ -174,14 +167,7 @@ def trace_ray(meshes: Meshes, table: Table, bodies: ViewBodies, view: int, insta
 
 @wp.func
 def is_blocked(
-    meshes: Meshes,
-    table: Table,
-    bodies: ViewBodies,
-    view: int,
-    tote: int,
-    origin: wp.vec3,
-    direction: wp.vec3,
-    reach: float,
+    meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, origin: wp.vec3, direction: wp.vec3, reach: float
 ) -> bool:
     """Any-hit query (shadow ray): True if something lies within `reach` [m] of `origin` along the unit vector `direction`, in the world.
 

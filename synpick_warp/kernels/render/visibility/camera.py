@@ -231,13 +231,7 @@ def clip_to_canvas(canvas: wp.vec4i, box: wp.vec4, margin: float) -> wp.vec4i:
 
 @wp.func
 def projected_box(
-    lower: wp.vec3,
-    upper: wp.vec3,
-    rotation: wp.mat33d,
-    position: wp.vec3d,
-    cameras: AnyCameras,
-    view: int,
-    grid: ImageGrid,
+    lower: wp.vec3, upper: wp.vec3, rotation: wp.mat33d, position: wp.vec3d, cameras: AnyCameras, view: int, grid: ImageGrid
 ) -> wp.vec4i:
     """Conservative screen box (x_min, y_min, x_max, y_max) [px] of a bounding box, inclusive; x_max < x_min: empty.
 
@@ -285,3 +279,26 @@ def projected_box(
     if lens >= 0:
         margin += cameras.lenses.number[lens, BEND] * wp.length_sq(most - least) / 6.0
     return clip_to_canvas(canvas, wp.vec4(x_min, y_min, x_max, y_max), margin)
+
+
+@wp.kernel
+def compute_rays_kernel(
+    # Scene:
+    cameras: Cameras,
+    # In:
+    slot: wp.array[int],  # (view)
+    view_cameras: LensCameras,
+    # Out:
+    ray_out: wp.array3d[wp.vec2],  # (view, row, column)
+):
+    """Ray of each pixel of the views that have a lens, by Newton's method from that of the same pixel in the scene, `cameras`.
+
+    `slot` is the row of a view's camera in the scene. Launched over view, row, column.
+    """
+    view, row, column = wp.tid()
+    if view_cameras.lens[view] >= 0:
+        center = wp.vec2(0.0, 0.0)
+        ray = pinhole_ray(view_cameras.intrinsics[view], row, column, center)
+        near = table_ray(cameras.lenses, cameras.lens[slot[view]], row, column, center)
+        goal = wp.vec2(ray[0], ray[1])
+        ray_out[view, row, column] = undistort(view_cameras.lenses, view_cameras.lens[view], goal, wp.vec2(near[0], near[1]))

@@ -98,14 +98,7 @@ def clip_box(grid: ImageGrid, box: wp.vec4i) -> wp.vec4i:
 
 
 @wp.kernel
-def lay_out_masks_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    # Out:
-    masks_out: InstanceMasks,
-):
+def lay_out_masks_kernel(grid: ImageGrid, bodies: ViewBodies, masks_out: InstanceMasks):
     """Lay out each view's masks in its pool: boxes, first words and the number of words, by exclusive prefix sums over the instances.
 
     A mask that does not fit is empty, and `length` then exceeds the pool. Launched over view, instance: each thread sums the words of the
@@ -126,12 +119,7 @@ def lay_out_masks_kernel(
 
 
 @wp.kernel
-def clear_masks_kernel(
-    # In:
-    threads: int,
-    # Out:
-    masks_inout: InstanceMasks,
-):
+def clear_masks_kernel(threads: int, masks_inout: InstanceMasks):
     """Clear the words in use. Launched over view, thread: `threads` threads stride over a view's words, whose number the host does not
     know.
     """

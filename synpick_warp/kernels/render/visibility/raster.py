@@ -138,15 +138,7 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
 
 
 @kernel_of_views
-def clear_visibility_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    views: AnyViews,
-    first: int,
-    # Out:
-    visibility_out: VisibilityBuffer,
-):
+def clear_visibility_kernel(grid: ImageGrid, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
     """Clear visibility buffer and the work list; unused views (camera -1) keep theirs.
 
     Launched over view, pixel (tile order, from flat index `first` on).
@@ -161,15 +153,12 @@ def clear_visibility_kernel(
 
 @kernel_of_views
 def rasterize_triangles_kernel(
-    # Scene:
     meshes: Meshes,
     grid: ImageGrid,
-    # In:
     bodies: ViewBodies,
     views: AnyViews,
     threads: int,
     first: int,
-    # Out:
     visibility_inout: VisibilityBuffer,
     masks_inout: InstanceMasks,
 ):
@@ -212,15 +201,12 @@ def rasterize_triangles_kernel(
 
 @kernel_of_views
 def rasterize_blocks_kernel(
-    # Scene:
     meshes: Meshes,
     grid: ImageGrid,
-    # In:
     bodies: ViewBodies,
     views: AnyViews,
     threads: int,
     first: int,
-    # Out:
     visibility_inout: VisibilityBuffer,
     masks_inout: InstanceMasks,
 ):

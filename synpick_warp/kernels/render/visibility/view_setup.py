@@ -26,10 +26,7 @@ TILE_RADIUS = wp.constant(5.5)
 
 
 @kernel_of_views
-def aim_views_kernel(
-    # Out:
-    views_inout: AnyViews,
-):
+def aim_views_kernel(views_inout: AnyViews):
     """Set the camera of each view: 0, or -1 where the view is unused (world -1). Launched over view."""
     view = wp.tid()
     views_inout.camera[view] = 0
@@ -38,12 +35,7 @@ def aim_views_kernel(
 
 
 @kernel_of_views
-def aim_cameras_kernel(
-    # Scene:
-    cameras: Cameras,
-    # Out:
-    views_inout: AnyViews,
-):
+def aim_cameras_kernel(cameras: Cameras, views_inout: AnyViews):
     """Gather camera parameters: copy intrinsics, pose and lens of row `slot` of `Cameras` to each used view. Launched over view."""
     view = wp.tid()
     if views_inout.camera[view] >= 0:
@@ -128,12 +120,7 @@ def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
 
 
 @wp.kernel
-def sort_bodies_kernel(
-    # Scene:
-    meshes: Meshes,
-    # Out:
-    bodies_inout: ViewBodies,
-):
+def sort_bodies_kernel(meshes: Meshes, bodies_inout: ViewBodies):
     """Sort the present bodies of each view front to back, the tote last, by counting: a body's rank is the number of bodies before it.
 
     Writes `order`, `ray_record` and `present`. Launched over view, body.
@@ -175,15 +162,7 @@ def hits_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3)
 
 
 @kernel_of_views
-def bin_bodies_kernel(
-    # Scene:
-    meshes: Meshes,
-    grid: ImageGrid,
-    # In:
-    views: AnyViews,
-    # Out:
-    bodies_inout: ViewBodies,
-):
+def bin_bodies_kernel(meshes: Meshes, grid: ImageGrid, views: AnyViews, bodies_inout: ViewBodies):
     """Tile binning: `body_mask` of each tile, by place in `order`: bodies whose oriented bounding box the tile's central ray intersects.
 
     Boxes are enlarged by the tile's radius at the body's far side, so that the mask is conservative for all rays of the tile. A screen box

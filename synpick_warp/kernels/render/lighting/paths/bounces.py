@@ -19,6 +19,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, AnySc
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -26,20 +27,14 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def extend_queued_paths_kernel(
-    # Scene:
     scene: AnyScene,
     coarse: CoarseGrid,
-    # State: worlds
-    episode: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
-    # In:
+    snapshot: Snapshots,
     bodies: ViewBodies,
     views: AnyViews,
     rules: PathRules,
     stage: int,
     first: int,
-    # Out:
     queues_inout: PathQueues,
     history_inout: LightHistory,
     coarse_light_out: CoarseLight,
@@ -60,7 +55,9 @@ def extend_queued_paths_kernel(
     path, pixel = read_path(queues_inout, first_record(queues_inout, view, region, slot))
     view, row, column = interleaved_pixel(coarse, (view * regions + region) * REGION_PIXELS + pixel.offset)
     world = views.world[view]
-    context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
+    context = make_context(
+        scene, coarse, rules, views, view, row, column, snapshot.episode[world], snapshot.light[world], snapshot.light_yaw[world]
+    )
     vertex = next_vertex(scene, bodies, rules, context, path)
     path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, path, vertex)
     if path.bounce == TERMINATED:

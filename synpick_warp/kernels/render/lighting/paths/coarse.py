@@ -12,9 +12,11 @@ from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
 from synpick_warp.kernels.render.lighting.coarse_grid import (
     CoarseGrid,
     Guide,
+    coarse_surface,
     flat_index,
     interleaved_pixel,
     morton_index,
+    write_guide,
 )
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
@@ -26,7 +28,6 @@ from synpick_warp.kernels.render.lighting.history import (
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, clamp_path, lamplit_radiance, limit_specular, store_light
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists, listed_pixel
 from synpick_warp.kernels.render.lighting.paths.queues import PathPixel, PathQueues, queue_path
-from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
 from synpick_warp.kernels.render.lighting.paths.tracing import (
     TERMINATED,
     AnyScene,
@@ -44,6 +45,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import stream_key
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -88,14 +90,7 @@ def make_context(
 
 @wp.func
 def average_paths(
-    scene: AnyScene,
-    bodies: ViewBodies,
-    rules: PathRules,
-    context: PathContext,
-    samples: int,
-    first: Vertex,
-    width: float,
-    pixel: PathPixel,
+    scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, samples: int, first: Vertex, width: float, pixel: PathPixel
 ) -> SplitRadiance:
     """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`).
 
@@ -222,9 +217,7 @@ def make_path_pixel(
 def trace_pixel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    episode: wp.array[int],
-    light: wp.array[int],
-    light_yaw: wp.array[float],
+    snapshot: Snapshots,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
@@ -264,7 +257,9 @@ def trace_pixel(
         return
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     write_guide(guide_out, views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)
-    context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
+    context = make_context(
+        scene, coarse, rules, views, view, row, column, snapshot.episode[world], snapshot.light[world], snapshot.light_yaw[world]
+    )
     beginning = wp.where(known > 0, rules.first_samples, samples)
     number = first_path_index(beginning, row, column, path_number(history_frame(history, slot, known), bits), known > 0)
     pixel = make_path_pixel(scene, rules, context, vertex, index, surface.hit.segment, known, number)
@@ -282,21 +277,15 @@ def trace_pixel(
 
 @kernel_of_views(cuda_max_registers=COARSE_PATH_REGISTERS)
 def trace_coarse_paths_kernel(
-    # Scene:
     scene: AnyScene,
     coarse: CoarseGrid,
-    # State: worlds
-    episode: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
-    # In:
+    snapshot: Snapshots,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
     lists: PathLists,
     rules: PathRules,
     first: int,
-    # Out:
     queues_inout: PathQueues,
     history_inout: LightHistory,
     guide_out: Guide,
@@ -311,9 +300,7 @@ def trace_coarse_paths_kernel(
     trace_pixel(
         scene,
         coarse,
-        episode,
-        light,
-        light_yaw,
+        snapshot,
         bodies,
         gbuffer,
         views,
@@ -330,21 +317,15 @@ def trace_coarse_paths_kernel(
 
 @kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
 def start_paths_kernel(
-    # Scene:
     scene: AnyScene,
     coarse: CoarseGrid,
-    # State: worlds
-    episode: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
-    # In:
+    snapshot: Snapshots,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
     lists: PathLists,
     rules: PathRules,
     first: int,
-    # Out:
     queues_inout: PathQueues,
     history_inout: LightHistory,
     guide_out: Guide,
@@ -358,9 +339,7 @@ def start_paths_kernel(
     trace_pixel(
         scene,
         coarse,
-        episode,
-        light,
-        light_yaw,
+        snapshot,
         bodies,
         gbuffer,
         views,

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, flat_index, interleaved_pixel
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, coarse_surface, flat_index, interleaved_pixel, write_guide
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
     MovingBodies,
@@ -15,13 +15,13 @@ from synpick_warp.kernels.render.lighting.history import (
 )
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, store_light
 from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_pixel
-from synpick_warp.kernels.render.lighting.paths.surface import coarse_surface, write_guide
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene, make_vertex
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Snapshots
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -29,19 +29,14 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def reuse_histories_kernel(
-    # Scene:
     scene: AnyScene,
     coarse: CoarseGrid,
-    # State: worlds
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
-    # In:
+    snapshot: Snapshots,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
     moving: MovingBodies,
     first: int,
-    # Out:
     history_inout: LightHistory,
     lists_inout: PathLists,
     guide_out: Guide,
@@ -70,7 +65,7 @@ def reuse_histories_kernel(
         append_pixel(lists_inout, view, index, known, bits)
         return
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
-    unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
-    exposure = scene.lights.exposure[light[world]]
+    unoccluded = unoccluded_light(scene.lights, snapshot.light[world], snapshot.light_yaw[world], vertex.brdf)
+    exposure = scene.lights.exposure[snapshot.light[world]]
     store_light(coarse_light_out, cell, read_history(history_inout, slot, row, column), scale_light(unoccluded, exposure))
     write_guide(guide_out, views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)

@@ -34,6 +34,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, c
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
 from synpick_warp.kernels.rng import mix, stream_key
+from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -351,10 +352,8 @@ def trace_paths_kernel(
     # Scene:
     scene: AnyScene,
     grid: ImageGrid,
-    # State: worlds
-    episode: wp.array[int],  # (world)
-    light: wp.array[int],  # (world)
-    light_yaw: wp.array[float],  # (world) [rad]
+    # State:
+    snapshot: Snapshots,
     # In:
     bodies: ViewBodies,
     views: AnyViews,
@@ -376,11 +375,11 @@ def trace_paths_kernel(
     context = PathContext()
     context.view = view
     context.instances = views.instances
-    context.first_light = light[world]
-    context.light = light[world]
-    context.yaw = light_yaw[world]
+    context.first_light = snapshot.light[world]
+    context.light = snapshot.light[world]
+    context.yaw = snapshot.light_yaw[world]
     pixel = (camera * grid.height + row) * grid.width + column
-    context.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
+    context.key = mix(stream_key(rules.seed, snapshot.episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
     footprint = 1.0 / (views.cameras.intrinsics[view][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
     for index in range(rules.samples):
