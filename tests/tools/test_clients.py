@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,12 +15,13 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.harness.exporter_contract import export
 from tests.worlds.box_views import cameras, config
 from tools.clients import __main__ as tool
-from tools.clients import base, blender, coco
-from tools.clients.environments import __main__ as environments
+from tools.clients import base, environments
+from tools.clients.process import NOT_INSTALLED
+from tools.clients.reader import CLIENTS
+from tools.clients.trajectories import develop
 
 CAMERAS = cameras(160, 120)
 FRAMES = 2
-SOURCES = base.Sources()
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +40,7 @@ def visible_masks(data: Path) -> dict[str, np.ndarray]:
         masks = np.array(
             [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) > 0 for path in sorted((scene / "mask_visib").glob(f"{frame:06d}_*"))]
         )
-        values[f"mask_visib {frame}"] = masks[masks.any(axis=(1, 2))]
+        values[f"visible_mask {frame}"] = masks[masks.any(axis=(1, 2))]
     return values
 
 
@@ -47,7 +49,7 @@ def opened(data, monkeypatch) -> dict[str, np.ndarray]:
     """The clients' data set, opened; what is in memory can be changed."""
     memory = visible_masks(data)
     monkeypatch.setattr(tool.synpick_warp, "open", lambda folder: {0: None})
-    monkeypatch.setattr(coco, "expect", lambda data_set: memory)
+    monkeypatch.setitem(CLIENTS, "coco", replace(CLIENTS["coco"], expect=lambda data_set: memory))
     return memory
 
 
@@ -61,7 +63,7 @@ def test_a_client_that_agrees(data, opened, tmp_path, capsys):
 
 
 def test_a_client_that_disagrees(data, opened, capsys):
-    opened["mask_visib 1"] = ~opened["mask_visib 1"]
+    opened["visible_mask 1"] = ~opened["visible_mask 1"]
     assert tool.main([str(data), "--clients", "coco"]) == 1
     assert "DIFFERS" in capsys.readouterr().out
 
@@ -72,7 +74,7 @@ def test_a_client_that_fails(tmp_path):
     (broken / "scene_camera.json").write_text("{}")
     (tmp_path / "episodes.jsonl").write_text('{"episode": 0, "frames": 1}\n')
     (broken / "scene_gt_coco.json").write_text("{")
-    result = tool.run_client("coco", sys.executable, tmp_path, {}, SOURCES)
+    result = tool.run_client("coco", sys.executable, tmp_path, {}, "")
     assert (result.agreement, result.holds) == ("FAILED", False)
     assert result.remarks.startswith("json.decoder.JSONDecodeError")
 
@@ -80,8 +82,8 @@ def test_a_client_that_fails(tmp_path):
 @pytest.mark.parametrize("name", ["bop_toolkit", "coco"])
 def test_a_client_that_is_not_installed_is_no_error(data, opened, name):
     python = sys.executable if name == "bop_toolkit" else str(data / "no-python")
-    result = tool.run_client(name, python, data, {}, SOURCES)
-    assert (result.agreement, result.holds) == (tool.NOT_INSTALLED, True)
+    result = tool.run_client(name, python, data, {}, "")
+    assert (result.agreement, result.holds) == (NOT_INSTALLED, True)
 
 
 @pytest.mark.parametrize("arguments", [(), ("--python", "coco"), ("--python", "word=python3")])
@@ -96,13 +98,13 @@ def test_values_are_compared_by_difference_and_pictures_by_psnr():
     assert tool.difference(np.array([1.0, np.nan]), np.array([1.0, 2.0])) == np.inf
     assert tool.difference(ramp, ramp[1:]) == np.inf
     assert tool.psnr(ramp, ramp + 0.1) == pytest.approx(20.0)
-    assert tool.compare(base, {"picture 0": ramp + 0.1}, {"picture 0": ramp}) == ("DIFFERS: picture 0", False)
-    assert tool.compare(base, {"a": ramp}, {"b": ramp})[1] is False
+    assert tool.compare(CLIENTS["coco"], {"picture 0": ramp + 0.1}, {"picture 0": ramp}) == ("DIFFERS: picture 0", False)
+    assert tool.compare(CLIENTS["coco"], {"a": ramp}, {"b": ramp})[1] is False
 
 
 def test_blenders_light_goes_through_our_tone_curve():
     """Linear to sRGB up to 0.6; continuous there; below 1 for any light."""
-    developed = blender.develop("picture", np.array([0.0, 0.18, 0.6, 0.6001, 100.0]))
+    developed = develop(np.array([0.0, 0.18, 0.6, 0.6001, 100.0]))
     np.testing.assert_allclose(developed[:4], [0.0, 0.4614, 0.7977, 0.7978], atol=1e-4)
     assert 0.99 < developed[4] <= 1.0
 
@@ -128,9 +130,9 @@ def test_the_table_of_libraries(tmp_path, monkeypatch, capsys):
     given = [f"--python={name}={tmp_path / name}" for name in ("all", *answers)]
     assert environments.main([*given, "--json", str(tmp_path / "table.json")]) == 1
     rows = {row["client"]: row for row in json.loads((tmp_path / "table.json").read_text())["more"]["clients"]}
-    assert (rows["gymnasium"]["version"], rows["gymnasium"]["remark"]) == ("gymnasium 1.4.0", "16 steps")
-    assert rows["skrl"]["remark"] == "FAILED: ValueError: spaces differ"
-    missing = [name for name, row in rows.items() if row["remark"].startswith("not installed")]
+    assert (rows["gymnasium"]["version"], rows["gymnasium"]["remarks"]) == ("gymnasium 1.4.0", "16 steps")
+    assert (rows["skrl"]["agreement"], rows["skrl"]["remarks"]) == ("FAILED", "ValueError: spaces differ")
+    missing = [name for name, row in rows.items() if row["agreement"] == NOT_INSTALLED]
     assert missing == ["statistics", "torchrl", "rsl_rl", "stable_baselines3"]
     assert "spaces differ" in capsys.readouterr().out
     assert environments.main(["--python", "keras=python"]) == 2

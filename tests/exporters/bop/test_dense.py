@@ -34,8 +34,8 @@ from tests.worlds import trajectories
 from tests.worlds.box_views import cameras, ends, ticks
 from tests.worlds.dense_views import dense_batch, dense_toy
 from tools.checks import dataset as check
-from tools.clients import newton_usd
-from tools.clients.base import Sources, pose_matrix
+from tools.clients.base import pose_matrix
+from tools.clients.trajectories import read_newton
 
 COUNT = 200
 LENSES = cameras(240, 180)
@@ -132,7 +132,7 @@ def read_zarr(out: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def read_usd(out: Path) -> tuple[np.ndarray, np.ndarray]:
     """Instances and poses (N, 4, 4) of the bodies that Newton imports."""
-    values = newton_usd.read(out / "usd" / "000000.usdc", out, Sources()).values
+    values = read_newton(out / "usd" / "000000.usdc", out, "").values
     return values["instance_id"], values["object_to_world"]
 
 

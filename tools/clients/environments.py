@@ -1,4 +1,11 @@
-"""Clients of the environment: for each library, two iterations of its training loop, or its own checks. Runs in its interpreter."""
+"""Integration tests of the environment with libraries of reinforcement learning, unpatched: two iterations, or their own checks.
+
+Each client runs in a process of its own, in our interpreter or in the one that `--python NAME=PATH` names. Prints a table; a client that is
+not installed is listed as such. Exits with 1 if a client fails. Nothing is fetched; an interpreter for all of them:
+`pip install gymnasium torch skrl torchrl rsl-rl-lib stable-baselines3 tensorboard synpick-warp`.
+
+    python -m tools.clients.environments --python all=VENV/bin/python
+"""
 
 # Runs where these libraries are, which the type checker may not see.
 # pyright: reportMissingImports=false
@@ -8,12 +15,15 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 import synpick_warp
+from tools.clients.process import finish, interpreters, run_module
+from tools.options import fail, make_parser
 
 SMALL: dict[str, Any] = {
     "config": "smoke",
@@ -193,15 +203,36 @@ CLIENTS: Mapping[str, tuple[str, Callable[[str], str]]] = {
     "rsl_rl": ("rsl-rl-lib", train_rsl_rl),
     "stable_baselines3": ("stable-baselines3", train_stable_baselines3),
 }
-"""Client -> its package, for the version, and its function, which returns a remark and raises on a failure."""
+"""Client -> its package, for the version, and its function, which returns a remark and raises on a failure. `--run` runs one here."""
 
 
-def main() -> None:
-    """Run the client that the first argument names on the device of the second; prints version and remark as the last line."""
-    package, run = CLIENTS[sys.argv[1]]
-    remark = run(sys.argv[2])
-    print(f"\n{package} {version(package)}\t{remark}")
+def run_client(name: str, python: str, device: str) -> Any:
+    """Run a client in a process of its interpreter; returns its row."""
+    result, printed = run_module(name, python, "tools.clients.environments", "--run", device)
+    if result.agreement:
+        return result
+    number, _, remark = next(line for line in reversed(printed.splitlines()) if "\t" in line).partition("\t")
+    return replace(result, version=number, agreement="works", remarks=remark)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if "--run" in given:
+        name, _, device = given
+        package, run = CLIENTS[name]
+        remark = run(device)
+        print(f"\n{package} {version(package)}\t{remark}")
+        return 0
+    parser = make_parser(__doc__, "device", "json", device="cpu")
+    parser.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help="interpreter of a client, or of all")
+    options = parser.parse_args(given)
+    try:
+        chosen = list(interpreters(CLIENTS, tuple(CLIENTS), options.python))
+    except ValueError as error:
+        return fail("environments", str(error))
+    return finish("tools.clients.environments", options.json, [run_client(name, python, options.device) for name, python in chosen])
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Integration tests of the environment with published libraries of reinforcement learning."""
