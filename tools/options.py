@@ -39,15 +39,17 @@ def positive_count(text: str) -> int:
     return int(text)
 
 
-def finite_seconds(text: str) -> float:
-    """Argument type of an option: a finite, non-negative duration [s]."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 <= seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is no time; allowed: a number of seconds from 0 on")
-    return seconds
+def counts(text: str) -> tuple[int, ...]:
+    """Argument type of an option: integers above 0, comma-separated."""
+    return tuple(positive_count(part) for part in text.split(","))
+
+
+def existing_folder(text: str) -> Path:
+    """Argument type of an option: the path of an existing folder."""
+    path = Path(text)
+    if not path.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {path}; create it first")
+    return path
 
 
 def number_in(low: float, high: float = math.inf) -> Callable[[str], float]:
@@ -59,7 +61,8 @@ def number_in(low: float, high: float = math.inf) -> Callable[[str], float]:
         except ValueError:
             value = math.nan
         if not low <= value <= high or value == math.inf:
-            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {low:g} to {high:g}")
+            allowed = f"{low:g} to {high:g}" if math.isfinite(high) else f"finite numbers from {low:g} on"
+            raise argparse.ArgumentTypeError(f"{text} is out of range; allowed: {allowed}")
         return value
 
     return parse

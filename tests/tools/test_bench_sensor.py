@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,11 @@ import pytest
 
 from synpick_warp.codes import Segment
 from synpick_warp.scenes.types import Catalog, Fixture
+from tests.builders import FEW_STEPS
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
-from tools.bench.compare import sensor as bench_sensor
+from tools.bench import __main__ as bench
+from tools.bench import run, worlds
+from tools.bench import sensor as bench_sensor
 
 OBLIQUE = np.array([[1.0, 0.0, 0.0], [0.0, -0.6, -0.8], [0.0, 0.8, -0.6]])
 """World-to-camera rotation of a camera that looks down and towards +y."""
@@ -79,5 +83,18 @@ def test_textures_with_the_same_border_stay_distinct():
     black = np.zeros((1024, 1024, 3), np.uint8)
     framed = black.copy()
     framed[:, 1:] = 200
-    first, second = (bench_sensor._newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
+    first, second = (bench_sensor.newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
     assert first.texture_hash != second.texture_hash
+
+
+def test_both_renderers_are_timed_on_settled_piles(tmp_path, monkeypatch):
+    for module, names in ((worlds, ("FALL_TICKS", "SETTLE_TICKS")), (run, ("BURST", "MIN_REPEATS"))):
+        for name in names:
+            monkeypatch.setattr(module, name, 1)
+    file = tmp_path / "bench.json"
+    small = ("--worlds", "2", "--resolution", "32x18", "--seconds", "0", *FEW_STEPS)
+    assert bench.main(["--parts", "sensor", "--json", str(file), *small]) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert {row["part"] for row in rows} == {"sensor"}
+    assert {row["unit"] for row in rows} == {"s", "", "%", "mm", "ms", "1/s", "Mpx/s", "grey"}
+    assert min(row["value"] for row in rows if "pixels with the same instance" in row["name"]) >= 99.0

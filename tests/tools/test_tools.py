@@ -14,7 +14,7 @@ from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, assignments
 from tools.bench import __main__ as bench
-from tools.bench import physics as bench_physics
+from tools.bench import run, worlds
 from tools.figures import read_runs
 from tools.reports import rest as rest_report
 
@@ -135,12 +135,11 @@ def test_more_arrangements_than_worlds(tmp_path):
 
 @pytest.mark.slow
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
-    for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "MIN_REPEATS", "BURST"):
-        monkeypatch.setattr(bench_physics, name, 1)
-    for target in ("write.COPIES", "meter.LEAD_TICKS"):
+    for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "STREAM_BATCHES"):
+        monkeypatch.setattr(worlds, name, 1)
+    for target in ("run.MIN_REPEATS", "run.BURST", "write.COPIES", "meter.LEAD_TICKS"):
         monkeypatch.setattr(f"tools.bench.{target}", 1)
-    for name, value in (("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3)):
-        monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(worlds, "WRITE_VIEWS", 3)
     # Other tests write to and delete from the file system whose used space is measured.
     unchanged = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: unchanged)
@@ -158,7 +157,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
 
 
 def test_a_stopwatch_sums_calls(device):
-    watch, calls = bench_physics.Stopwatch(device), []
+    watch, calls = run.Stopwatch(device), []
     owner = SimpleNamespace(work=lambda value, *, factor: calls.append(value * factor) or time.sleep(2e-3))
     with watch.time_method(owner, "work", "name"):
         owner.work(2, factor=3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import statistics
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -20,23 +21,70 @@ from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally
-from tools.bench.usage import Usage, measure_usage
 from tools.options import Row
 
-LIVE_FRACTION = 0.9
-"""Steady-state threshold: fraction of the worlds that must deliver frames in a tick. Before, worlds settle, and physics has a larger
-part."""
 LEAD_TICKS = 2
 """Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
 SLICE_SECONDS = 20.0
 """Window length of the reported rates (median, minimum and maximum over windows) [s]."""
+_PARENT, _USER, _SYSTEM, _RESIDENT = 1, 11, 12, 21
+"""Indices in /proc/PID/stat (proc_pid_stat(5)) after the command's name: parent process, CPU time in user mode and in system mode [clock
+ticks], resident memory [pages]."""
+_ANONYMOUS = re.compile(r"^RssAnon:\s*(\d+) kB$", re.MULTILINE)
+"""Line of /proc/PID/status, which processes that have ended and kernel threads lack."""
+
+
+class Usage(NamedTuple):
+    """Resources of processes."""
+
+    user: float = 0.0
+    """CPU time in user mode [s]."""
+    system: float = 0.0
+    """CPU time in the kernel [s]."""
+    resident: int = 0
+    """Resident memory [bytes]; memory that processes share, such as the slots through which writers get images, counts in each."""
+    anonymous: int = 0
+    """Resident memory of the process's own [bytes]: without shared memory and files."""
+
+    @property
+    def cpu(self) -> float:
+        """CPU time in user mode and in the kernel [s]."""
+        return self.user + self.system
+
+    def plus(self, other: Usage) -> Usage:
+        """Sum of the resources of two."""
+        return Usage(*(one + another for one, another in zip(self, other, strict=True)))
+
+
+def measure_usage() -> dict[int, Usage]:
+    """Resources of this process and of its running descendants, by process id."""
+    usages: dict[int, Usage] = {}
+    parents: dict[int, int] = {}
+    tick = 1.0 / os.sysconf("SC_CLK_TCK")
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                values = list(map(int, (entry / "stat").read_text().rpartition(")")[2].split()[1:]))
+                anonymous = _ANONYMOUS.search((entry / "status").read_text())
+            except OSError:
+                continue
+            user, system, pages = (values[index - 1] for index in (_USER, _SYSTEM, _RESIDENT))
+            own = 1024 * int(anonymous[1]) if anonymous else 0
+            usages[int(entry.name)] = Usage(tick * user, tick * system, pages * os.sysconf("SC_PAGE_SIZE"), own)
+            parents[int(entry.name)] = values[_PARENT - 1]
+    return {pid: usage for pid, usage in usages.items() if _descends(pid, os.getpid(), parents)}
+
+
+def _descends(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
+    """True if a process is the ancestor or one of its descendants."""
+    while pid in parents and pid != ancestor:
+        pid = parents[pid]
+    return pid == ancestor
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Reading of a bake after a tick: time [s], views or frames so far, episodes, resources of its processes, disk and device memory in use
-    [B].
-    """
+    """Reading of a bake after a tick."""
 
     time: float
     """[s]"""
@@ -110,19 +158,14 @@ class SteadyMeter(SilentProgress):
             if self.ticks > LEAD_TICKS * self.devices and not self.is_stopped:
                 self.readings.append(self._read(count, episodes_done, tally))
         measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
-        if measured or tally.problem or episodes_done >= episodes - self.worlds * self.devices:
-            self._stop()
+        if not self.is_stopped and (measured or tally.problem or episodes_done >= episodes - self.worlds * self.devices):
+            self.is_stopped = True
+            os.kill(os.getpid(), signal.SIGINT)
 
     def raise_interruption(self, summary: BakeSummary) -> None:
         """Raise KeyboardInterrupt if Ctrl-C or another signal from outside stopped the bake."""
         if summary.stopped and not self.is_stopped:
             raise KeyboardInterrupt
-
-    def _stop(self) -> None:
-        """Interrupt the bake in this process, once."""
-        if not self.is_stopped:
-            self.is_stopped = True
-            os.kill(os.getpid(), signal.SIGINT)
 
     def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
         """Reading of this moment: time, counts, CPU and memory of the processes, cleaner apart, disk, device memory."""
@@ -145,12 +188,7 @@ def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
 
 
 def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[Row]:
-    """Rows of a measurement: rate, its slices, CPU time, and memory at both ends.
-
-    Args:
-        unit: Name of what the readings count, in the singular.
-        meter: Meter with at least two readings.
-    """
+    """Rows of a measurement with at least two readings: rate, its slices, CPU time, and memory at both ends; `unit` is what they count."""
     first, last = meter.readings[0], meter.readings[-1]
     count, seconds = last.count - first.count, last.time - first.time
     yield Row(f"time to the first {unit}s", meter.first_count, "s")
@@ -158,10 +196,8 @@ def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[Row]:
     yield Row("a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
     yield Row(f"{unit}s to disk", count / seconds, "1/s")
     rates = slice_rates(meter.readings, SLICE_SECONDS)
-    if rates:
-        yield Row(f"{unit}s to disk, median of {len(rates)} times {SLICE_SECONDS:.0f} s", statistics.median(rates), "1/s")
-        yield Row(f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
-        yield Row(f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
+    for name, choose in ((f"median of {len(rates)} times", statistics.median), ("slowest", min), ("fastest", max)) if rates else ():
+        yield Row(f"{unit}s to disk, {name} {SLICE_SECONDS:.0f} s", choose(rates), "1/s")
     workers = "writers" if meter.devices == 1 else "writers and devices' processes"
     spent = {workers: last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
     if meter.cleaner:

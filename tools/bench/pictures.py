@@ -10,6 +10,7 @@ and writers do not run. The size of a pass is fixed: `--seconds` is ignored.
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from collections.abc import Iterator
@@ -19,7 +20,6 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
@@ -28,9 +28,8 @@ from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.stream import FrameStream, TickReport, read_tick
 from synpick_warp.system.progress import SilentProgress
-from tools.bench.meter import LIVE_FRACTION
-from tools.bench.steady import SPARE_EPISODES
-from tools.bench.stream import batch_views, select_views
+from tools.bench.online import batch_views
+from tools.bench.run import LIVE_FRACTION, SPARE_EPISODES, Bench
 from tools.options import Row
 
 HISTORY_TICKS = 24
@@ -77,42 +76,37 @@ def light_history(renderer: Renderer) -> Any:
     return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
 
 
-def measure_pictures(config: Config, after: int = 0) -> Iterator[Row]:
+def measure_pictures(bench: Bench) -> Iterator[Row]:
     """Simulate, keep and render ticks: rows of counts, and of the rates with `render.history` as set, and with 0.
 
-    Args:
-        config: All settings. More device memory is needed than for a bake: for a copy of the histories, the kept snapshots, and the scratch
-            arrays of a second renderer.
-        after: Ticks simulated before the histories begin; just after the drop little moves.
+    More device memory is needed than for a bake: for a copy of the histories, the kept snapshots, and the scratch arrays of a second
+    renderer. `bench.after` ticks are simulated before the histories begin; just after the drop little moves.
     """
     started = time.perf_counter()
-    config = config.with_values({"bake.episodes": SPARE_EPISODES * config.bake.worlds})
-    needs = Needs.of(config)
-    factory = build_factory(config, SilentProgress(), needs_images=needs.images)
-    stream, device = factory.stream, factory.simulation.device
+    config = bench.config.with_values({"bake.episodes": SPARE_EPISODES * bench.config.bake.worlds})
+    factory = build_factory(config, SilentProgress(), needs_images=Needs.of(config).images)
+    stream, ring = factory.stream, factory.stream.rings[0]
     simulate_until_live(factory)
-    for _ in range(after):
+    for _ in range(bench.after):
         _tick(factory)
     for _ in range(HISTORY_TICKS):
-        render_ticks(stream, stream.rings[0].renderer, [keep_tick(factory)])
+        render_ticks(stream, ring.renderer, [keep_tick(factory)])
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
     views = sum(tick.views for tick in ticks)
-    wp.synchronize_device(device)
+    wp.synchronize_device(stream.device)
     yield Row(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
     yield Row("ticks in a pass", len(ticks), "")
     yield Row("views in a pass", views, "")
-    yield Row("views in a batch", stream.rings[0].batch, "")
+    yield Row("views in a batch", ring.batch, "")
     if views == 0:
         return  # All episodes have ended.
-    renderers = {"all stages": stream.rings[0].renderer}
-    history = light_history(stream.rings[0].renderer)
+    renderers = {"all stages": ring.renderer}
+    history = light_history(ring.renderer)
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
         yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
         without = config.with_values({"render.history": 0})
-        renderers["all stages, render.history=0"] = make_renderer(
-            without, stream.rings[0].renderer.scene, stream.rings[0].instances, stream.rings[0].batch
-        )
+        renderers["all stages, render.history=0"] = make_renderer(without, ring.renderer.scene, ring.instances, ring.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
@@ -133,10 +127,9 @@ def simulate_until_live(factory: Factory) -> None:
 
 def keep_tick(factory: Factory) -> KeptTick:
     """Simulate a tick, and copy what its rendering needs: the simulation overwrites its record."""
-    world, camera = select_views(_tick(factory), len(factory.cameras))
-    snapshot = factory.simulation.record.snapshot
+    report, snapshot, ring = _tick(factory), factory.simulation.record.snapshot, factory.stream.rings[0]
     copy = Snapshot(**{item.name: wp.clone(getattr(snapshot, item.name)) for item in fields(snapshot)})
-    return KeptTick(copy, list(batch_views(world, camera, factory.stream.rings[0].batch, factory.stream.rings[0].renderer)))
+    return KeptTick(copy, list(batch_views(report, len(factory.cameras), ring.batch, ring.renderer)))
 
 
 def _tick(factory: Factory) -> TickReport:
@@ -147,11 +140,11 @@ def _tick(factory: Factory) -> TickReport:
 
 def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:
     """Enqueue the rendering of all views of `ticks`, in the order, batches and buffers of a bake; does not wait for the device."""
-    slot = 0
+    slots = itertools.cycle(stream.rings[0].slots)
     for tick in ticks:
         for views in tick.batches:
-            renderer.render(tick.snapshot, views, stream.rings[0].slots[slot].images, stream.rings[0].slots[slot].layers)
-            slot = (slot + 1) % len(stream.rings[0].slots)
+            slot = next(slots)
+            renderer.render(tick.snapshot, views, slot.images, slot.layers)
 
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from synpick_warp.stages.host_copies import DeviceImages
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
+from tools.bench.meter import Usage, measure_usage
 from tools.options import Row
 
 COPIES = 8
@@ -56,12 +57,8 @@ class _Input:
 
 
 def measure_writing(factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
-    """Benchmark of each format alone.
-
-    Args:
-        factory: Worlds and renderer that provide the input; its settings name the formats.
-        report: Selects the worlds whose views are written.
-        min_seconds: Time of a measurement, at least [s].
+    """Benchmark of each format of the settings alone, for at least `min_seconds` [s] each; `report`: selects the worlds whose views are
+    written.
     """
     config, snapshot = factory.config, factory.simulation.record.snapshot
     batches = [_copy(batch) for batch in factory.stream.render(snapshot, report)]
@@ -105,9 +102,7 @@ def _copy(batch: FrameBatch) -> FrameBatch:
 
 @dataclass(frozen=True)
 class _Result:
-    """Result of one format with one process count: views written [1/s], CPU time per view [s], time to commit an episode [s], files and
-    bytes per view.
-    """
+    """Result of one format with one process count."""
 
     rate: float
     """Views written [1/s]."""
@@ -134,8 +129,8 @@ def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, pro
     with WriterPool(processes, exporter_class.slot_bytes(settings)) as pool:
         exporter = exporter_class(ExportContext(out, settings, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
-        for batch in (source.at(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(source.views)))):
-            exporter.write_views(batch)
+        for _ in range(-(-processes * QUEUE_DEPTH // len(source.views))):
+            exporter.write_views(source.at(COPIES, 0)[0])
         pool.wait()
         cpu, frame, started = _cpu_seconds(pool), 0, time.perf_counter()
         while frame == 0 or (frame < MAX_FRAMES and time.perf_counter() - started < min_seconds):
@@ -146,7 +141,7 @@ def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, pro
             frame += 1
         pool.wait()
         seconds = time.perf_counter() - started
-        # The clocks of the thread and of the process are read one after the other, so their difference may shrink.
+        # Clocks are read one after the other, so their difference may shrink.
         cpu = {part: max(0.0, spent - cpu[part]) for part, spent in _cpu_seconds(pool).items()}
         episodes = source.episodes()
         for episode in episodes:
@@ -164,9 +159,7 @@ def _write(exporter_class: type[Exporter], factory: Factory, source: _Input, pro
 
 def _cpu_seconds(pool: WriterPool) -> dict[str, float]:
     """CPU time [s] used so far by this process's main thread, by its other threads, and by the writers in user and kernel mode."""
-    # utime and stime of /proc/PID/stat (proc_pid_stat(5)); the process name before them may contain blanks.
-    texts = (Path(f"/proc/{pid}/stat").read_text() for pid in pool.pids())
-    ticks = np.array([[int(value) for value in text.rpartition(")")[2].split()[11:13]] for text in texts])
-    user, kernel = (ticks.sum(axis=0) / os.sysconf("SC_CLK_TCK")).tolist()
-    main = time.thread_time()
-    return {"main thread": main, "other threads": time.process_time() - main, "writers, user": user, "writers, kernel": kernel}
+    usages = measure_usage()
+    writers = reduce(Usage.plus, (usages[pid] for pid in pool.pids()))
+    main, process = time.thread_time(), time.process_time()
+    return {"main thread": main, "other threads": process - main, "writers, user": writers.user, "writers, kernel": writers.system}

@@ -1,11 +1,11 @@
-"""Benchmark against newton.sensors.SensorCamera: time and agreement of both renderers for the same scene, views and outputs."""
+"""Part `sensor`: newton.sensors.SensorCamera beside our renderer, time and agreement for the same scene, views and outputs."""
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import newton
@@ -16,16 +16,17 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Render
-from synpick_warp.factory.assembly import Factory
+from synpick_warp.factory.assembly import build_factory
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.layers import LayerRenderer
-from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import first_views
-from tools.bench.physics import BURST, seconds_per_call
+from synpick_warp.system.progress import SilentProgress
+from tools.bench import worlds
+from tools.bench.run import FOREVER, Bench
 from tools.options import Row
 
 ORDERS = {
@@ -41,8 +42,8 @@ DEPTH_TOLERANCE = 1.0
 """Tolerance of depths [counts]: ours is rounded to half a count, the sensor's is computed in world space in single precision."""
 NORMAL_TOLERANCE = 1.0
 """Tolerance of normals [°]."""
-CHECKED_VIEWS = 6
-"""Views in which the outputs are compared: two worlds."""
+MAX_WORLDS, CHECKED_VIEWS = 64, 6
+"""Worlds that are settled, at most, and views in which the outputs are compared: two worlds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +86,7 @@ def build_sensor_scene(
     """Build the worlds of the first `count` views, which are ordered by world, then by camera.
 
     Args:
-        config: All settings.
+        render: Settings of the renderer.
         catalog: Objects that the snapshot's catalog indices refer to.
         fixtures: Tote, gripper shaft, cup.
         cameras: Cameras with equal intrinsics, since the sensor uses the same rays for all views.
@@ -98,11 +99,10 @@ def build_sensor_scene(
     sensor = SensorCamera(model)
     sensor.create_default_light()
     width, height, matrix = cameras[0].width, cameras[0].height, cameras[0].matrix
-    rays = SensorCamera.compute_camera_rays_pinhole_opencv(
-        width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], device=device
-    )
+    intrinsics = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    rays = SensorCamera.compute_camera_rays_pinhole_opencv(width, height, *intrinsics, device=device)
     view = np.arange(count)
-    transforms = np.array([camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
+    transforms = np.array([_camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
     return SensorScene(
         model,
         model.state(),
@@ -114,28 +114,35 @@ def build_sensor_scene(
     )
 
 
+def _camera_to_world(camera: Camera) -> np.ndarray:
+    """Pose x, y, z [m], quaternion x, y, z, w (7) of the camera in OpenGL axes."""
+    rotation = camera.rotation.T
+    return np.concatenate([-rotation @ camera.translation, Rotation.from_matrix(rotation @ OPENGL).as_quat()])
+
+
 def _build_model(
-    render: Render, catalog: Catalog, fixtures: tuple[Fixture, ...], table: float, snapshot: Snapshot, worlds: int, device: Any
+    render: Render, catalog: Catalog, fixtures: tuple[Fixture, ...], table: float, snapshot: Snapshot, count: int, device: Any
 ) -> tuple[newton.Model, list[int]]:
-    """Build the Newton model of the first worlds; returns it with the segmentation id of each shape."""
-    objects = [_newton_mesh(entry.mesh, entry.material) for entry in catalog.entries]
-    fixture_meshes = [_newton_mesh(fixture.mesh, fixture.material) for fixture in fixtures]
+    """Build the Newton model of the first `count` worlds; returns it with the segmentation id of each shape."""
+    objects = [(newton_mesh(entry.mesh, entry.material), entry.material) for entry in catalog.entries]
+    others = [(newton_mesh(fixture.mesh, fixture.material), fixture.material) for fixture in fixtures]
     builder = newton.ModelBuilder()
     # SAH builds, as for our meshes: slower to build, faster to trace.
     builder.default_bvh_cfg.mesh_constructor = builder.default_bvh_cfg.shape_constructor = "sah"
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
     host = {name: getattr(snapshot, name).numpy() for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible")}
-    segment = []
-    for world in range(worlds):
+    segment: list[int] = []
+    for world in range(count):
+        present = np.flatnonzero(host["catalog_index"][world] >= 0)
+        visible = np.flatnonzero(host["fixture_visible"][world])
+        bodies = [(objects[host["catalog_index"][world, index]], host["pose"][world, index], 1 + index) for index in present]
+        bodies += [(others[index], host["fixture_pose"][world, index], Segment.TOTE + index) for index in visible]
         builder.begin_world()
-        for instance, catalog_index in enumerate(host["catalog_index"][world]):
-            if catalog_index >= 0:
-                _add_body(builder, objects[catalog_index], catalog.entries[catalog_index].material, host["pose"][world, instance], shape)
-                segment.append(1 + instance)
-        for index, visible in enumerate(host["fixture_visible"][world]):
-            if visible:
-                _add_body(builder, fixture_meshes[index], fixtures[index].material, host["fixture_pose"][world, index], shape)
-                segment.append(Segment.TOTE + index)
+        for (mesh, material), pose, number in bodies:
+            # A movable body with one shape; its mass does not affect rendering.
+            body = builder.add_body(xform=wp.transform(*pose.tolist()), mass=1.0, inertia=wp.mat33(np.eye(3)))
+            builder.add_shape_mesh(body, mesh=mesh, cfg=shape, color=material.color)
+            segment.append(int(number))
         if render.table:
             builder.add_shape_plane((0.0, 0.0, 1.0, -table), width=0.0, length=0.0, cfg=shape, color=render.table_color)
             segment.append(Segment.TABLE)
@@ -151,22 +158,10 @@ class _Mesh(newton.Mesh):
         return id(self.texture)
 
 
-def _newton_mesh(mesh: TriangleMesh, material: Material) -> newton.Mesh:
+def newton_mesh(mesh: TriangleMesh, material: Material) -> newton.Mesh:
     """Convert a mesh; texture coordinates are left out without a texture."""
     uvs = None if material.texture is None else mesh.uv
     return _Mesh(mesh.vertices, mesh.faces.reshape(-1), normals=mesh.normals, uvs=uvs, texture=material.texture, compute_inertia=False)
-
-
-def _add_body(builder: newton.ModelBuilder, mesh: newton.Mesh, material: Material, pose: np.ndarray, shape: Any) -> None:
-    """Add a movable body with one shape; its mass does not affect rendering."""
-    body = builder.add_body(xform=wp.transform(*pose.tolist()), mass=1.0, inertia=wp.mat33(np.eye(3)))
-    builder.add_shape_mesh(body, mesh=mesh, cfg=shape, color=material.color)
-
-
-def camera_to_world(camera: Camera) -> np.ndarray:
-    """Pose x, y, z [m], quaternion x, y, z, w (7) of the camera in OpenGL axes."""
-    rotation = camera.rotation.T
-    return np.concatenate([-rotation @ camera.translation, Rotation.from_matrix(rotation @ OPENGL).as_quat()])
 
 
 def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float) -> list[Row]:
@@ -212,79 +207,65 @@ def compare_surfaces(cameras: tuple[Camera, ...], normal: np.ndarray, albedo: np
     ]
 
 
-def measure_sensor(factory: Factory, min_seconds: float) -> Iterator[Row]:
-    """Benchmark of both renderers for three sets of outputs.
+def measure_sensor(bench: Bench) -> Iterator[Row]:
+    """Benchmark of both renderers for three sets of outputs, on piles at rest.
 
     Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
     sensor has no light maps, amodal masks, counts, boxes, or texture minification.
     """
-    simulation, renderer, config = factory.simulation, factory.stream.rings[0].renderer, factory.config
-    device, snapshot = simulation.device, simulation.record.snapshot
-    count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(factory.cameras))
+    config = bench.config.with_values({"bake.worlds": min(bench.config.bake.worlds, MAX_WORLDS)})
+    factory = build_factory(config, SilentProgress())
+    simulation, renderer, cameras = factory.simulation, factory.stream.rings[0].renderer, factory.cameras
+    simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
+    for _ in range(worlds.FALL_TICKS + worlds.SETTLE_TICKS):
+        simulation.tick()
+    device, snapshot, scale = simulation.device, simulation.record.snapshot, config.bop.depth_scale
+    count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(cameras))
     started = time.perf_counter()
     fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     table = float(renderer.scene.table.height)
-    scene = build_sensor_scene(config.render, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
+    scene = build_sensor_scene(config.render, factory.catalog, fixtures, cameras, table, snapshot, count, device)
     wp.synchronize_device(device)
     yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
     yield Row("views in a batch", count, "")
-    ours = OurViews(renderer, snapshot, count)
+    height, width, checked = renderer.scene.height, renderer.scene.width, slice(min(count, CHECKED_VIEWS))
+    out, views = (
+        allocate_view_buffers(count, width, height, renderer.instances, device),
+        first_views(count, len(cameras), renderer.instances, device),
+    )
     layer_renderer = LayerRenderer(LAYERS, None, renderer.scene, renderer.instances, count)
-    our_layers = allocate(LayerBuffers, {"view": count, "row": renderer.scene.height, "column": renderer.scene.width}, device, LAYERS)
-    hit_images = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
-    surface_images = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
-    color_images = scene.allocate_outputs(color_image="color")
+    our_layers = allocate(LayerBuffers, {"view": count, "row": height, "column": width}, device, LAYERS)
+    hits = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
+    surfaces = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
+    gbuffer = partial(renderer.render_gbuffer, snapshot, views, out)
 
     def time_view(function: Callable[[], object]) -> float:
         """Time of one view [s]."""
-        return seconds_per_call(function, device, min_seconds / 4, BURST) / count
+        return bench.seconds_per_call(function, 0.25) / count
 
     def render_layers() -> None:
         """Layers, besides depth, ids and amodal masks."""
-        ours.render_gbuffer()
-        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, ours.views, our_layers, renderer.cameras)
+        gbuffer()
+        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, views, our_layers, renderer.cameras)
 
-    times = [time_view(ours.render_gbuffer)]
-    orders = {name: time_view(functools.partial(scene.render, order, hit_images)) for name, order in ORDERS.items()}
+    own = time_view(gbuffer)
+    orders = {name: time_view(partial(scene.render, order, hits)) for name, order in ORDERS.items()}
     best = min(orders, key=orders.__getitem__)
-    checked = min(count, CHECKED_VIEWS)
-    arrays = (hit_images["shape_index_image"], hit_images["forward_depth_image"], ours.out.instance, ours.out.depth)
-    index, depth, segment, counts = (array[:checked].numpy() for array in arrays)
-    yield from compare_hits(scene.segment, index, depth, segment, counts, config.bop.depth_scale)
+    arrays = (hits["shape_index_image"], hits["forward_depth_image"], out.instance, out.depth)
+    yield from compare_hits(scene.segment, *(array[checked].numpy() for array in arrays), scale)
     for name, seconds in orders.items():
         yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
-        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / times[0], "")
-    pixels = factory.cameras[0].width * factory.cameras[0].height
-    yield from _comparison_rows("depth, index", ", amodal masks", "", (times[0], orders[best]), pixels)
+        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / own, "")
+    yield from _comparison_rows("depth, index", ", amodal masks", "", (own, orders[best]), width * height)
     textured = replace(ORDERS[best], enable_textures=True)
-    times = [time_view(render_layers), time_view(functools.partial(scene.render, textured, hit_images | surface_images))]
-    layers = {name: getattr(our_layers, name)[:checked].numpy() for name in LAYERS}
-    normal, albedo = (image[:checked].numpy() for image in surface_images.values())
-    yield from compare_surfaces(factory.cameras, normal, albedo, layers)
-    yield from _comparison_rows("depth, index, normals, albedo", ", amodal masks", "", (times[0], times[1]), pixels)
-    lit = replace(textured, enable_shadows=True)
-    times = [time_view(ours.render), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
-    yield from _comparison_rows(
-        "color, depth, index", ", indirect light, anti-aliasing, amodal masks, counts, boxes", ", one light", (times[0], times[1]), pixels
-    )
-
-
-class OurViews:
-    """Our renderer, for the first views of a snapshot."""
-
-    def __init__(self, renderer: Renderer, snapshot: Snapshot, count: int) -> None:
-        scene = renderer.scene
-        self.renderer, self.snapshot = renderer, snapshot
-        self.out = allocate_view_buffers(count, scene.width, scene.height, renderer.instances, scene.device)
-        self.views = first_views(count, scene.camera_count, renderer.instances, scene.device)
-
-    def render_gbuffer(self) -> None:
-        """Depth, ids and amodal masks alone."""
-        self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
-
-    def render(self) -> None:
-        """All stages."""
-        self.renderer.render(self.snapshot, self.views, self.out)
+    times = time_view(render_layers), time_view(partial(scene.render, textured, hits | surfaces))
+    layers = {name: getattr(our_layers, name)[checked].numpy() for name in LAYERS}
+    yield from compare_surfaces(cameras, *(image[checked].numpy() for image in surfaces.values()), layers)
+    yield from _comparison_rows("depth, index, normals, albedo", ", amodal masks", "", times, width * height)
+    lit, color = replace(textured, enable_shadows=True), scene.allocate_outputs(color_image="color")
+    times = time_view(partial(renderer.render, snapshot, views, out)), time_view(partial(scene.render, lit, hits | color))
+    extras = ", indirect light, anti-aliasing, amodal masks, counts, boxes"
+    yield from _comparison_rows("color, depth, index", extras, ", one light", times, width * height)
 
 
 def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tuple[float, float], pixels: int) -> Iterator[Row]:
@@ -292,11 +273,6 @@ def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tu
     ours, theirs = times
     for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
         yield Row(name, 1e3 * seconds, "ms")
-        yield from rate_rows(name, seconds, pixels)
+        yield Row(f"{name}: views", 1.0 / seconds, "1/s")
+        yield Row(f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")
     yield Row(f"SensorCamera's time over ours: {outputs}", theirs / ours, "")
-
-
-def rate_rows(name: str, seconds: float, pixels: int) -> Iterator[Row]:
-    """Rates of a renderer that takes `seconds` for a view of `pixels` pixels."""
-    yield Row(f"{name}: views", 1.0 / seconds, "1/s")
-    yield Row(f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")

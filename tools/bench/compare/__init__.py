@@ -1,1 +1,0 @@
-"""Benchmarks against other simulators and renderers, on the same piles, meshes and cameras."""

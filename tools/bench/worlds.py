@@ -1,0 +1,366 @@
+"""Parts that are measured in the same worlds: physics, perception, rendering, encoders; the parts write and stream follow there."""
+
+from __future__ import annotations
+
+import contextlib
+import resource
+import time
+from collections.abc import Callable, Iterator
+from unittest import mock
+
+import newton
+import numpy as np
+import warp as wp
+
+from synpick_warp.cli.commands.doctor import GIB
+from synpick_warp.codes import Phase, Status, Task
+from synpick_warp.exporters.registry import Needs
+from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.factory.assembly import Factory, build_factory
+from synpick_warp.stages import timing
+from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
+from synpick_warp.stages.perception.perceive import Perception
+from synpick_warp.stages.render.view_setup import first_views
+from synpick_warp.stages.sim.physics import may_capture
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import TickReader, TickReport, read_tick
+from synpick_warp.system.codecs.jpeg import encode_jpeg
+from synpick_warp.system.progress import SilentProgress
+from tools.bench import run
+from tools.bench.online import measure_stream
+from tools.bench.run import FOREVER, Bench, Stopwatch
+from tools.bench.write import measure_writing
+from tools.options import Row, of_part
+
+FALL_TICKS, SETTLE_TICKS = 4, 60
+"""Ticks from the drop until the first objects land, and from there until piles are at rest (4 s at 15 Hz)."""
+START_HEIGHT, STIR_TICKS = 0.2, 30
+"""Start height of the gripper in mode move, just above the pile [m]; ticks from there until it is inside the pile (2 s at 15 Hz)."""
+LEAD_TICKS, PICK_TICKS = 25, 60
+"""Ticks from the first perception to the middle of the first attempt, and ticks measured from there: an attempt takes 55."""
+STREAM_BATCHES = 12
+"""Number of batches that are rendered and copied back to back."""
+WRITE_VIEWS, CPU_VIEWS = 12, 6
+"""Number of views that are written over and over, and of those encoded on the CPU."""
+
+
+def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
+    """Measure the parts physics, perception, render, encode, write and stream of these, in this order."""
+    started, needs = time.perf_counter(), Needs.of(bench.config)
+    records = "write" in parts and needs.physics
+    factory = build_factory(bench.config, SilentProgress(), records_physics=records, needs_images=needs.images)
+    simulation, device = factory.simulation, factory.simulation.device
+    wp.synchronize_device(device)
+    yield Row("load and build", time.perf_counter() - started, "s", part="setup")
+    yield from of_part("physics", _measure_simulation(bench, simulation, parts))
+    if simulation.perception is not None and "perception" in parts:
+        yield from of_part("perception", measure_perception(simulation.perception, simulation.record.snapshot, device, bench.seconds))
+    if "render" in parts:
+        yield from of_part("render", _measure_rendering(bench, factory))
+    if "encode" in parts:
+        yield from of_part("encode", _measure_encoding(bench, factory))
+    yield from _perception_fraction(bench)
+    if "write" in parts:
+        worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
+        yield from of_part("write", measure_writing(factory, _mark_live(simulation, worlds), bench.seconds))
+    if "stream" in parts:
+        yield from of_part("stream", measure_stream(bench, factory, _mark_live(simulation, simulation.layout.worlds)))
+    yield _memory_in_use(device)
+
+
+def _memory_in_use(device: wp.Device) -> Row:
+    """Row of the device memory in use by all processes; on the CPU, of the process's peak memory."""
+    if device.is_cuda:
+        return Row("device memory in use by all processes", (device.total_memory - device.free_memory) / GIB, "GiB", part="setup")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return Row("peak memory of the process", peak / 1024**2, "GiB", part="setup")
+
+
+def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
+    """Report of the last tick, marked as a frame of the first `worlds` worlds alone."""
+    report = read_tick(simulation.record)
+    report.status[:, Status.LIVE] = np.arange(simulation.layout.worlds) < worlds
+    return report
+
+
+# ---- physics ----
+
+
+def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, ...]) -> Iterator[Row]:
+    """Benchmark of all phases of an episode: drop, settle, let act; measures `parts` (physics, perception) on the way.
+
+    The state at the end is that of worlds in the middle of acting, as the benchmarks of rendering and writing need it.
+    """
+    tick, settle, measured = simulation.tick, simulation.scene.settle, "physics" in parts
+    rest_ticks, settle.rest_ticks, settle.max_ticks = settle.rest_ticks, FOREVER, FOREVER
+    simulation.scene.move.start_height = START_HEIGHT
+    started = time.perf_counter()
+    _simulate(simulation, FALL_TICKS)
+    wp.synchronize_device(simulation.device)
+    yield Row(f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s", part="setup")
+    if measured:
+        yield from _tick_rates(simulation, bench.seconds_per_call(tick), "falling and landing")
+    _simulate(simulation, SETTLE_TICKS)
+    # Guide walls are removed as in a bake; then the phase SETTLE goes on, so that piles stay at rest.
+    for count in (1, FOREVER):
+        settle.rest_ticks = count
+        tick()
+    pile_seconds = 0.0
+    if measured:
+        yield from _tick_rates(simulation, bench.seconds_per_call(tick), "at rest")
+        yield from _measure_tick_parts(bench, simulation)
+        pile_seconds = _measure_pile_steps(bench, simulation)
+        yield from _tick_rates(simulation, pile_seconds, "at rest, without gripper and seals, steps alone")
+    settle.rest_ticks = rest_ticks
+    if simulation.perception is None:
+        _simulate(simulation, STIR_TICKS + 2 * rest_ticks)
+        if measured:
+            yield from _tick_rates(simulation, bench.seconds_per_call(tick), "being stirred")
+    else:
+        _simulate(simulation, LEAD_TICKS + 2 * rest_ticks)
+        if {"physics", "perception"} & set(parts):
+            yield from (row for row in of_part("physics", _measure_picking(simulation, pile_seconds)) if row.part in parts)
+    if measured:
+        acting = float((simulation.state.phase.numpy() == Phase.ACT).mean())
+        yield Row("worlds that act", 100.0 * acting, "%")
+        contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
+        yield Row("contacts per world", contacts / simulation.layout.worlds, "")
+
+
+def _simulate(simulation: Simulation, ticks: int) -> None:
+    for _ in range(ticks):
+        simulation.tick()
+
+
+def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[Row]:
+    """Rows of time and rates of ticks that take `seconds` each in a state of the worlds."""
+    steps = simulation.config.physics.steps_per_tick
+    yield Row(f"{state}: world-steps", steps * simulation.layout.worlds / seconds, "1/s")
+    yield Row(f"{state}: a step of all worlds", 1e3 * seconds / steps, "ms")
+
+
+def _measure_tick_parts(bench: Bench, simulation: Simulation) -> Iterator[Row]:
+    """Breakdown of a tick: physics steps, everything else, launch overhead, collision detection."""
+    physics, tick = simulation.physics, simulation.tick
+    watch, calls = Stopwatch(simulation.device), 0
+    with watch.time_generator(physics, "tick_parts", "steps"):
+        while calls < run.MIN_REPEATS or watch.seconds("steps") < bench.seconds:
+            tick()
+            calls += 1
+    started = time.perf_counter()
+    tick()
+    host = time.perf_counter() - started
+    with mock.patch.object(physics, "tick_parts", side_effect=lambda *_: iter(())):
+        outside = bench.seconds_per_call(tick, 0.25)
+    collide = _capture_graph(lambda: physics.pipeline.collide(physics.state, physics.contacts), simulation.device)
+    yield Row("a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
+    yield Row("a tick: everything but physics steps", 1e3 * outside, "ms")
+    yield Row("a tick: host time to launch it", 1e3 * host, "ms")
+    yield Row("a collision detection of all worlds", 1e3 * bench.seconds_per_call(collide, 0.25), "ms")
+
+
+def _capture_graph(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
+    """Capture the function's launches as a graph, to leave launch overhead out, where a bake captures them, too."""
+    function()
+    if not may_capture(device):
+        return function
+    with wp.ScopedCapture(device=device) as capture:
+        function()
+    graph = capture.graph
+    assert graph is not None  # Set at the end of the capture.
+    return lambda: wp.capture_launch(graph)
+
+
+def _measure_pile_steps(bench: Bench, simulation: Simulation) -> float:
+    """Time of a tick's physics steps [s] with the pile alone: no setpoints, no seals; the gripper keeps its last force."""
+
+    def keep_forces(state: newton.State) -> None:
+        """Leave the forces of the last step."""
+
+    # Captured graphs contain the kernels of their hooks: steps without the gripper's need graphs of their own, and so do those after them.
+    physics = simulation.physics
+    physics.clear_graphs()
+    physics.tick(keep_forces)
+    seconds = bench.seconds_per_call(lambda: physics.tick(keep_forces))
+    physics.clear_graphs()
+    return seconds
+
+
+def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Row]:
+    """Benchmark of ticks in which worlds pick, and of their perception.
+
+    Args:
+        simulation: Worlds in the middle of an attempt.
+        pile_seconds: Time of a tick's steps with the pile alone, for comparison [s]; 0: not measured.
+    """
+    device, perception, worlds = simulation.device, simulation.perception, simulation.layout.worlds
+    reader, watch = TickReader(simulation.record), Stopwatch(device)
+    perceptions, attached, acting = 0, 0, 0
+    wp.synchronize_device(device)
+    started = time.perf_counter()
+    with watch.time_generator(simulation.physics, "tick_parts", "steps"), watch.time_method(perception, "perceive", "perception"):
+        for _ in range(PICK_TICKS):
+            simulation.tick()
+            reader.start()
+            report = reader.wait()
+            act = report.column("phase") == Phase.ACT
+            acting += int(act.sum())
+            attached += int((act & report.attached.any(axis=1)).sum())
+            perceptions += int((act & (report.column("task") == Task.LOOK)).sum())
+    wp.synchronize_device(device)
+    tick = (time.perf_counter() - started) / PICK_TICKS
+    steps, perceive = (watch.seconds(name) / PICK_TICKS for name in ("steps", "perception"))
+    yield from _tick_rates(simulation, tick, "picking")
+    yield from _tick_rates(simulation, steps, "picking, steps alone")
+    if pile_seconds:
+        yield Row("picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
+    for name, count in (("act", acting), ("have an object attached", attached)):
+        yield Row(f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
+    yield Row("worlds perceived a tick", perceptions / PICK_TICKS, part="perception")
+    yield Row("perception and planning, a tick", 1e3 * perceive, "ms", part="perception")
+    yield Row("perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%", part="perception")
+
+
+# ---- perception ----
+
+
+def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.Device, min_seconds: float) -> Iterator[Row]:
+    """Measure perception and planning by stage, in full batches of worlds that all look, for at least `min_seconds` [s]."""
+    perception.state.phase.fill_(Phase.ACT)
+    perception.attempts.task.fill_(Task.LOOK)
+    stages = (
+        (perception.images, "render", "ray tracing"),
+        (perception.segmenter, "find_grasp_points", "components, distance transform, contours, suction points"),
+        (perception.planner, "plan", "occlusion votes, clutter graph, target, grasp"),
+    )
+    names, graph = [name for _, _, name in stages], "of these, clutter graph"
+
+    def perceive_batch() -> None:
+        perception.list_worlds()
+        perception.perceive_batch(snapshot)
+
+    run.seconds_per_call(perceive_batch, device, 0.0)
+    watch, calls = Stopwatch(device), 0
+    with contextlib.ExitStack() as patches:
+        for stage in (*stages, (perception.planner, "order_clutter", graph)):
+            patches.enter_context(watch.time_method(*stage))
+        while calls < run.MIN_REPEATS or sum(map(watch.seconds, names)) < min_seconds:
+            perceive_batch()
+            calls += 1
+    views = perception.images.views.count
+    yield Row("views in a batch", views, "")
+    for name in (*names, graph):
+        yield Row(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
+    yield Row("a view", 1e3 * sum(map(watch.seconds, names)) / (calls * views), "ms")
+
+
+def _perception_fraction(bench: Bench) -> Iterator[Row]:
+    """Fraction of perception and planning in a tick in which all worlds pick and are rendered, if all of these were measured."""
+    names = ("perception and planning, a tick", "picking: a step of all worlds", "views, all stages")
+    perceive, step, rate = map(bench.values.get, names)
+    if perceive is not None and step and rate:
+        render = 1e3 * bench.config.bake.worlds * len(bench.config.rig) / rate
+        fraction = perceive / (step * bench.config.physics.steps_per_tick + render)
+        yield Row("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
+
+
+# ---- rendering and encoders ----
+
+
+def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[Row]:
+    """Benchmark of rendering: each stage of a view, a whole batch, copies to the host, and batches with copies overlapped."""
+    simulation, stream, ring = factory.simulation, factory.stream, factory.stream.rings[0]
+    device, cameras = simulation.device, len(factory.cameras)
+    count = min(ring.batch, simulation.layout.worlds * cameras)
+    yield Row("views in a batch", count, "")
+    views = first_views(count, cameras, ring.renderer.instances, device)
+
+    def render() -> None:
+        ring.renderer.render(simulation.record.snapshot, views, ring.slots[0].images)
+
+    spent = {name: seconds / count for name, seconds in _time_passes(render, device, bench.seconds).items()}
+    spent["all"] = bench.seconds_per_call(render, 0.25) / count
+    for name, seconds in spent.items():
+        yield Row(f"a view: {name}", 1e3 * seconds, "ms")
+    yield Row("views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
+    yield Row("views, all stages", 1.0 / spent["all"], "1/s")
+    if device.is_cuda:
+        size = sum(array.capacity for array in ring.copies[0].source)
+
+        def copy() -> None:
+            ring.copies[0].start(stream.streams.copy)
+            ring.copies[0].wait()
+
+        seconds = bench.seconds_per_call(copy, 0.25, 1)
+        yield Row("copy to the host", 1e-9 * size / seconds, "GB/s")
+        yield Row("views copied to the host", ring.batch / seconds, "1/s")
+    worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * ring.batch // cameras))
+    report = _mark_live(simulation, worlds)
+    seconds = bench.seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], 1.0, 1)
+    yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")
+
+
+def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: float) -> dict[str, float]:
+    """Mean time [s] of each timing scope of `render`, by its path: names of outer scopes and its own, joined by ': '."""
+    render()
+    wp.synchronize_device(device)
+    with timing.record() as recorder:
+        started = time.perf_counter()
+        while not recorder.times or time.perf_counter() - started < min_seconds:
+            for _ in range(run.BURST):
+                render()
+            wp.synchronize_device(device)
+    times = recorder.times.items()
+    return {": ".join(path): (stage.device if device.is_cuda else stage.host) / stage.calls for path, stage in times}
+
+
+def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[Row]:
+    """Benchmark of the image encoders: colour as JPEG and depth as PNG, on the device, and on a core of the CPU for comparison."""
+    ring, simulation, quality = factory.stream.rings[0], factory.simulation, factory.config.bop.jpeg_quality
+    device, images = simulation.device, ring.slots[0].images
+    count = min(ring.batch, simulation.layout.worlds * len(factory.cameras))
+    ring.renderer.render(simulation.record.snapshot, first_views(count, len(factory.cameras), ring.renderer.instances, device), images)
+    colors, depths = (array[: min(count, CPU_VIEWS)].numpy() for array in (images.color, images.depth))
+    jpeg, jpeg_out = _jpeg_encoder(images, quality, count, device)
+    depth, depth_out = _depth_encoder(images, count, device)
+    runs = (
+        (f"JPEG, quality {quality}", jpeg, jpeg_out.jpeg_size, jpeg_out.jpeg, lambda view: encode_jpeg(colors[view], quality)),
+        ("depth PNG", depth, depth_out.depth_idat_size, depth_out.depth_idat, lambda view: encode_png(depths[view])),
+    )
+    for name, encode, sizes, data, encode_on_cpu in runs:
+        yield Row(f"a view: {name}", 1e3 * bench.seconds_per_call(encode) / count, "ms")
+        bytes_ = sizes.numpy()[:count]
+        yield Row(f"{name}: size", 1e-6 * float(bytes_.mean()), "MB")
+        yield Row(f"{name}: largest size, of its capacity", 100.0 * float(bytes_.max()) / data.shape[1], "%")
+        yield Row(f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode_on_cpu, len(depths)), "ms")
+
+
+def _jpeg_encoder(images: ViewBuffers, quality: int, count: int, device: wp.Device) -> tuple[Callable[[], None], JpegBuffers]:
+    """Encoder of the first `count` colour images, and its output."""
+    views, height, width = images.depth.shape
+    sizes = jpeg_sizes(views, width, height)
+    encoder, out = JpegEncoder(allocate(JpegScratch, sizes, device), width, height), allocate(JpegBuffers, sizes, device)
+    qualities = wp.full(views, quality, dtype=wp.int32, device=device)
+    return lambda: encoder.encode(images.color, qualities, count, out), out
+
+
+def _depth_encoder(images: ViewBuffers, count: int, device: wp.Device) -> tuple[Callable[[], None], DepthBuffers]:
+    """Encoder of the first `count` depth images, and its output."""
+    views, height, width = images.depth.shape
+    encoder = DepthEncoder(allocate_depth_scratch(views, width, height, device), width, height)
+    out = allocate(DepthBuffers, depth_sizes(views, width, height), device)
+    return lambda: encoder.encode(images.depth, count, out), out
+
+
+def _cpu_seconds(encode: Callable[[int], object], views: int) -> float:
+    """Median CPU time of a view [s], after one warm-up."""
+    encode(0)
+    times = []
+    for view in range(views):
+        started = time.process_time()
+        encode(view)
+        times.append(time.process_time() - started)
+    return float(np.median(times))
