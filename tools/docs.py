@@ -1,7 +1,7 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
 configs/REFERENCE.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of
-picks; tools/README.md and the READMEs of tools/reports/real, sensor and store: the figures in tools/results.
+picks; tools/README.md and tools/reports/real/README.md: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from synpick_warp.apps.validation.registry import load_rules
@@ -28,8 +27,7 @@ from synpick_warp.configs.files.table_lists import SPLITS
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from synpick_warp.views.picks import COLUMNS, STATES
-from tools.figures import figures_tables, newest_runs, pivot_table, read_runs
-from tools.options import Row
+from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "REFERENCE.md"
@@ -37,8 +35,8 @@ FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
 VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
-SENSOR = ROOT / "tools" / "reports" / "sensor" / "README.md"
-STORE = ROOT / "tools" / "reports" / "store" / "README.md"
+STUDIES = ("photographs_ablation.json", "photographs_tuning.json")
+"""Results whose many values are in no table."""
 _SETTINGS_HEAD = """# Reference of the settings
 
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
@@ -128,30 +126,11 @@ def figures_reference() -> str:
     return _with_results(FIGURES, figures_tables(read_runs()))
 
 
-def sensor_reference() -> str:
-    """The README of the report on depth sensors with its tables of figures; the rest is as committed."""
-    runs = newest_runs(read_runs())
-    return _with_results(SENSOR, {name: pivot_table(runs[f"sensor_{name}.json"]) for name in ("cross_validation", "annotation")})
-
-
-def store_reference() -> str:
-    """The README of the report on stores with its tables of figures; the rest is as committed."""
-    runs, stages = newest_runs(read_runs()), ("scale", "requests", "indices", "reading", "two_gpus")
-    return _with_results(STORE, {name: pivot_table(runs[f"store_{name}.json"]) for name in stages})
-
-
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
-    runs = newest_runs(read_runs())
+    runs = {name: run for name, run in read_runs().items() if name not in STUDIES}
     table = figures_tables(runs)["photographs"].replace("](results/", "](../../results/")
-    shown = [runs[f"photographs_{name}.json"] for name in ("small", "main", "most", "native")]
-    rows = [row for run in shown for row in run.rows if row.name.startswith("obj_id")]
-    objects = msgspec.structs.replace(shown[0], rows=rows, shown=[])
-    ablation = runs["photographs_ablation.json"]
-    columns = {row: row.name.removeprefix(f"{row.part}: ") + " [%]" * row.unit.startswith("%") for row in ablation.rows}
-    turned = [Row(row.part, row.value, part=column) for row, column in columns.items() if row.name.startswith(row.part)]
-    pivots = {"objects": objects, "ablation": msgspec.structs.replace(ablation, rows=turned, shown=[])}
-    return _with_results(PHOTOGRAPHS, {"photographs": table} | {f"photographs_{name}": pivot_table(run) for name, run in pivots.items()})
+    return _with_results(PHOTOGRAPHS, {"photographs": table})
 
 
 def _with_results(path: Path, tables: Mapping[str, str]) -> str:
@@ -165,8 +144,6 @@ REFERENCES: dict[Path, Callable[[], str]] = {
     VALIDATION: validation_reference,
     FIGURES: figures_reference,
     PHOTOGRAPHS: photographs_reference,
-    SENSOR: sensor_reference,
-    STORE: store_reference,
 }
 """File -> its content with generated tables."""
 

@@ -23,12 +23,6 @@ from tools.options import Row, print_machine, print_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "tools" / "results"
-SHORT = {
-    "B": "python -m tools.bench --models YCB --lights HDRI",
-    "QUICK": "--set settle.rest_displacement=2e-3 --set settle.rest_ticks=2 --set settle.min_time=0.5",
-    "MIXED": "--set bake.mode=mixed",
-}
-"""Names for parts of commands in the table."""
 
 
 class Run(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -114,39 +108,21 @@ def figures_tables(runs: Mapping[str, Run]) -> dict[str, str]:
 
 def _table(runs: Mapping[str, Run]) -> str:
     """Markdown table of the runs, with their conditions as numbered notes."""
-    lines = ["| what | figures | measured on | limited by | command |", "|---|---|---|---|---|"]
+    lines = ["| what | figures | measured on | limited by |", "|---|---|---|---|"]
     notes: dict[str, int] = {}
     for name, run in runs.items():
         numbers = sorted(notes.setdefault(part, len(notes) + 1) for part in run.conditions.split("; ") if part)
         day = datetime.date.fromisoformat(run.date).strftime("%-d %b %Y") if run.date else "no date"
         where = f"[{run.card or '?'}, {day}](results/{name})" + (f" ({', '.join(map(str, numbers))})" if numbers else "")
         figures = "; ".join(_show(row) for row in run.rows if not run.shown or row.name in run.shown)
-        lines.append(f"| {run.stage} | {figures} | {where} | {run.limit} | `{_shorten(run.today or run.command)}` |")
+        lines.append(f"| {run.stage} | {figures} | {where} | {run.limit} |")
     return "\n".join([*lines, *([f"\n{'; '.join(f'({number}) {note}' for note, number in notes.items())}."] if notes else [])])
-
-
-def pivot_table(run: Run) -> str:
-    """Pivot table of a run in Markdown: rows are names with their units, columns are parts. If the run lists `shown` names, only these."""
-    rows = [row for row in run.rows if not run.shown or row.name in run.shown]
-    parts = list(dict.fromkeys(row.part for row in rows))
-    values = {(row.name, row.part): f"{row.value:.2f}" for row in rows}
-    lines = [f"| | unit | {' | '.join(parts)} |", "|---" * (len(parts) + 2) + "|"]
-    for name, unit in {row.name: row.unit for row in rows}.items():
-        lines.append(f"| {name} | {unit} | {' | '.join(values.get((name, part), '') for part in parts)} |")
-    return "\n".join([*lines, "", f"Measured {run.date} by `{run.command}`."])
 
 
 def _show(row: Row) -> str:
     """Name and value of a row in Markdown."""
     unit = {"1/s": "/s", "1/h": "/h", "%": " %", "": ""}.get(row.unit, f" {row.unit}")
     return f"{row.name} **{row.value:,.10g}{unit}**".strip()
-
-
-def _shorten(command: str) -> str:
-    """Command line with long names abbreviated."""
-    for name, words in SHORT.items():
-        command = command.replace(words, name)
-    return command
 
 
 def write_run(path: Path | None, run: Mapping[str, Any]) -> None:

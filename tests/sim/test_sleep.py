@@ -13,10 +13,10 @@ from synpick_warp.kernels.state import Contacts
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
+from tests.harness.world_states import Rows, check_arrays, check_branches, differing
 from tests.worlds.kernel_worlds import filled
 from tests.worlds.sights import CALM, brief
 from tests.worlds.small_worlds import report
-from tools.checks.states import Rows, check_arrays, check_branches, differing
 
 SLEEP = {"physics__sleep": 2e-4}
 CREEP = 5e-4

@@ -10,7 +10,8 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, RENDER_MODES
-from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.stages.arrays import allocate
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from tests.builders import ONE_OBJECT, assignments
 from tools.compare import pictures as tool
 
@@ -104,3 +105,15 @@ def test_exceeded_tolerances_exit_with_1(monkeypatch, capsys):
     monkeypatch.setattr(tool, "compare_devices", lambda *_: [tool.compare(FAST, "instance", a, a + 1)])
     assert tool.main(["--devices", "cpu,cpu"]) == 1
     assert "VIOLATED" in capsys.readouterr().out
+
+
+def test_the_next_frame_displaces_objects_and_keeps_the_rest(device):
+    snapshot = allocate(Snapshot, {"world": 1, "instance": 2, "fixture": 3}, device)
+    snapshot.frame.fill_(7)
+    snapshot.pose.fill_(wp.transform((1.0, 2.0, 3.0), wp.quat_identity()))
+    after = tool.next_frame(snapshot, 0.5)
+    assert after.frame.numpy().tolist() == [8]
+    assert after.follows.numpy().tolist() == [1]
+    assert after.pose.numpy()[0, 1, :3].tolist() == [1.5, 2.0, 3.0]
+    assert np.array_equal(after.last_pose.numpy(), snapshot.pose.numpy())
+    assert snapshot.frame.numpy().tolist() == [7]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.errors import SynpickError
-from tools.reports.real_frames import copy_frames, read_frames, write_data_set
+from tools.reports.real_frames import read_frames, write_data_set
 
 MATRIX = [[200.0, 0.0, 31.5], [0.0, 200.0, 23.5], [0.0, 0.0, 1.0]]
 
@@ -56,17 +56,6 @@ def test_the_data_set_has_bops_files(frames, tmp_path):
     assert {path.name for path in (out / "models").iterdir()} == {"models_info.json", "obj_000021.ply", "obj_000021.png"}
     info = json.loads((scene / "scene_gt_info.json").read_text())["7"][0]
     assert (info["px_count_all"], info["px_count_visib"]) == (silhouette.sum(), 28 * 28)
-
-
-def test_copies_of_frames_have_other_labels(frames, tmp_path):
-    (frame,) = read_frames(frames[0])
-    label = np.where(frame.label, 0, 5).astype(np.uint8)
-    copy_frames(frames[0], {frame.name: label}, tmp_path / "out")
-    (copy,) = read_frames(tmp_path / "out")
-    np.testing.assert_array_equal(copy.label, label)
-    np.testing.assert_array_equal(copy.depth, frame.depth)
-    with pytest.raises(SynpickError, match="missing"):
-        copy_frames(frames[0], {frame.name: label}, tmp_path / "missing" / "out")
 
 
 def test_bad_folders_are_one_line(frames, tmp_path):

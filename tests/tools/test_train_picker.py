@@ -79,19 +79,14 @@ def test_the_hidden_object_is_the_least_visible_of_those_tried():
         assert (hidden[mine] == [areas[obj_id] == smallest for obj_id in samples.trials["obj_id"][mine]]).all()
 
 
-def test_an_ensemble_is_the_mean_of_its_networks(tmp_path):
-    paths = [tmp_path / name for name in ("a.pt", "b.pt", "other.pt")]
-    torch.manual_seed(0)
-    networks = [network.Network(len(network.LABELS) + len(data.MAPS), 4, inputs=5).eval() for _ in range(2)]
-    for path, one, unseen in zip(paths, [*networks, networks[0]], ([], [], [3]), strict=True):
-        network.save_picker(path, one, 4, SIZE, np.array(unseen, int), np.arange(3))
-    whole, facts = network.load_ensemble(paths[:2], CPU)
-    assert facts == {"size": SIZE, "unseen": [], "objects": [0, 1, 2]}
+def test_a_picker_is_read_as_it_was_written(tmp_path):
+    one = network.Network(len(network.LABELS) + len(data.MAPS), 4, inputs=5).eval()
+    network.save_picker(tmp_path / "a.pt", one, 4, SIZE, np.array([3]), np.arange(3))
+    other, facts = network.load_picker(tmp_path / "a.pt", CPU)
+    assert (facts["size"], facts["unseen"], facts["objects"]) == (SIZE, [3], [0, 1, 2])
     inputs = torch.rand(1, 5, *SIZE)
     with torch.no_grad():
-        torch.testing.assert_close(whole(inputs), (networks[0](inputs) + networks[1](inputs)) / 2)
-    with pytest.raises(network.DatasetError, match=r"other.pt differs from .*a.pt in unseen: \[3\], not \[\]"):
-        network.load_ensemble(paths[::2], CPU)
+        torch.testing.assert_close(other(inputs), one(inputs))
 
 
 def test_objects_that_are_not_trained_on_are_a_fixed_draw():

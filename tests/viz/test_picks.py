@@ -1,4 +1,4 @@
-"""Pictures of simulated picks: interpolated maps, sentences on trials, sheets, the report's section, and the report on scores."""
+"""Pictures of simulated picks: interpolated maps, sentences on trials, sheets, the report's section, and scores."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.apps.report import compose
-from synpick_warp.apps.statistics.picks import ALL, FACED, SCORES, UNIFORM, evaluate_picks, picks_figures
+from synpick_warp.apps.statistics.picks import ALL, FACED, SCORES, UNIFORM, evaluate_picks
 from synpick_warp.apps.viz.picks import choose_trial, describe_trial, draw_pick_maps, spread_over_surface, write_pick_sheet
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending, Outcome, Share
@@ -23,7 +23,6 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.picks import pick_files
 from tests.builders import mistake
 from tests.worlds.box_sets import write_pick_set
-from tools.reports import picks as report
 
 
 @pytest.fixture(scope="module")
@@ -185,17 +184,3 @@ def test_figures_of_hand_made_trials():
     areas = {(each.population, each.score): each.auc.value for each in figures.scores}
     assert areas == {(where, score): 0.5 if score == "wrench" else 1.0 for where in (UNIFORM, FACED, ALL) for score in SCORES}
     assert figures.objects[0].success.value == 0.5
-
-
-def test_the_report_prints_and_writes_its_figures(data, tmp_path, capsys):
-    files = {name: tmp_path / f"{name}.{kind}" for name, kind in (("json", "json"), ("picture", "png"), ("map", "png"))}
-    options = [f"--{name}={path}" for name, path in files.items()]
-    assert report.main([str(data.folder), "--draws=20", *options]) == 0
-    said = capsys.readouterr().out
-    assert said.startswith("88 trials of 44 candidates in 4 states of 2 episodes")
-    assert all(title in said for title in ("Calibration of seal x wrench", "By object", "seal x wrench"))
-    auc = json.loads(files["json"].read_text())["scores"][0]["auc"]["value"]
-    assert auc == pytest.approx(picks_figures(data, 20).scores[0].auc.value)
-    assert all(cv2.imread(str(files[name])) is not None for name in ("picture", "map"))
-    assert report.main([str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith("picks: ")

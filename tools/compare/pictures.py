@@ -18,6 +18,7 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
+from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
@@ -36,7 +37,6 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.views.masks import paint_masks
 from tools.options import configure, fail, make_parser, write_json
-from tools.reports.render_piles import next_frame, settle_piles
 
 OWN = {
     "devices": {"default": "cpu,cuda:0", "help": "two devices, comma-separated (default: cpu,cuda:0)"},
@@ -46,6 +46,8 @@ OWN = {
 """Options of this report; see `tools.options.OPTIONS`."""
 CREEP = 1e-3
 """Displacement of objects since the frame before [m]."""
+MAX_TICKS = 400
+"""Ticks within which all piles must come to rest: 27 s."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +187,45 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
             outputs.append(render_views(renderer, copy_snapshot(snapshot, device)))
         differences += [compare(mode, name, outputs[0][name], outputs[1][name]) for name in outputs[0]]
     return differences
+
+
+def settle_piles(simulation: Simulation, count: int) -> Snapshot:
+    """Simulate `count` piles until rest, one a world; returns each in the tick in which it begins to act. World w has light map w % their
+    number.
+
+    Raises:
+        SynpickError: A pile does not come to rest.
+    """
+    arrays = {item.name: getattr(simulation.record.snapshot, item.name) for item in fields(Snapshot)}
+    piles: dict[int, dict[str, np.ndarray]] = {}
+    for _ in range(MAX_TICKS):
+        simulation.tick()
+        for world in np.flatnonzero(simulation.state.phase.numpy() == Phase.ACT).tolist():
+            if world not in piles:
+                piles[world] = {name: array.numpy()[world].copy() for name, array in arrays.items()}
+        if len(piles) == count:
+            break
+    else:
+        raise SynpickError(f"only {len(piles)} of {count} piles came to rest within {MAX_TICKS} ticks; choose another seed")
+    for name, array in arrays.items():
+        rows = array.numpy().copy()
+        for world, pile in piles.items():
+            rows[world] = pile[name]
+        array.assign(rows)
+    arrays["light"].assign(np.arange(simulation.layout.worlds, dtype=np.int32) % simulation.scene.drop.lights)
+    return simulation.record.snapshot
+
+
+def next_frame(snapshot: Snapshot, displacement: float) -> Snapshot:
+    """Snapshot of the next frame: a copy with objects displaced along +x by `displacement` [m], and the given one as last frame."""
+    sources = {item.name: getattr(snapshot, item.name) for item in fields(Snapshot)}
+    arrays = {name: array.numpy().copy() for name, array in sources.items()}
+    for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
+        arrays[f"last_{name}"] = arrays[name].copy()
+    arrays["follows"][:] = 1
+    arrays["frame"] += 1
+    arrays["pose"][..., 0] += displacement
+    return Snapshot(**{name: wp.array(array, dtype=sources[name].dtype, device=sources[name].device) for name, array in arrays.items()})
 
 
 def copy_snapshot(snapshot: Snapshot, device: Any) -> Snapshot:

@@ -1,21 +1,14 @@
-"""Training samples of pickers: images of camera 0 at the states of a data set, and the simulated picks from them. Needs PyTorch.
-
-Also draws the scores of a picker over a state, beside those picks.
-"""
+"""Training samples of pickers: images of camera 0 at the states of a data set, and the simulated picks from them. Needs PyTorch."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 
 import synpick_warp
-from synpick_warp.apps.viz.drawing import INK, put_text, write_picture
-from synpick_warp.apps.viz.picks import WIDTH, draw_heat, draw_pick_maps
 from synpick_warp.dataset.grasp_maps import find_pixels
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import View
@@ -109,29 +102,3 @@ def split_objects(samples: Samples, unseen: int) -> np.ndarray:
     if unseen >= len(objects):
         raise ConfigError(f"--unseen is {unseen}, but {len(objects)} objects were tried; name fewer")
     return np.sort(np.random.default_rng(0).permutation(objects)[:unseen])
-
-
-def write_maps(folder: Path, score: Callable[[Sight], torch.Tensor], device: torch.device, out: Path) -> None:
-    """Draw heat maps of the data set's first state with most trials: predicted success, simulated success, and the analytic score.
-
-    The circle marks the pixel with the largest prediction.
-    """
-    data = synpick_warp.open(folder)
-    states = [(len(data[index].picks), index) for index in data]
-    episode = data[max(states, key=lambda each: each[0])[1]]
-    state = episode.pick_states[0]
-    view = episode.view(int(state["frame"]), int(state["camera"]))
-    shot = _read_shot(view, view.picks)
-    images = (torch.from_numpy(image)[None] for image in (shot.depth, shot.instance))
-    value = score(Sight(*images, shot.focal).to(device))[0].cpu().numpy()
-    heat = draw_heat(view, np.where(shot.instance > 0, value, np.nan))
-    scale = WIDTH / view.size[0]
-    heat = cv2.resize(heat, (WIDTH, round(scale * view.size[1])), interpolation=cv2.INTER_AREA)
-    row, column = np.unravel_index(value.argmax(), value.shape)
-    cv2.circle(heat, (round(scale * (column + 0.5)), round(scale * (row + 0.5))), 10, (255, 255, 255), 2, cv2.LINE_AA)
-    parts = []
-    for caption, picture in [("predicted success: yellow 1, blue 0; circle: first choice", heat), *draw_pick_maps(view, view.picks)]:
-        head = np.full((32, WIDTH, 3), 255, np.uint8)
-        put_text(head, caption, (8, 22), 0.5, INK)
-        parts += [head, picture]
-    write_picture(out, np.concatenate(parts))

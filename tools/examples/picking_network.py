@@ -8,7 +8,6 @@ mirrored image shows a possible state: images, normals and grasp points are turn
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -34,8 +33,6 @@ HINTS = 0.3
 """Factor on the auxiliary loss: prediction of the analytic maps, where a data set has them."""
 SMOOTHING = 3
 """Side of the window over which predictions are averaged [px]: a pick lands within half a pixel of its target, and labels are sparse."""
-FACTS = ("size", "unseen", "objects")
-"""Entries of a picker's file that the files of an ensemble share: image size, objects left out of training, and all objects."""
 SCALE = 10.0
 """Depth differences are given in units of 0.1 m."""
 
@@ -181,29 +178,6 @@ def save_picker(path: Path, network: Network, width: int, size: tuple[int, int],
     """Write a network's weights with width, image size, held-out objects (`unseen`) and all tried objects (`everything`)."""
     parts = {"width": width, "size": size, "unseen": unseen.tolist(), "objects": everything.tolist(), "weights": network.state_dict()}
     torch.save(parts, path)
-
-
-class Ensemble(torch.nn.Module):
-    """Deep ensemble (Lakshminarayanan et al., NeurIPS 2017): mean logits of several networks. A picker takes the maximum of a score map,
-    which is often an overestimate of a single network."""
-
-    def __init__(self, networks: Sequence[Network]) -> None:
-        super().__init__()
-        self.networks = torch.nn.ModuleList(networks)
-
-    def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Compute the mean logits (B, channel, H, W) for inputs (B, 5, H, W), see `make_inputs`."""
-        return torch.stack([network(inputs) for network in self.networks]).mean(dim=0)
-
-
-def load_ensemble(paths: Sequence[Path], device: torch.device) -> tuple[Ensemble, dict[str, Any]]:
-    """Read files of `save_picker` as one picker, and its entries except weights; raises DatasetError if they differ in these."""
-    loaded = [load_picker(path, device) for path in paths]
-    networks, facts = [network for network, _ in loaded], [{name: parts[name] for name in FACTS} for _, parts in loaded]
-    for path, other in zip(paths, facts, strict=True):
-        if wrong := [name for name in FACTS if other[name] != facts[0][name]]:
-            raise DatasetError(f"{path} differs from {paths[0]} in {wrong[0]}: {other[wrong[0]]}, not {facts[0][wrong[0]]}")
-    return Ensemble(networks), facts[0]
 
 
 def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, Any]]:

@@ -28,7 +28,7 @@ from synpick_warp.cli.main import parse_resolution
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import FIELDS, StreamDataset
 from synpick_warp.system.hardware.device import pick_device
-from tools.options import configure, fail, make_parser, positive_count
+from tools.options import configure, counts, fail, make_parser, positive_count
 
 TRAINING, HELD_OUT = range(100_000), range(100_000, 101_000)
 """Episodes to train on, and to measure on."""
@@ -164,8 +164,7 @@ def run(options: argparse.Namespace, device: torch.device) -> list[float]:
 
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    parser = make_parser(__doc__, "models", "lights", "seed", "set")
-    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default: auto)")
+    parser = make_parser(__doc__, "device", "models", "lights", "seed", "set")
     parser.add_argument("--worlds", type=positive_count, default=64, help="worlds simulated in parallel (default: 64)")
     parser.add_argument("--resolution", default="320x180", help="WIDTHxHEIGHT [px] (default: 320x180)")
     parser.add_argument("--batch", type=positive_count, default=24, help="views of a batch, at most (default: 24)")
@@ -173,13 +172,8 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--width", type=positive_count, default=32, help="channels of the network's first level (default: 32)")
     parser.add_argument("--held-out", type=positive_count, default=600, help="views to measure on (default: 600)")
     amounts = "views to train on, a network for each number, comma-separated (default: 2000,8000,32000)"
-    parser.add_argument("--views", type=_counts, default=[2000, 8000, 32000], help=amounts)
+    parser.add_argument("--views", type=counts, default=(2000, 8000, 32000), help=amounts)
     return parser.parse_args(arguments)
-
-
-def _counts(text: str) -> list[int]:
-    """Type of an option: positive numbers joined by commas."""
-    return [positive_count(part) for part in text.split(",")]
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ from synpick_warp.codes import Outcome, Share
 from synpick_warp.environment.settings import PICK, TARGET
 from synpick_warp.errors import ConfigError, DatasetError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
-from tools.examples.picking_data import Samples, load_samples, split_objects, write_maps
-from tools.examples.picking_network import load_ensemble, save_picker, score_learned, train
+from tools.examples.picking_data import Samples, load_samples, split_objects
+from tools.examples.picking_network import load_picker, save_picker, score_learned, train
 from tools.examples.picking_scores import (
     Sight,
     average_precision,
@@ -45,7 +45,7 @@ from tools.examples.picking_scores import (
     score_random,
     wilson,
 )
-from tools.options import configure, fail, make_names_parser, make_parser, positive_count, writable_file, write_json
+from tools.options import configure, fail, make_names_parser, make_parser, positive_count, write_json
 
 HELD_OUT = 5
 """Stride of the train/test split: every fifth episode is held out from training."""
@@ -157,9 +157,8 @@ def _numbers(interval: Interval) -> dict[str, float | None]:
 def run_train(options: argparse.Namespace, device: torch.device) -> None:
     """Command `train`: train on all episodes except those held out, and evaluate on these."""
     started = time.perf_counter()
-    picker = options.picker[0]
-    if len(options.picker) > 1 or not picker.parent.is_dir():
-        raise ConfigError(f"--picker is {' '.join(map(str, options.picker))}; name a file in a folder that exists")
+    if not options.picker.parent.is_dir():
+        raise ConfigError(f"--picker is {options.picker}; name a file in a folder that exists")
     samples = load_samples(options.folder)
     unseen = split_objects(samples, options.unseen) if options.unseen else np.zeros(0, int)
     held = np.isin(samples.episode, np.unique(samples.episode)[HELD_OUT - 1 :: HELD_OUT])
@@ -172,7 +171,7 @@ def run_train(options: argparse.Namespace, device: torch.device) -> None:
     loss, seconds = sum(losses[-len(losses) // 10 :]) / len(losses[-len(losses) // 10 :]), time.perf_counter() - started
     print(f"read in {read:.1f} s; {len(losses)} steps in {seconds:.1f} s: loss {losses[0]:.3f} to {loss:.3f}")
     height, width = samples.sight.depth.shape[1:]
-    save_picker(picker, network, options.width, (width, height), unseen, np.unique(samples.trials["obj_id"]))
+    save_picker(options.picker, network, options.width, (width, height), unseen, np.unique(samples.trials["obj_id"]))
     rows = evaluate(samples, np.flatnonzero(held), unseen, dense_scores(network, device), device)
     show_rows(rows)
     facts = {"states": len(used), "held_out": int(held.sum()), "trials": trials, "read_s": read, "train_s": seconds, "loss": loss}
@@ -181,13 +180,11 @@ def run_train(options: argparse.Namespace, device: torch.device) -> None:
 
 def run_evaluate(options: argparse.Namespace, device: torch.device) -> None:
     """Command `evaluate`: evaluate a picker and the baselines at the tried pixels of a whole data set, not that of the training."""
-    network, parts = load_ensemble(options.picker, device)
+    network, parts = load_picker(options.picker, device)
     samples = load_samples(options.folder)
     rows = evaluate(samples, np.arange(len(samples.episode)), np.array(parts["unseen"]), dense_scores(network, device), device)
     show_rows(rows)
     write_json(options.json, {"trials": len(samples.trials["state"]), "rows": _plain(rows)})
-    if options.map:
-        write_maps(options.folder, partial(score_learned, network), device, options.map)
 
 
 def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
@@ -195,10 +192,10 @@ def run_simulation(options: argparse.Namespace, device: torch.device) -> None:
     from synpick_warp.environment.make import make_picking
     from tools.examples import picking_runs as runs
 
-    network, parts = load_ensemble(options.picker, device)
+    network, parts = load_picker(options.picker, device)
     named = {"seen": sorted(set(parts["objects"]) - set(parts["unseen"])), "unseen": parts["unseen"], "all": []}[options.objects]
     if options.objects != "all" and not named:
-        raise ConfigError(f"--objects is {options.objects}, but {options.picker[0]} was trained with --unseen 0")
+        raise ConfigError(f"--objects is {options.objects}, but {options.picker} was trained with --unseen 0")
     config = configure(options, {})
     if named:
         most = max(1, min(MOST_OF_EACH, config.arrangement.max_objects // len(named)))
@@ -258,19 +255,14 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-NETWORKS = "file of the network (default: picker.pt); several, of other --seed: their mean (evaluate, run)"
-
-
 def parse(arguments: list[str] | None) -> argparse.Namespace:
     """Parse the command line."""
-    parser = make_parser(__doc__, "config", "models", "lights", "seed", "set", "json")
+    parser = make_parser(__doc__, "config", "device", "models", "lights", "seed", "set", "json")
     parser.add_argument(
         "command", choices=COMMANDS, help="train and score on held-out episodes; evaluate on another set; run in simulation"
     )
     parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="data set with picks and images (train, evaluate)")
-    parser.add_argument("--picker", type=Path, nargs="+", default=[Path("picker.pt")], metavar="FILE", help=NETWORKS)
-    parser.add_argument("--map", type=writable_file, metavar="FILE", help="draw predictions beside simulated picks to this file (evaluate)")
-    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default: auto)")
+    parser.add_argument("--picker", type=Path, default=Path("picker.pt"), metavar="FILE", help="file of the network (default: picker.pt)")
     parser.add_argument("--width", type=positive_count, default=24, help="channels of the network's first level (default: 24)")
     parser.add_argument("--steps", type=positive_count, default=4000, help="steps of training (default: 4000)")
     parser.add_argument("--batch", type=positive_count, default=16, help="images of a step (default: 16)")

@@ -1,11 +1,10 @@
 """Reader of annotated frames of a real RGB-D camera (YCB-Video's, by way of `oprb/ycbvideo`), and their BOP data set, for measuring only.
 
-    python -m tools.reports.real_frames FRAMES MODELS OUT [--json FILE]
+    python -m tools.reports.real_frames FRAMES MODELS OUT
 
 writes OUT as a BOP data set of one split, `test`: a scene for each sequence, depth in 0.1 mm, `mask_visib` from the class masks (each class
 is there once), `mask` rendered from pose and model, poses in the frames of the models. `cam_K` has 0.5 px added to the principal point:
-pixel centres are at + 0.5 in data sets of this project, at whole numbers in those frames. `--json` writes what `validate --tolerance`
-measures in it.
+pixel centres are at + 0.5 in data sets of this project, at whole numbers in those frames.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import argparse
 import json
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,18 +21,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synpick_warp.apps.validation.deviations import distributions
-from synpick_warp.apps.validation.registry import Tolerance
 from synpick_warp.apps.validation.rendering import ObjectRenderer
-from synpick_warp.apps.validation.run import Options, Summary, validate
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.system.inputs.image_files import decode_image
 from synpick_warp.system.inputs.json import decode_json
-from tools.figures import describe_run, write_run
-from tools.options import Row, fail
+from tools.options import fail
 
 SPLIT = "test"
 """Split of the data set: BOP's name of measured images."""
@@ -41,8 +36,6 @@ DEPTH_SCALE = 0.1
 """Depth of one count in the frames [mm]."""
 CENTER = 0.5
 """Centre of the first pixel in our coordinates, where the frames have 0 [px]."""
-TOLERANCE = Tolerance(15.0, 3.0)
-"""Of annotation [mm, px]: BOP's tolerance of visibility; masks of people."""
 _MILLIMETRES = 1e3
 """In a metre."""
 _PARTS = {"color": "rgb", "depth": "depth"}
@@ -81,33 +74,20 @@ class RealFrame:
         return self.label == self.object_ids[index]
 
 
-def list_frames(folder: Path) -> list[str]:
-    """Names of the frames in a folder, sorted: those with poses.
-
-    Raises:
-        DatasetError: There are none.
-    """
-    names = sorted(path.name.removesuffix("-poses.json") for path in folder.glob("*-poses.json"))
-    if not names:
-        raise DatasetError(f"{folder} has no frames (SSSS_FFFFFF-poses.json)")
-    return names
-
-
 def read_frames(folder: Path) -> list[RealFrame]:
     """Read all annotated frames of a folder, by name.
 
     Raises:
         DatasetError: There are none, or a file is missing or damaged.
     """
-    return [read_frame(folder, name) for name in list_frames(folder)]
+    names = sorted(path.name.removesuffix("-poses.json") for path in folder.glob("*-poses.json"))
+    if not names:
+        raise DatasetError(f"{folder} has no frames (SSSS_FFFFFF-poses.json)")
+    return [_read_frame(folder, name) for name in names]
 
 
-def read_frame(folder: Path, name: str) -> RealFrame:
-    """Read the frame of a name.
-
-    Raises:
-        DatasetError: A file is missing or damaged.
-    """
+def _read_frame(folder: Path, name: str) -> RealFrame:
+    """Read the frame of a name."""
     path = folder / f"{name}-poses.json"
     content = decode_json(_read(path), dict[str, Any], path, DatasetError)
     try:
@@ -128,25 +108,6 @@ def read_frame(folder: Path, name: str) -> RealFrame:
         )
     except (KeyError, TypeError, ValueError) as fault:
         raise DatasetError(f"{path} is no record of poses: {fault}") from None
-
-
-def copy_frames(folder: Path, labels: Mapping[str, np.ndarray], out: Path) -> None:
-    """Copy frames with other labels, such as predicted ones; files of these names are replaced.
-
-    Args:
-        folder: Frames.
-        labels: obj_id of each pixel (H, W) uint8, by name of the frame.
-        out: Folder, which is made if it is missing, in one that exists.
-
-    Raises:
-        OutputError: `out` cannot be written.
-    """
-    with output_errors(out):
-        out.mkdir(exist_ok=True)
-        for name, label in labels.items():
-            for ending in ("color.png", "depth.png", "poses.json"):
-                shutil.copyfile(folder / f"{name}-{ending}", out / f"{name}-{ending}")
-            cv2.imwrite(str(out / f"{name}-label.png"), label)
 
 
 def _read(path: Path) -> bytes:
@@ -254,7 +215,7 @@ def _write_masks(frames: Sequence[RealFrame], out: Path) -> None:
     for frame in frames:
         scene = _scene_folder(out, frame.sequence)
         visible = [frame.mask(index) for index in range(len(frame.object_ids))]
-        amodal = [render_silhouette(renderer, frame, index) for index in range(len(frame.object_ids))]
+        amodal = [_render_silhouette(renderer, frame, index) for index in range(len(frame.object_ids))]
         for kind, masks in (("mask", amodal), ("mask_visib", visible)):
             (scene / kind).mkdir(exist_ok=True)
             for index, mask in enumerate(masks):
@@ -267,41 +228,14 @@ def _write_masks(frames: Sequence[RealFrame], out: Path) -> None:
         _write_json(_scene_folder(out, sequence) / "scene_gt_info.json", content)
 
 
-def render_depth(renderer: ObjectRenderer, frame: RealFrame, index: int, move: np.ndarray | None = None) -> np.ndarray:
-    """Planar depth (H, W) float32 [mm] of one object at its annotated pose; inf: it is not there.
-
-    `move` (4, 4) [mm] is applied to the pose, in the camera's frame.
-    """
-    rotation, translation = frame.rotations[index], frame.translations[index]
-    if move is not None:
-        rotation, translation = move[:3, :3] @ rotation, move[:3, :3] @ translation + move[:3, 3]
-    height, width = frame.depth.shape
-    patch = renderer.render(frame.object_ids[index], rotation, translation, frame.intrinsics, (width, height))
-    depth = np.full((height, width), np.inf, np.float32)
-    rows, columns = patch.depth.shape
-    depth[patch.top : patch.top + rows, patch.left : patch.left + columns] = patch.depth
-    return depth
-
-
-def render_silhouette(renderer: ObjectRenderer, frame: RealFrame, index: int) -> np.ndarray:
+def _render_silhouette(renderer: ObjectRenderer, frame: RealFrame, index: int) -> np.ndarray:
     """Silhouette (H, W) bool of one object at its annotated pose."""
-    return np.isfinite(render_depth(renderer, frame, index))
-
-
-def measure_deviations(folder: Path) -> tuple[list[Row], int]:
-    """Distribution of the deviations that `validate` measures in a data set, by rule over all objects, medians by object; and the number of
-    violations.
-    """
-    summary = Summary()
-    violations = list(validate(folder, Options(sample=None, tolerance=TOLERANCE), summary))
-    rows: list[Row] = []
-    for found in distributions(summary.deviations):
-        if found.obj_id is not None:
-            rows.append(Row(found.rule, found.median, found.unit, part=f"object {found.obj_id}"))
-            continue
-        sizes = {"median": found.median, "95 %": found.percentile_95, "largest": found.largest}
-        rows += [Row(found.rule, value, found.unit, part=part) for part, value in sizes.items()]
-    return rows, len(violations)
+    silhouette = np.zeros(frame.depth.shape, bool)
+    size = (silhouette.shape[1], silhouette.shape[0])
+    patch = renderer.render(frame.object_ids[index], frame.rotations[index], frame.translations[index], frame.intrinsics, size)
+    rows, columns = patch.depth.shape
+    silhouette[patch.top : patch.top + rows, patch.left : patch.left + columns] = np.isfinite(patch.depth)
+    return silhouette
 
 
 def main() -> int:
@@ -310,13 +244,9 @@ def main() -> int:
     parser.add_argument("frames", type=Path, help="folder of SSSS_FFFFFF-{color,depth,label}.png and -poses.json")
     parser.add_argument("models", type=Path, help="folder of BOP models")
     parser.add_argument("out", type=Path, help="folder to write, which does not exist")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the deviations of its annotation as JSON")
     options = parser.parse_args()
     try:
         print(f"data set: {write_data_set(options.frames, options.models, options.out)}")
-        if options.json is not None:
-            rows, violations = measure_deviations(options.out)
-            write_run(options.json, describe_run("tools.reports.real_frames", [], rows, tolerance=TOLERANCE, violations=violations))
     except SynpickError as error:
         return fail("reports.real_frames", error)
     return 0

@@ -2,7 +2,7 @@
 
 A checkpoint has a row for each saved world. It holds everything that a tick reads from the previous tick: the per-world arrays of
 `WorldState` and the other state groups, Newton's own arrays listed in `newton_patches.history`, and the world's contacts. All other arrays
-are constant or recomputed within a tick; `tools.checks.states` finds every array of a simulation and verifies this. Random numbers are
+are constant or recomputed within a tick; `tests/sim/test_states.py` finds every array of a simulation and verifies this. Random numbers are
 counter-based: functions of episode, arrangement and attempt, without a state of their own. The renderer's light history is not part of a
 checkpoint: environments render without one (`environment.settings.fixed_settings`), and candidates are sampled from G-buffers.
 """

@@ -16,7 +16,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from tools.reports.real.views import Pool, code_depth
+from tools.reports.real.views import Pool
 
 FOUND_IOU = 0.5
 """IoU above which an instance counts as found."""
@@ -50,23 +50,10 @@ class Scores:
         return float(np.mean([iou > FOUND_IOU for _, _, iou in self.instances])) if self.instances else float("nan")
 
 
-def predict(
-    network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device, depth: np.ndarray | None = None
-) -> np.ndarray:
-    """Segmentation of an image: obj_id of each pixel (H, W) uint8.
-
-    Args:
-        network: Gives logits of an image.
-        color: Colour image (H, W, 3) uint8.
-        size: Size (width, height) of the image that the network sees [px].
-        device: Where the network is.
-        depth: Depth (H, W) [m], if the network sees it.
-    """
+def predict(network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device) -> np.ndarray:
+    """Segmentation of an image (H, W, 3) uint8, which the network sees at `size` (width, height): obj_id of each pixel (H, W) uint8."""
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
-    if depth is not None:
-        nearest = cv2.resize(depth.astype(np.float32), size, interpolation=cv2.INTER_NEAREST)
-        image = torch.cat((image, code_depth(torch.from_numpy(nearest))[None, None]), dim=1)
     with torch.no_grad():
         logits = functional.interpolate(network(image.to(device)).float(), size=color.shape[:2], mode="bilinear", align_corners=False)
     return logits[0].argmax(0).to(torch.uint8).cpu().numpy()
@@ -95,15 +82,15 @@ def _ious(table: np.ndarray) -> np.ndarray:
     return table.diagonal() / np.maximum(union, 1)
 
 
-def score_pool(network: nn.Module, pool: Pool, classes: int, channels: int) -> Scores:
-    """Scores of a network, which sees the first `channels` of images, on the views of a pool, at their own size."""
+def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
+    """Scores of a network on the views of a pool, at their own size."""
     images, classified = pool.tensors()
 
     def pairs() -> Iterable[tuple[str, np.ndarray, np.ndarray]]:
         for start in range(0, pool.count, SCORED):
             part = slice(start, min(start + SCORED, pool.count))
             with torch.no_grad():
-                found = network(images[part, :channels]).argmax(1)
+                found = network(images[part]).argmax(1)
             both = zip(found.to(torch.uint8).cpu().numpy(), classified[part].cpu().numpy(), strict=True)
             yield from ((str(start + index), one, truth) for index, (one, truth) in enumerate(both))
 

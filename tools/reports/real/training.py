@@ -1,11 +1,13 @@
 """Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
 
-AdamW with a warm-up and a cosine schedule, mixed precision (bfloat16) on a GPU, compiled on request. Augmentation is geometric (scale,
+The network is a residual U-Net (Zhang et al., GRSL 2018), from scratch. AdamW with a warm-up and a cosine schedule, mixed precision
+(bfloat16) on a GPU. Augmentation is geometric (scale,
 rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from dataclasses import dataclass
@@ -18,7 +20,6 @@ from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
 from tools.examples.train_online import LEARNING_RATE, WARM_UP
-from tools.reports.real.networks import NETWORKS
 from tools.reports.real.views import Pool, Source
 
 LUMA = (0.299, 0.587, 0.114)
@@ -29,6 +30,8 @@ MIDDLE = (128 / 255, 0.0, 0.0)
 """Values of Y, Cb and Cr that the level shift of JPEG maps to 0."""
 BLOCK = 8
 """Side of a JPEG block [px]."""
+DEPTHS = (2, 3, 4, 3)
+"""Residual blocks of each level of the network."""
 LEAST_RATE = 0.01
 """Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
@@ -68,12 +71,6 @@ class Recipe:
     """Weight of the Dice loss, which is added to the cross entropy."""
     rate: float = LEARNING_RATE
     """Peak learning rate of the schedule."""
-    network: str = "unet"
-    """Architecture: a key of NETWORKS."""
-    depth: bool = False
-    """Whether the network sees depth beside colours."""
-    compile: bool = False
-    """Whether the training step is compiled (`torch.compile`)."""
     half: float = 0.7
     """End of the stage with images of half the size, as a fraction of the schedule (progressive resizing)."""
     crop: float = 0.5
@@ -90,17 +87,65 @@ class Trained:
     stream_seconds: float
     seconds: float
     """Time of rendering and training together [s]."""
-    compile_seconds: float
-    """Compilation time, not included in `seconds`."""
     views: int
     samples: int
     """Views trained on, repeats counted."""
 
 
+class ResidualNetwork(nn.Module):
+    """Residual U-Net: a stem of 1/2 of the image's size, levels of 1/2 to 1/16 with `width` to 8 x `width` channels, logits of 1/2.
+
+    A pixel of its coarsest level sees about 210 pixels of the image to each side.
+    """
+
+    def __init__(self, classes: int, width: int) -> None:
+        super().__init__()
+        widths = [width * factor for factor in (1, 2, 4, 8)]
+        self.stem = _convolution(3, width, size=5, stride=2)
+        self.down = nn.ModuleList(
+            nn.Sequential(_convolution(before, after, stride=1 + (level > 0)), *(_Block(after) for _ in range(depth)))
+            for level, (before, after, depth) in enumerate(zip([width, *widths], widths, DEPTHS, strict=False))
+        )
+        self.up = nn.ModuleList(nn.Sequential(_convolution(low + high, high), _Block(high)) for high, low in itertools.pairwise(widths))
+        self.head = nn.Conv2d(width, classes, 1)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Logits (B, classes, H, W) of an image (B, 3, H, W): uint8, or float32 as it is."""
+        x, skips = self.stem(image.float().div(255).sub(0.5) if image.dtype == torch.uint8 else image), []
+        for level in self.down:
+            x = level(x)
+            skips.append(x)
+        for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
+            x = level(torch.cat((_upsample(x, skip.shape[2:]), skip), dim=1))
+        return _upsample(self.head(x), image.shape[2:])
+
+
+class _Block(nn.Module):
+    """Residual block of two 3 x 3 convolutions (He et al., CVPR 2016)."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = _convolution(channels, channels)
+        self.second = nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1, bias=False), nn.BatchNorm2d(channels))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Features of the size of `x`."""
+        return functional.relu(x + self.second(self.first(x)))
+
+
+def _convolution(before: int, after: int, size: int = 3, stride: int = 1) -> nn.Sequential:
+    """Convolution with batch normalization and ReLU."""
+    return nn.Sequential(nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.ReLU())
+
+
+def _upsample(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
+    """Bilinear interpolation of features (B, C, H, W) to a height and width of `size`."""
+    return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
+
+
 def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop: float = 1.0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Geometric augmentation of images (B, 3 or 4, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored
-    borders, and a random crop whose sides are the fraction `crop` of H and W. Depth, the fourth channel, is that of the nearest pixel,
-    divided by the scale."""
+    """Geometric augmentation of images (B, 3, H, W) float32 with classes (B, H, W) int64: scale, rotation, shift, with mirrored borders,
+    and a random crop whose sides are the fraction `crop` of H and W."""
     count, height, width = classes.shape
     draw = torch.rand(4, count, device=images.device) * 2 - 1
     factor, angle, aspect = recipe.scale ** -draw[0], draw[1] * math.radians(recipe.rotation), height / width
@@ -109,10 +154,9 @@ def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop
     rows = [torch.stack([cosine, -sine * aspect, reach * draw[2]], 1), torch.stack([sine / aspect, cosine, reach * draw[3]], 1)]
     size = [count, 1, *(BLOCK * round(side * crop / BLOCK) if crop < 1 else side for side in (height, width))]
     grid = functional.affine_grid(torch.stack(rows, 1), size, align_corners=False)
-    depth = functional.grid_sample(images[:, 3:], grid, "nearest", "reflection", align_corners=False) * factor.view(-1, 1, 1, 1)
-    images = functional.grid_sample(images[:, :3], grid, "bilinear", "reflection", align_corners=False)
+    images = functional.grid_sample(images, grid, "bilinear", "reflection", align_corners=False)
     labels = functional.grid_sample(classes[:, None].float(), grid, "nearest", "reflection", align_corners=False)
-    return torch.cat((images, depth.clamp(max=1)), dim=1), labels[:, 0].round().long()
+    return images, labels[:, 0].round().long()
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
@@ -168,29 +212,23 @@ def compress_views(images: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
     return torch.einsum("ck,bkhw->bchw", colors, values + middle).clamp(0, 1)
 
 
-def halve_views(images: torch.Tensor, classes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Downsampling by two of images (B, 3 or 4, H, W) and classes (B, H, W): colours are averaged, depth and class are those of one pixel
-    of four."""
-    colors = functional.avg_pool2d(images[:, :3], 2)
-    nearest = (..., slice(1, None, 2), slice(1, None, 2))
-    return torch.cat((colors, images[:, 3:][nearest]), dim=1), classes[nearest]
-
-
 def prepare_batch(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Augmentation and normalization of a batch; the elapsed fraction of the schedule, `progress`, determines the size of its images.
 
-    Returns the network's input (B, 3 or 4, H, W) float32, colours in -0.5..0.5, and classes (B, H, W), both downsampled by two or cropped.
+    Returns the network's input (B, 3, H, W) float32 in -0.5..0.5, and classes (B, H, W), both downsampled by two, where the class is that
+    of one pixel of four, or cropped.
     """
     values, crop = images.float() / 255, 1.0 if progress < recipe.half else recipe.crop
     if recipe.scale > 1 or crop < 1:
         values, classes = warp_views(values, classes, recipe, crop)
     if progress < recipe.half:
-        values, classes = halve_views(values, classes)
-    colors = jitter_views(values[:, :3], recipe.jitter) if recipe.jitter else values[:, :3]
+        values, classes = functional.avg_pool2d(values, 2), classes[..., 1::2, 1::2]
+    if recipe.jitter:
+        values = jitter_views(values, recipe.jitter)
     if recipe.jpeg:
         quality = recipe.jpeg + (QUALITIES - recipe.jpeg) * torch.rand(len(values), device=values.device)
-        colors = compress_views(colors, quality.long().clamp(1, QUALITIES - 1))
-    return torch.cat((colors, values[:, 3:]), dim=1) - 0.5, classes
+        values = compress_views(values, quality.long().clamp(1, QUALITIES - 1))
+    return values - 0.5, classes
 
 
 def segmentation_loss(logits: torch.Tensor, classes: torch.Tensor, dice: float) -> torch.Tensor:
@@ -215,21 +253,13 @@ class _Trainer:
     def __init__(self, recipe: Recipe, classes: int, device: torch.device, seed: int) -> None:
         torch.manual_seed(seed)
         self.recipe, self.device, self.started = recipe, device, time.perf_counter()
-        self.network = NETWORKS[recipe.network](classes, recipe.width, 3 + recipe.depth).to(device, memory_format=torch.channels_last)
+        self.network = ResidualNetwork(classes, recipe.width).to(device, memory_format=torch.channels_last)
         self.optimizer = torch.optim.AdamW(self.network.parameters(), recipe.rate, fused=device.type == "cuda")
         torch.backends.cudnn.benchmark = True  # Sizes are fixed: the fastest convolutions are found once.
-        self._predict, self._criterion = self.network, segmentation_loss
-        if recipe.compile:
-            # Two graphs, so that logits are rounded to bfloat16 in between. Kernels fused across both take rounded logits for the softmax's
-            # numerator and unrounded ones for its denominator: with logits of 64, a pixel's probabilities sum to up to 1.17.
-            self._predict = torch.compile(self.network, dynamic=False)
-            self._criterion = torch.compile(segmentation_loss, dynamic=False)
         self.total = max(1, round(recipe.views * recipe.passes / recipe.batch))
         self.losses: list[torch.Tensor] = []
         self.waited = 0.0
         """Time before the first step, in which the first part of the pool was filled [s]."""
-        self.compiling = 0.0
-        """Compilation time, not included in the schedule [s]."""
 
     @property
     def progress(self) -> float:
@@ -237,32 +267,15 @@ class _Trainer:
         left = max(self.recipe.seconds - self.waited, 1.0)
         return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
 
-    def evaluate(self, images: torch.Tensor, classes: torch.Tensor) -> torch.Tensor:
-        """Loss of a batch, in mixed precision."""
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
-            logits = self._predict(images)
-        return self._criterion(logits, classes, self.recipe.dice)
-
-    def compile(self, pool: Pool) -> None:
-        """Warm-up: compile the training step by a forward and backward pass on images of each size; gradients are discarded."""
-        started = time.perf_counter()
-        for progress in (0.0, 1.0):
-            self.evaluate(*self._draw(pool, progress)).backward()
-        self.optimizer.zero_grad()
-        self.compiling = time.perf_counter() - started
-        self.started += self.compiling
-
-    def _draw(self, pool: Pool, progress: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Augmented batch."""
-        images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, progress)
-        return images.contiguous(memory_format=torch.channels_last), classes
-
     def step(self, pool: Pool) -> None:
-        """Train on a batch drawn from the pool, and append its loss to `losses`."""
+        """Train on a batch drawn from the pool, in mixed precision, and append its loss to `losses`."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
         self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
-        loss = self.evaluate(*self._draw(pool, done))
+        images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, done)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+            logits = self.network(images.contiguous(memory_format=torch.channels_last))
+        loss = segmentation_loss(logits, classes, self.recipe.dice)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
@@ -270,19 +283,15 @@ class _Trainer:
         self.losses.append(loss.detach())
 
 
-def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int, pool: Pool | None = None) -> tuple[Trained, Pool]:
+def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
     """Train a network on views of a stream. Training starts when a first part of the pool is filled; the rest is filled during training.
-
-    If a `pool` is given, the stream adds the views that it lacks of `recipe.views`. Returns the trained network and the pool.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
-    pool, trainer = pool or Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
-    batches = source.batches(recipe.views - pool.seen)
+    pool, trainer = Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
+    batches = source.batches(recipe.views)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
-    if recipe.compile:
-        trainer.compile(pool)
     first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started
     while trainer.progress < 1.0:
@@ -293,8 +302,5 @@ def train(source: Source, recipe: Recipe, classes: int, device: torch.device, se
     batches.close()
     values = torch.stack(trainer.losses).tolist()
     parts = [values[len(values) * part // 10 : max(1, len(values) * (part + 1) // 10)] for part in range(10)]
-    losses = [sum(part) / len(part) for part in parts if part]
-    seconds = time.perf_counter() - trainer.started
-    samples = len(values) * recipe.batch
-    trained = Trained(trainer.network.eval(), losses, pool.seconds, seconds, trainer.compiling, pool.seen, samples)
-    return trained, pool
+    losses, seconds = [sum(part) / len(part) for part in parts if part], time.perf_counter() - trainer.started
+    return Trained(trainer.network.eval(), losses, pool.seconds, seconds, pool.seen, len(values) * recipe.batch)

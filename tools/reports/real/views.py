@@ -15,14 +15,6 @@ import torch  # pyright: ignore[reportMissingImports]
 from synpick_warp.configs.schema import Config
 from synpick_warp.online.dataset import StreamDataset
 
-FARTHEST = 1.5
-"""Depth that is coded by 255 [m], and all beyond: objects are nearer, and what is behind them differs from room to room."""
-
-
-def code_depth(depth: torch.Tensor) -> torch.Tensor:
-    """Depth [m] as uint8: 255 at FARTHEST, 0 where it is not measured."""
-    return depth.mul(255 / FARTHEST).round_().clamp_(0, 255).to(torch.uint8)
-
 
 @dataclass(frozen=True, eq=False)
 class Source:
@@ -34,21 +26,14 @@ class Source:
     """Every n-th frame of an episode."""
     cameras: tuple[int, ...] | None = None
     """Indices of the cameras whose views are taken; None: all."""
-    depth: bool = False
-    """Whether images have depth as a fourth channel, by `code_depth`."""
 
     def batches(self, views: int) -> Generator[tuple[torch.Tensor, torch.Tensor]]:
-        """Images (B, 3 or 4, H, W) and obj_ids (B, H, W) uint8 of `views` views in total; a batch is valid until the next one."""
-        if views <= 0:
-            return
-        fields = ("rgb", "classes", "depth") if self.depth else ("rgb", "classes")
+        """Images (B, 3, H, W) and obj_ids (B, H, W) uint8 of `views` views in total; a batch is valid until the next one."""
+        fields = ("rgb", "classes")
         dataset = StreamDataset(self.config, fields=fields, episodes=self.episodes, stride=self.stride, cameras=self.cameras)
         for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
-            image, classes = batch["rgb"], batch["classes"].to(torch.uint8)
-            if self.depth:
-                image = torch.cat((image, code_depth(batch["depth"])), dim=1)
-            yield image[:views], classes[:views]
-            views -= len(image)
+            yield batch["rgb"][:views], batch["classes"][:views].to(torch.uint8)
+            views -= len(batch["rgb"])
             if views <= 0:
                 return
 
@@ -58,7 +43,7 @@ class Pool:
     """Replay buffer of views on the device; once full, new ones replace random ones.
 
     Attributes:
-        images: (N, 3 or 4, H, W) uint8.
+        images: (N, 3, H, W) uint8.
         classes: obj_ids (N, H, W) uint8.
     """
 
@@ -101,7 +86,7 @@ class Pool:
         return self.seen >= views
 
     def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Batch of random views, drawn with replacement: images (size, 3 or 4, H, W) uint8, obj_ids (size, H, W) int64."""
+        """Batch of random views, drawn with replacement: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
         images, classes = self.tensors()
         chosen = self._on_device(torch.randint(self.count, (size,), generator=self._random))
         return images[chosen], classes[chosen].long()

@@ -1,18 +1,14 @@
-"""Check that states of worlds are exact: a branch continues as its episode does, bit by bit, and nothing is forgotten.
+"""Exactness of states of worlds: a branch continues as its episode does, bit by bit, and nothing is forgotten.
 
-Branches: in each mode, states are saved at many moments, loaded into other worlds while all others go on, and into a simulation of few
-worlds, and continued. After every tick the branch's state must be that of the episode's own continuation.
+Branches: states are saved at many moments, loaded into other worlds while all others go on, and into a simulation of few worlds, and
+continued. After every tick the branch's state must be that of the episode's own continuation.
 
 Arrays: every device array that a simulation reaches is found. What is no state, and ever changes from tick to tick, is overwritten between
 ticks, by NaN or by numbers of an earlier tick, and then the state is loaded into its own worlds: nothing may change.
-
-    python -m tools.checks.states --device cuda:0 --worlds 256 --states 64 --set perception.resolution=[320,180]
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 import types
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,36 +17,11 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from rich.console import Console
 
 from synpick_warp.codes import Mode, Phase, Task
-from synpick_warp.errors import SynpickError
-from synpick_warp.factory.assembly import fit_to_catalog
-from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.fixtures import make_fixtures
-from synpick_warp.scenes.lights import load_lights
-from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
+from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import SilentProgress
-from tools.options import Row, configure, fail, make_parser, positive_count, print_rows
 
-OWN = {
-    "worlds": {"type": positive_count, "default": 256, "help": "worlds (default: 256)"},
-    "states": {"type": positive_count, "default": 64, "help": "states in each mode (default: 64)"},
-    "moments": {"type": positive_count, "default": 8, "help": "moments at which they are saved (default: 8)"},
-    "ticks": {"type": positive_count, "default": 10, "help": "ticks that each is continued (default: 10)"},
-    "apart": {"type": positive_count, "default": 20, "help": "ticks between two moments (default: 20)"},
-    "repeated": {"type": positive_count, "default": 100, "help": "ticks that are repeated with overwritten arrays (default: 100)"},
-}
-"""Options of this check; see `tools.options.OPTIONS`."""
-EPISODES = 8
-"""Episodes for each world."""
-POISONED_WORLDS = 16
-"""Worlds of the check of arrays."""
 OLDER = 3
 """Age of the values that integers are overwritten by [ticks]."""
 CONTACTS = "contacts."
@@ -68,59 +39,6 @@ class Result:
     differences: list[str] = field(default_factory=list)
     compared: int = 0
     """Ticks of branches that were compared."""
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    options = make_parser(__doc__, "config", "models", "device", "seed", "set", own=OWN).parse_args(arguments)
-    console, rows = Console(highlight=False), []
-    try:
-        maker, episodes = Maker(options), EPISODES * options.worlds
-        for mode in Mode:
-            simulation = maker.make(mode.name.lower(), options.worlds, episodes)
-            few = maker.make(mode.name.lower(), min(MIN_GPU_WORLDS, options.worlds), episodes)
-            result = check_branches(simulation, few, options.states, options.moments, options.ticks, options.apart)
-            rows += report(mode.name.lower(), result)
-            console.print(*(f"{count} x {name}" for name, count in sorted(result.moments.items())), *result.differences[:20], sep="\n")
-        kinds = Counter[str]()
-        simulation = maker.make("mixed", min(POISONED_WORLDS, options.worlds), episodes)
-        differences = list(check_arrays(simulation, options.repeated, kinds))
-        rows += [Row(f"arrays: {kind}", count) for kind, count in sorted(kinds.items())]
-        rows.append(Row("arrays: ticks that overwritten ones change", len(differences), "", "= 0", not differences))
-        console.print(*differences[:20], sep="\n")
-    except SynpickError as error:
-        return fail("checks.states", error)
-    print_rows(console, "states", f"{options.states} states of {options.worlds} worlds on {options.device}", rows)
-    return 0 if all(row.holds for row in rows) else 1
-
-
-class Maker:
-    """Makes simulations by the options of a tool; all share objects, lights, and the scene that is seen."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        config = configure(options, {"bake.mode": "mixed"})
-        self.bins = make_bins(config.cell.bins)
-        self.catalog, lights = load_catalog(config, report=lambda line: None), load_lights("")
-        cameras, fixtures = make_cameras(config.rig), make_fixtures(self.bins, config.gripper)
-        self.device, self.lights = pick_device(config.bake.device), len(lights)
-        ground = self.bins[0].sizes.ground
-        self.scene = build_render_scene(config.render, ground, self.catalog, fixtures, cameras, lights, self.device)
-
-    def make(self, mode: str, worlds: int, episodes: int) -> Simulation:
-        """Worlds that can see."""
-        config = configure(self.options, {"bake.mode": mode, "bake.worlds": worlds, "bake.episodes": episodes})
-        config = fit_to_catalog(config, self.catalog, self.bins, self.device, SilentProgress())
-        return Simulation(config, self.catalog, self.lights, self.device, self.scene)
-
-
-def report(mode: str, result: Result) -> list[Row]:
-    """Rows of the report of a mode."""
-    return [
-        Row(f"{mode}: states", sum(result.moments.values())),
-        Row(f"{mode}: ticks compared", result.compared, "", "> 0", result.compared > 0),
-        Row(f"{mode}: differences", len(result.differences), "", "= 0", not result.differences),
-    ]
 
 
 # ---- branches ----
@@ -297,7 +215,3 @@ def overwrite(array: wp.array, elements: np.ndarray, older: np.ndarray) -> None:
     values = array.numpy()
     values[elements] = np.nan if values.dtype.kind == "f" else older[elements]
     array.assign(values)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
