@@ -1,4 +1,4 @@
-"""Benchmarks of whole bakes: their rows, and the process that verifies and deletes episodes. Measured values are not asserted."""
+"""Benchmarks of bakes: their rows, and the process that verifies and deletes episodes. Measured values are not asserted."""
 
 from __future__ import annotations
 
@@ -24,12 +24,9 @@ from tests.harness.processes import wait_for
 from tests.tools.test_tools import SHORT_PICKS
 from tools.bench import __main__ as bench
 from tools.bench import bakes, meter, run, scaling
-from tools.bench import cleaner as cleaner_module
-from tools.bench.bakes import Stretch, TracePoint
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.meter import Usage, measure_usage
 from tools.bench.run import Bench
-from tools.figures import read_runs
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *SHORT_PICKS)
 ANY_DEVICE = tuple(part for part in TINY if part not in ("--device", "cpu"))
@@ -67,13 +64,6 @@ def test_shared_folders_stay_when_they_are_empty(tmp_path):
     assert (tmp_path / "manifest/000001.json").exists()
 
 
-def test_only_files_with_the_suffixes_are_deleted(tmp_path):
-    image, table = write_episode(tmp_path, 1)
-    clean_episode(Assignment(tmp_path, SHARED, (".jpg",)), 1, Tally())
-    assert not image.exists()
-    assert table.exists()
-
-
 @pytest.mark.parametrize(("content", "said"), [(b"other", "has changed since it was written"), (None, "is missing")])
 def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
     image, table = write_episode(tmp_path, 1)
@@ -105,21 +95,15 @@ def test_a_process_that_dies_is_a_problem(tmp_path):
     with Cleaner(Assignment(tmp_path, SHARED), 2) as cleaner:
         os.kill(cleaner.pids[1], signal.SIGKILL)
         wait_for(lambda: cleaner.poll().problem)
-        assert cleaner.finish(1).problem == "a process that verifies episodes was ended by SIGKILL"
-
-
-def test_processes_that_make_no_progress_are_a_problem(tmp_path, monkeypatch):
-    monkeypatch.setattr(cleaner_module, "STALL_TIME", 2.0)
-    with Cleaner(Assignment(tmp_path, SHARED), 1) as cleaner:
-        write_episode(tmp_path, 0)
-        assert cleaner.finish(2) == Tally(1, 2, mock.ANY, "no episode was verified for 2 s; 1 are left")
+        assert cleaner.poll().problem == "a process that verifies episodes was ended by SIGKILL"
 
 
 def test_the_processes_of_a_cleaner_share_what_is_committed(tmp_path):
     files = [file for episode in range(5) for file in write_episode(tmp_path, episode)]
     size = sum(file.stat().st_blocks * 512 for file in files)
     with Cleaner(Assignment(tmp_path, SHARED), 2) as cleaner:
-        assert cleaner.finish(5) == Tally(5, 10, size)
+        wait_for(lambda: cleaner.poll().episodes == 5)
+        assert cleaner.poll() == Tally(5, 10, size)
         assert [tally.episodes for tally in cleaner._tallies] == [3, 2]
     assert not any(file.exists() for file in files)
 
@@ -172,7 +156,6 @@ def test_descendants_of_the_benchmark_are_counted_and_other_processes_are_not():
         (["--seconds", "-1"], "-1 is out of range"),
         (["--json", "/nowhere/x.json"], "there is no folder /nowhere"),
         (["--json", "/tmp"], "/tmp is a folder"),
-        (["--parts", "steady", "--episodes", "7"], "--episodes needs the part whole"),
         (["--parts", "render", "--devices", "cpu,cpu"], "--devices needs the part steady, the only one that uses several"),
         (["--parts", "steady", "--devices", "cpu,cpu"], "--device and --devices are both given"),
     ],
@@ -188,16 +171,15 @@ def test_devices_that_do_not_exist_are_one_line(capsys):
     assert "cuda:98" in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("part", ["steady", pytest.param("whole", marks=pytest.mark.slow)])
-def test_damage_ends_a_bake_with_one_line(monkeypatch, capsys, part):
+def test_damage_ends_a_bake_with_one_line(monkeypatch, capsys):
     monkeypatch.setattr(bakes.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
-    assert bench.main([*TINY, "--parts", part, "--seconds", "60"]) == 2
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == "bench: a file is missing"
 
 
 def test_ctrl_c_ends_the_benchmark(monkeypatch, capsys):
     monkeypatch.setattr(meter.SteadyMeter, "update", lambda *_, **counts: os.kill(os.getpid(), signal.SIGINT))
-    assert bench.main([*TINY, "--parts", "steady,whole", "--seconds", "60"]) == 130
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 130
     assert capsys.readouterr().err.splitlines()[-1] == "bench: interrupted"
 
 
@@ -218,73 +200,6 @@ def test_damage_is_raised_when_the_bake_has_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(bakes.Cleaner, "poll", lambda self: Tally(problem="damaged"))
     with pytest.raises(DatasetError, match="damaged"), bakes.clean_up_behind(DataLayout.of(bench.Config()), tmp_path):
         pass
-
-
-# ---- whole bakes ----
-
-
-def points(*ticks: tuple[float, int, int]) -> list[TracePoint]:
-    """Trace of ticks (time, views so far, active worlds)."""
-    return [TracePoint(seconds, views, active, 0) for seconds, views, active in ticks]
-
-
-def test_phases_add_up_to_the_whole_bake():
-    """Two cameras, ten worlds: settling, 3 live, 9 live, 5 live, 10 live, and two ticks of a tail."""
-    trace = points((5, 0, 10), (6, 6, 10), (7, 14, 10), (8, 32, 10), (10, 42, 10), (11, 62, 10), (12, 66, 2), (13, 68, 1))
-    phases = bakes.split_stretches(trace, 2, Stretch(15.0, 71))
-    assert phases == {
-        "start": (6, 6),
-        "settling": (1, 8),
-        "steady": (2, 38),
-        "between": (2, 10),
-        "tail": (2, 6),
-        "finishing": (2, 3),
-    }
-    assert bakes.count_live(trace, 2) == [0, 3, 4, 9, 5, 10, 2, 1]
-
-
-def test_a_bake_that_never_has_all_worlds_live_only_settles():
-    phases = bakes.split_stretches(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, Stretch(4.0, 4))
-    assert (phases["start"], phases["settling"], phases["steady"]) == ((2, 2), (1, 2), (0, 0))
-    assert bakes.split_stretches([], 1, Stretch(4.0, 0))["finishing"] == (4, 0)
-
-
-def test_the_mean_is_compared_with_both_steady_rates():
-    rows = {row.name: row.value for row in bakes.summarize_whole(points((5, 10, 10), (6, 20, 10)), 1, Stretch(10.0, 20), 4.0)}
-    assert rows["mean of the whole: views"] == 2.0
-    assert rows["mean, of the rate of its own steady ticks"] == 20.0
-    assert rows["mean, of the rate of the part steady"] == 50.0
-
-
-def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
-    file = tmp_path / "bench.json"
-    assert bench.main([*TINY, "--parts", "whole", "--episodes", "2", "--json", str(file)]) == 0
-    record = json.loads(file.read_text())
-    rows = {row["name"]: row["value"] for row in record["rows"]}
-    trace = read_runs(tmp_path)[file.name].more["whole"]
-    assert record["machine"]["measured"] == "2 episodes, 2 worlds, 3 cameras, 32x18"
-    assert rows["worlds"] == 2
-    assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
-    assert rows["views"] >= trace["views"][-1] > 0
-    assert trace["views"][-1] // 3 == sum(trace["live"])
-    assert trace["episodes"][-1] == 2
-    assert trace["seconds"] == sorted(trace["seconds"])
-    assert rows["episodes of which all files are verified"] == 2
-    assert rows["files of these"] > 4 * rows["views"]
-    assert rows["start until all episodes are verified, at least until exit"] >= rows["start to exit"]
-    assert "largest size on disk, after a tick" in rows
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["--parts", "whole"], "150 episodes, automatic worlds"),
-        (["--parts", "whole,steady"], "512 worlds"),
-    ],
-)
-def test_the_setup_names_what_determines_the_worlds(arguments, expected):
-    options = bench._parse(arguments)
-    assert bench._describe_setup(bench._config(options), options) == f"{expected}, 3 cameras, 1920x1080"
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
-"""Benchmark of a bake's parts: physics, perception, rendering, encoders, writing, the online stream, and of whole bakes.
+"""Benchmark of a bake's parts: physics, perception, rendering, encoders, the online stream, and of bakes in steady state.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
-mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
+mode pick; with `--set bake.mode=move`, piles are stirred instead. Files are written to the
 system's temporary folder (TMPDIR) and removed. The part render renders one tick repeatedly; the part pictures renders successive ticks,
 with light histories as in a bake; the part sensor renders piles by Newton's SensorCamera, too.
 
@@ -23,7 +23,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.system.hardware.device import pick_device
-from tools.bench.bakes import measure_steady, measure_trajectories, measure_whole
+from tools.bench.bakes import measure_steady, measure_trajectories
 from tools.bench.online import measure_environment, measure_picks
 from tools.bench.pictures import measure_pictures
 from tools.bench.run import Bench
@@ -33,12 +33,11 @@ from tools.bench.worlds import measure_worlds
 from tools.figures import describe_run, write_run
 from tools.options import INTERRUPTED, Row, configure, counts, fail, make_names_parser, make_parser, number_in, of_part, positive_count
 
-SHARED_PARTS = ("physics", "perception", "render", "encode", "write", "stream")
+SHARED_PARTS = ("physics", "perception", "render", "encode", "stream")
 """Parts in the same worlds."""
 OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
     "pictures": measure_pictures,
     "steady": measure_steady,
-    "whole": measure_whole,
     "trajectories": measure_trajectories,
     "growth": measure_growth,
     "patches": measure_patches,
@@ -50,10 +49,10 @@ OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
 """Parts that build worlds of their own, in the order in which they are measured."""
 DEFAULT_PARTS = (*SHARED_PARTS, "steady")
 PARTS = (*DEFAULT_PARTS, *(name for name in OWN_PARTS if name != "steady"))
-OWNERS = (("devices", "steady", "several"), ("episodes", "whole", "it"), ("after", "pictures", "it"), ("instances", "growth", "it"))
+OWNERS = (("devices", "steady", "several"), ("after", "pictures", "it"), ("instances", "growth", "it"))
 """Options that only one part uses: option, part, and what of."""
-WORLDS, WHOLE_EPISODES = 512, 150
-"""Default number of worlds of all parts but `whole`, and of episodes of that."""
+WORLDS = 512
+"""Default number of worlds."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -62,17 +61,18 @@ def main(arguments: list[str] | None = None) -> int:
     console = Console(highlight=False)
     rows: list[Row] = []
     machine: dict[str, str] = {}
-    traces: dict[str, object] = {}
     code = 0
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
-        machine = dict([*describe_machine(device), ("measured", _describe_setup(config, options))])
+        width, height = config.cameras.resolution
+        setup = f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}"
+        machine = dict([*describe_machine(device), ("measured", setup)])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
-        given = {name: getattr(options, name) for name in ("seconds", "devices", "after", "instances", "episodes")}
-        bench = Bench(config, **given, worlds=options.worlds or 0, traces=traces)
+        given = {name: getattr(options, name) for name in ("seconds", "devices", "after", "instances")}
+        bench = Bench(config, **given)
         for row in measure(bench, options.parts):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -82,30 +82,20 @@ def main(arguments: list[str] | None = None) -> int:
         print("bench: interrupted", file=sys.stderr)
         code = INTERRUPTED
     if rows:
-        write_run(options.json, describe_run("tools.bench", machine.items(), rows, **traces))
+        write_run(options.json, describe_run("tools.bench", machine.items(), rows))
     return code
-
-
-def _describe_setup(config: Config, options: argparse.Namespace) -> str:
-    """Worlds, cameras and resolution. If `whole` is the only part: also its episodes, and the worlds may be automatic."""
-    worlds = f"{config.bake.worlds} worlds"
-    if set(options.parts) == {"whole"}:
-        worlds = f"{options.episodes} episodes, " + (worlds if options.worlds else "automatic worlds")
-    width, height = config.cameras.resolution
-    return f"{worlds}, {len(config.cameras.positions)} cameras, {width}x{height}"
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "config", "device", "models", "lights", "set", "json")
-    worlds_help = f"worlds simulated in parallel (default: {WORLDS}; the part whole: as many as a bake of --episodes chooses)"
-    parser.add_argument("--worlds", type=positive_count, help=worlds_help)
+    worlds_help = f"worlds simulated in parallel (default: {WORLDS})"
+    parser.add_argument("--worlds", type=positive_count, default=WORLDS, help=worlds_help)
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
     parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), default=DEFAULT_PARTS, help=parts_help)
     after_help = "ticks simulated before the part pictures, in which little moves just after the drop (default: 0)"
     parser.add_argument("--after", type=positive_count, default=0, metavar="TICKS", help=after_help)
-    parser.add_argument("--episodes", type=positive_count, help=f"episodes of the part whole (default: {WHOLE_EPISODES})")
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
     instances_help = "numbers of like parts, of which the part growth measures physics alone: 10,32,64,128,251"
@@ -118,12 +108,11 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
             parser.error(f"--{name} needs the part {part}, the only one that uses {use}")
     if options.devices and options.device != parser.get_default("device"):
         parser.error("--device and --devices are both given; name one device by --device, or several by --devices")
-    options.episodes = options.episodes or WHOLE_EPISODES
     return options
 
 
 def _config(options: argparse.Namespace) -> Config:
-    worlds, resolution = options.worlds or WORLDS, parse_resolution(options.resolution)
+    worlds, resolution = options.worlds, parse_resolution(options.resolution)
     return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 
 

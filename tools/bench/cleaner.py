@@ -27,8 +27,6 @@ from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, sen
 
 INTERVAL = 0.5
 """Polling interval for committed episodes [s]."""
-STALL_TIME = 120.0
-"""Longest wait for the next verified episode [s]; the 60,000 files of an episode of 1,200 frames take a process some seconds."""
 CORES_PER_PROCESS = 4
 """Number of CPU cores per process; with fewer cores there is one process. Verifying and deleting a view takes less CPU time than writing
 it: on an H200's host with 16 cores, 4 processes kept up with 877 full-HD views/s with all masks."""
@@ -37,14 +35,12 @@ _PROGRAM = "from tools.bench.cleaner import main; main()"
 
 @dataclass(frozen=True)
 class Assignment:
-    """Task of a cleaner's process: data set, share of the episodes to verify, and suffixes of the files to delete (empty: all)."""
+    """Task of a cleaner's process: data set, and share of the episodes to verify."""
 
     out: Path
     """Folder of the data set."""
     folders: tuple[str, ...]
     """Folders shared by several episodes, relative to the data set; they are kept even if empty."""
-    suffixes: tuple[str, ...] = ()
-    """Suffixes of the files to delete; empty: all files."""
     share: tuple[int, int] = (0, 1)
     """(i, n): only episodes with index % n == i are verified."""
 
@@ -87,20 +83,6 @@ class Cleaner:
         """Receive pending messages and return the totals over all processes; a process that died is reported as a problem."""
         self._tallies = [_poll(worker, tally) for worker, tally in zip(self._workers, self._tallies, strict=True)]
         return reduce(Tally.plus, self._tallies)
-
-    def finish(self, episodes: int) -> Tally:
-        """Wait until `episodes` episodes have been verified or a problem has been found; returns the totals.
-
-        That the processes verified no episode for STALL_TIME is a problem, too.
-        """
-        progress, deadline = -1, 0.0
-        while (tally := self.poll()).episodes < episodes and not tally.problem:
-            if tally.episodes > progress:
-                progress, deadline = tally.episodes, time.monotonic() + STALL_TIME
-            elif time.monotonic() > deadline:
-                return replace(tally, problem=f"no episode was verified for {STALL_TIME:g} s; {episodes - progress} are left")
-            time.sleep(INTERVAL)
-        return tally
 
     def __enter__(self) -> Self:
         return self
@@ -159,9 +141,8 @@ def clean_episode(assignment: Assignment, episode: int, tally: Tally) -> Tally:
     deleted = 0
     try:
         for name in known:
-            if not assignment.suffixes or name.endswith(assignment.suffixes):
-                deleted += (out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
-                (out / name).unlink()
+            deleted += (out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
+            (out / name).unlink()
     except OSError as error:
         return replace(tally, problem=f"{error.filename} cannot be deleted: {error.strerror}")
     _remove_empty_folders(out, known, assignment.folders)

@@ -37,19 +37,12 @@ _ANONYMOUS = re.compile(r"^RssAnon:\s*(\d+) kB$", re.MULTILINE)
 class Usage(NamedTuple):
     """Resources of processes."""
 
-    user: float = 0.0
-    """CPU time in user mode [s]."""
-    system: float = 0.0
-    """CPU time in the kernel [s]."""
+    cpu: float = 0.0
+    """CPU time in user mode and in the kernel [s]."""
     resident: int = 0
     """Resident memory [bytes]; memory that processes share, such as the slots through which writers get images, counts in each."""
     anonymous: int = 0
     """Resident memory of the process's own [bytes]: without shared memory and files."""
-
-    @property
-    def cpu(self) -> float:
-        """CPU time in user mode and in the kernel [s]."""
-        return self.user + self.system
 
     def plus(self, other: Usage) -> Usage:
         """Sum of the resources of two."""
@@ -70,7 +63,7 @@ def measure_usage() -> dict[int, Usage]:
                 continue
             user, system, pages = (values[index - 1] for index in (_USER, _SYSTEM, _RESIDENT))
             own = 1024 * int(anonymous[1]) if anonymous else 0
-            usages[int(entry.name)] = Usage(tick * user, tick * system, pages * os.sysconf("SC_PAGE_SIZE"), own)
+            usages[int(entry.name)] = Usage(tick * (user + system), pages * os.sysconf("SC_PAGE_SIZE"), own)
             parents[int(entry.name)] = values[_PARENT - 1]
     return {pid: usage for pid, usage in usages.items() if _descends(pid, os.getpid(), parents)}
 

@@ -8,7 +8,6 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
 from unittest import mock
 
 import warp as wp
@@ -42,14 +41,8 @@ class Bench:
     """Ticks simulated before the part pictures."""
     instances: tuple[int, ...] = ()
     """Numbers of like parts that the part growth measures, instead of its factors."""
-    episodes: int = 0
-    """Episodes of the part whole."""
-    worlds: int = 0
-    """Worlds of the part whole; 0: automatic."""
     values: dict[str, float] = field(default_factory=dict)
     """Value of each row so far, by name."""
-    traces: dict[str, Any] = field(default_factory=dict)
-    """What changes during a measurement, by part."""
 
     @property
     def device(self) -> wp.Device:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,9 +20,7 @@ from synpick_warp.factory.assembly import build_factory
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
-from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot, allocate_view_buffers
-from synpick_warp.stages.render.layers import LayerRenderer
+from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.system.progress import SilentProgress
 from tools.bench import worlds
@@ -34,14 +32,10 @@ ORDERS = {
     "in tiles of 8 x 4": SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder.TILED, tile_width=8, tile_height=4),
 }
 """Pixel orders of the sensor; the faster one is compared."""
-LAYERS = ("normals", "albedo")
-"""Layers that both renderers have."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Rotation from OpenGL camera axes (looking along -z, y up) to OpenCV camera axes (looking along +z, y down)."""
 DEPTH_TOLERANCE = 1.0
 """Tolerance of depths [counts]: ours is rounded to half a count, the sensor's is computed in world space in single precision."""
-NORMAL_TOLERANCE = 1.0
-"""Tolerance of normals [°]."""
 MAX_WORLDS, CHECKED_VIEWS = 64, 6
 """Worlds that are settled, at most, and views in which the outputs are compared: two worlds."""
 
@@ -186,32 +180,11 @@ def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment:
     ]
 
 
-def compare_surfaces(cameras: tuple[Camera, ...], normal: np.ndarray, albedo: np.ndarray, layers: dict[str, np.ndarray]) -> list[Row]:
-    """Agreement of both renderers in normals and base colors; view v is of camera v % len(cameras).
-
-    Args:
-        cameras: The cameras.
-        normal: The sensor's normals in world space (view, row, column, 3) float32.
-        albedo: The sensor's base color (view, row, column) uint32, red in the lowest byte.
-        layers: Our normals in camera space, facing the camera (view, row, column, 3) float32, and base color (view, row, column, 3) uint8.
-    """
-    rotations = np.array([cameras[view % len(cameras)].rotation for view in range(len(normal))])
-    rotated = np.einsum("bij,bhwj->bhwi", rotations, normal)
-    cosine = np.abs((rotated * layers["normals"]).sum(axis=-1))[layers["normals"].any(axis=-1)]
-    color = np.stack([albedo >> shift & 255 for shift in (0, 8, 16)], axis=-1)
-    difference = np.abs(color.astype(np.int16) - layers["albedo"])
-    same_normal = 100.0 * float((cosine >= np.cos(np.radians(NORMAL_TOLERANCE))).mean()) if cosine.size else 100.0
-    return [
-        Row(f"surfaces with the same normal within {NORMAL_TOLERANCE:g}°", same_normal, "%"),
-        Row("mean difference of base colors, the sensor's without texture minification", float(difference.mean()), "grey"),
-    ]
-
-
 def measure_sensor(bench: Bench) -> Iterator[Row]:
-    """Benchmark of both renderers for three sets of outputs, on piles at rest.
+    """Benchmark of both renderers for depth and ids, which both have, on piles at rest.
 
-    Both update poses and render a batch of views. On CUDA both launch without waiting, so that launch overhead is hidden. The
-    sensor has no light maps, amodal masks, counts, boxes, or texture minification.
+    Both update poses and render a batch of views; ours makes amodal masks, too. On CUDA both launch without waiting, so that launch
+    overhead is hidden.
     """
     config = bench.config.with_values({"bake.worlds": min(bench.config.bake.worlds, MAX_WORLDS)})
     factory = build_factory(config, SilentProgress())
@@ -219,60 +192,27 @@ def measure_sensor(bench: Bench) -> Iterator[Row]:
     simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
     for _ in range(worlds.FALL_TICKS + worlds.SETTLE_TICKS):
         simulation.tick()
-    device, snapshot, scale = simulation.device, simulation.record.snapshot, config.bop.depth_scale
+    device, snapshot, pixels = simulation.device, simulation.record.snapshot, renderer.scene.width * renderer.scene.height
     count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(cameras))
     started = time.perf_counter()
-    fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
-    table = float(renderer.scene.table.height)
+    fixtures, table = make_fixtures(make_bins(config.cell.bins), config.gripper), float(renderer.scene.table.height)
     scene = build_sensor_scene(config.render, factory.catalog, fixtures, cameras, table, snapshot, count, device)
     wp.synchronize_device(device)
     yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
     yield Row("views in a batch", count, "")
-    height, width, checked = renderer.scene.height, renderer.scene.width, slice(min(count, CHECKED_VIEWS))
-    out, views = (
-        allocate_view_buffers(count, width, height, renderer.instances, device),
-        first_views(count, len(cameras), renderer.instances, device),
-    )
-    layer_renderer = LayerRenderer(LAYERS, None, renderer.scene, renderer.instances, count)
-    our_layers = allocate(LayerBuffers, {"view": count, "row": height, "column": width}, device, LAYERS)
-    hits = scene.allocate_outputs(forward_depth_image="depth_forward", shape_index_image="shape_index")
-    surfaces = scene.allocate_outputs(normal_image="normal", albedo_image="albedo")
-    gbuffer = partial(renderer.render_gbuffer, snapshot, views, out)
-
-    def time_view(function: Callable[[], object]) -> float:
-        """Time of one view [s]."""
-        return bench.seconds_per_call(function, 0.25) / count
-
-    def render_layers() -> None:
-        """Layers, besides depth, ids and amodal masks."""
-        gbuffer()
-        layer_renderer.render(snapshot, renderer.bodies, renderer.gbuffer, views, our_layers, renderer.cameras)
-
-    own = time_view(gbuffer)
-    orders = {name: time_view(partial(scene.render, order, hits)) for name, order in ORDERS.items()}
-    best = min(orders, key=orders.__getitem__)
-    arrays = (hits["shape_index_image"], hits["forward_depth_image"], out.instance, out.depth)
-    yield from compare_hits(scene.segment, *(array[checked].numpy() for array in arrays), scale)
+    out = allocate_view_buffers(count, renderer.scene.width, renderer.scene.height, renderer.instances, device)
+    views = first_views(count, len(cameras), renderer.instances, device)
+    images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
+    ours = bench.seconds_per_call(partial(renderer.render_gbuffer, snapshot, views, out), 0.25) / count
+    orders = {name: bench.seconds_per_call(partial(scene.render, order, images), 0.25) / count for name, order in ORDERS.items()}
+    arrays = [array[: min(count, CHECKED_VIEWS)].numpy() for array in (*images.values(), out.instance, out.depth)]
+    yield from compare_hits(scene.segment, *arrays, config.bop.depth_scale)
     for name, seconds in orders.items():
         yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
-        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / own, "")
-    yield from _comparison_rows("depth, index", ", amodal masks", "", (own, orders[best]), width * height)
-    textured = replace(ORDERS[best], enable_textures=True)
-    times = time_view(render_layers), time_view(partial(scene.render, textured, hits | surfaces))
-    layers = {name: getattr(our_layers, name)[checked].numpy() for name in LAYERS}
-    yield from compare_surfaces(cameras, *(image[checked].numpy() for image in surfaces.values()), layers)
-    yield from _comparison_rows("depth, index, normals, albedo", ", amodal masks", "", times, width * height)
-    lit, color = replace(textured, enable_shadows=True), scene.allocate_outputs(color_image="color")
-    times = time_view(partial(renderer.render, snapshot, views, out)), time_view(partial(scene.render, lit, hits | color))
-    extras = ", indirect light, anti-aliasing, amodal masks, counts, boxes"
-    yield from _comparison_rows("color, depth, index", extras, ", one light", times, width * height)
-
-
-def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tuple[float, float], pixels: int) -> Iterator[Row]:
-    """Rows of the times of a view [s] of `pixels` pixels by ours and theirs, of their rates, and of their ratio."""
-    ours, theirs = times
-    for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
+        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / ours, "")
+    theirs = min(orders.values())
+    for name, seconds in (("ours: depth, index, amodal masks", ours), ("SensorCamera: depth, index", theirs)):
         yield Row(name, 1e3 * seconds, "ms")
         yield Row(f"{name}: views", 1.0 / seconds, "1/s")
         yield Row(f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")
-    yield Row(f"SensorCamera's time over ours: {outputs}", theirs / ours, "")
+    yield Row("SensorCamera's time over ours: depth, index", theirs / ours, "")

@@ -1,4 +1,4 @@
-"""Parts that are measured in the same worlds: physics, perception, rendering, encoders; the parts write and stream follow there."""
+"""Parts that are measured in the same worlds: physics, perception, rendering, encoders; the part stream follows there."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ from synpick_warp.system.progress import SilentProgress
 from tools.bench import run
 from tools.bench.online import measure_stream
 from tools.bench.run import FOREVER, Bench, Stopwatch
-from tools.bench.write import measure_writing
 from tools.options import Row, of_part
 
 FALL_TICKS, SETTLE_TICKS = 4, 60
@@ -43,15 +42,14 @@ LEAD_TICKS, PICK_TICKS = 25, 60
 """Ticks from the first perception to the middle of the first attempt, and ticks measured from there: an attempt takes 55."""
 STREAM_BATCHES = 12
 """Number of batches that are rendered and copied back to back."""
-WRITE_VIEWS, CPU_VIEWS = 12, 6
-"""Number of views that are written over and over, and of those encoded on the CPU."""
+CPU_VIEWS = 6
+"""Number of views that are encoded on the CPU."""
 
 
 def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
-    """Measure the parts physics, perception, render, encode, write and stream of these, in this order."""
-    started, needs = time.perf_counter(), Needs.of(bench.config)
-    records = "write" in parts and needs.physics
-    factory = build_factory(bench.config, SilentProgress(), records_physics=records, needs_images=needs.images)
+    """Measure the parts physics, perception, render, encode and stream of these, in this order."""
+    started = time.perf_counter()
+    factory = build_factory(bench.config, SilentProgress(), needs_images=Needs.of(bench.config).images)
     simulation, device = factory.simulation, factory.simulation.device
     wp.synchronize_device(device)
     yield Row("load and build", time.perf_counter() - started, "s", part="setup")
@@ -63,9 +61,6 @@ def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
     if "encode" in parts:
         yield from of_part("encode", _measure_encoding(bench, factory))
     yield from _perception_fraction(bench)
-    if "write" in parts:
-        worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
-        yield from of_part("write", measure_writing(factory, _mark_live(simulation, worlds), bench.seconds))
     if "stream" in parts:
         yield from of_part("stream", measure_stream(bench, factory, _mark_live(simulation, simulation.layout.worlds)))
     yield _memory_in_use(device)
@@ -92,7 +87,7 @@ def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
 def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, ...]) -> Iterator[Row]:
     """Benchmark of all phases of an episode: drop, settle, let act; measures `parts` (physics, perception) on the way.
 
-    The state at the end is that of worlds in the middle of acting, as the benchmarks of rendering and writing need it.
+    The state at the end is that of worlds in the middle of acting, as the benchmark of rendering needs it.
     """
     tick, settle, measured = simulation.tick, simulation.scene.settle, "physics" in parts
     rest_ticks, settle.rest_ticks, settle.max_ticks = settle.rest_ticks, FOREVER, FOREVER
