@@ -12,7 +12,7 @@ import synpick_warp
 from synpick_warp.dataset.grasp_maps import find_pixels
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import View
-from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.errors import DatasetError
 from synpick_warp.system.processes.threads import map_in_threads
 from tools.examples.picking_scores import Sight
 
@@ -94,11 +94,3 @@ def _read_shot(view: View, trials: np.ndarray) -> _Shot:
         instance[mask] = index + 1
     maps = np.stack([view.layer(name) for name in MAPS]).astype(np.float16) if set(MAPS) <= set(view.layers) else None
     return _Shot(view.depth, instance, maps, float(view.intrinsics[0, 0]), rows)
-
-
-def split_objects(samples: Samples, unseen: int) -> np.ndarray:
-    """Hold out objects: obj_ids of `unseen` of the tried ones, drawn with a fixed seed; raises ConfigError if too few were tried."""
-    objects = np.unique(samples.trials["obj_id"])
-    if unseen >= len(objects):
-        raise ConfigError(f"--unseen is {unseen}, but {len(objects)} objects were tried; name fewer")
-    return np.sort(np.random.default_rng(0).permutation(objects)[:unseen])

@@ -1,7 +1,7 @@
 """The learned picker: pixel-wise prediction of pick success by a U-Net on depth and normals, its training and its file. Needs PyTorch.
 
 It learns from tried pixels, from pixels without object as failures, and, where a data set has them, from analytic maps as an auxiliary
-task, which cover unseen objects too. The camera looks straight down, and its principal point is the middle of the image, so a turned or
+task. The camera looks straight down, and its principal point is the middle of the image, so a turned or
 mirrored image shows a possible state: images, normals and grasp points are turned about the principal point at random.
 """
 
@@ -63,20 +63,18 @@ class Batches:
     """Weights of the trials (state, trial) float32."""
 
     @classmethod
-    def of(cls, samples: Samples, unseen: np.ndarray, device: torch.device) -> Batches:
-        """Copy samples, except the trials of unseen objects, to a device."""
-        trials, states = samples.trials, len(samples.episode)
-        kept = ~np.isin(trials["obj_id"], unseen)
-        state = trials["state"][kept]
+    def of(cls, samples: Samples, device: torch.device) -> Batches:
+        """Copy samples to a device."""
+        trials, states, state = samples.trials, len(samples.episode), samples.trials["state"]
         counts = np.bincount(state, minlength=states)
         column = np.arange(len(state)) - np.repeat(np.cumsum(counts) - counts, counts)
         height, width = samples.sight.depth.shape[1:]
-        centers = np.stack((trials["x"][kept] + 0.5 - width / 2, trials["y"][kept] + 0.5 - height / 2), axis=1)
+        centers = np.stack((trials["x"] + 0.5 - width / 2, trials["y"] + 0.5 - height / 2), axis=1)
         shape = (states, max(1, int(counts.max(initial=0))))
         place, target, weight = np.zeros((*shape, 2)), np.zeros((states, len(LABELS), shape[1])), np.zeros(shape)
         place[state, column], weight[state, column] = centers, 1.0
         for channel, name in enumerate(LABELS):
-            target[state, channel, column] = trials[name][kept]
+            target[state, channel, column] = trials[name]
         depth, instance = samples.sight.depth, samples.sight.instance.to(device)[:, None].float()
         chunks = [Sight(part.to(device), part, samples.sight.focal) for part in depth.split(BATCH)]
         inputs = torch.cat([make_inputs(chunk) for chunk in chunks])
@@ -117,12 +115,10 @@ def _turn(images: torch.Tensor, matrix: torch.Tensor, mode: str) -> torch.Tensor
     return functional.grid_sample(images, grid, mode=mode, align_corners=False)
 
 
-def train(
-    samples: Samples, unseen: np.ndarray, width: int, steps: int, device: torch.device, seed: int = 0, batch: int = BATCH
-) -> tuple[Network, list[float]]:
-    """Train a U-Net (AdamW, cosine decay) on trials, except those of unseen objects; returns it and the loss of each step."""
+def train(samples: Samples, width: int, steps: int, device: torch.device, seed: int = 0, batch: int = BATCH) -> tuple[Network, list[float]]:
+    """Train a U-Net (AdamW, cosine decay) on trials; returns it and the loss of each step."""
     torch.manual_seed(seed)
-    batches = Batches.of(samples, unseen, device)
+    batches = Batches.of(samples, device)
     network = Network(len(LABELS) + len(MAPS), width, inputs=5).to(device)
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE, weight_decay=DECAY)
     generator, losses = torch.Generator().manual_seed(seed), []
@@ -174,10 +170,9 @@ def _predict(network: torch.nn.Module, sight: Sight, channel: int) -> torch.Tens
     return functional.avg_pool2d(total[:, None], SMOOTHING, 1, SMOOTHING // 2, count_include_pad=False)[:, 0]
 
 
-def save_picker(path: Path, network: Network, width: int, size: tuple[int, int], unseen: np.ndarray, everything: np.ndarray) -> None:
-    """Write a network's weights with width, image size, held-out objects (`unseen`) and all tried objects (`everything`)."""
-    parts = {"width": width, "size": size, "unseen": unseen.tolist(), "objects": everything.tolist(), "weights": network.state_dict()}
-    torch.save(parts, path)
+def save_picker(path: Path, network: Network, width: int, size: tuple[int, int]) -> None:
+    """Write a network's weights with its width and the size of its images."""
+    torch.save({"width": width, "size": size, "weights": network.state_dict()}, path)
 
 
 def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, Any]]:

@@ -12,8 +12,6 @@ import numpy as np
 import torch  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from synpick_warp.apps.statistics.ranking import Scored
-
 WINDOW = 7
 """Side of the window over which normals are averaged [px]: about the cup's lip (10 mm radius) in 320 px across the tote."""
 LONGEST = 40
@@ -75,21 +73,6 @@ def score_random(sight: Sight, generator: torch.Generator) -> torch.Tensor:
     """Uniform random scores at pixels of visible objects, 0 elsewhere (B, H, W)."""
     drawn = torch.rand(sight.depth.shape, generator=generator, device=sight.depth.device)
     return torch.where(sight.instance > 0, drawn, 0.0)
-
-
-def average_precision(scored: Scored, weight: np.ndarray) -> float:
-    """Average precision (area under the precision-recall curve) with weights (sample); NaN without successes. Ties keep sample order."""
-    order = np.argsort(-scored.score, kind="stable")
-    order = order[weight[order] > 0.0]
-    gained, all_of = np.cumsum((weight * scored.outcome)[order]), np.cumsum(weight[order])
-    if not gained.size or gained[-1] <= 0.0:
-        return float("nan")
-    return float((gained / all_of * (weight * scored.outcome)[order]).sum() / gained[-1])
-
-
-def mean_score(scored: Scored, weight: np.ndarray) -> float:
-    """Weighted mean of the scores."""
-    return float(weight @ scored.score / weight.sum())
 
 
 def wilson(successes: int, count: int) -> tuple[float, float]:
