@@ -59,9 +59,7 @@ OWN = {
 
 @dataclass(frozen=True, eq=False)
 class Pile:
-    """Measures of one arrangement at rest: ticks, re-drops, volume [l], energy [J]; per object speeds [mm/s], penetration [mm], inside or
-    not.
-    """
+    """Measures of one arrangement at rest; arrays are by object."""
 
     episode: int
     ticks: int
@@ -84,7 +82,7 @@ class Pile:
 
 @dataclass
 class Results:
-    """Results of all arrangements: piles at rest, failed arrangements by ending, episodes given up."""
+    """Results of all arrangements."""
 
     piles: list[Pile] = field(default_factory=list)
     resampled: Counter[str] = field(default_factory=Counter)
@@ -123,15 +121,8 @@ def main(arguments: list[str] | None = None) -> int:
     wall = time.perf_counter() - started
     objects = "the models folder's objects" if config.bake.models else "the embedded objects"
     title = f"{config.bake.episodes} arrangements of {objects} in {config.bake.worlds} worlds, seed {config.bake.seed}, {wall:.0f} s"
-    code = finish_report(
-        "tools.reports.rest",
-        options.json,
-        device,
-        "at rest",
-        title,
-        report(results, config.physics, bool(config.arrangement.counts)),
-        interrupted=interrupted,
-    )
+    rows = report(results, config.physics, bool(config.arrangement.counts))
+    code = finish_report("tools.reports.rest", options.json, device, "at rest", title, rows, interrupted=interrupted)
     return INTERRUPTED if interrupted else code
 
 
@@ -239,9 +230,8 @@ def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
     ticks, volume, energy = over_piles("ticks"), over_piles("volume"), 1e6 * over_piles("energy")
     speed, tick_speed, depth = over_objects("speed"), over_objects("tick_speed"), over_objects("depth")
     inside = 100.0 * float(over_objects("inside").mean())
-    largest = Row("total volume, max", float(volume.max()), "l")
-    if not any_volume:
-        largest = _bounded(largest.name, largest.value, "l", MAX_VOLUME * (1 + ROUNDING), f"<= {MAX_VOLUME:g}")
+    limited = _bounded("total volume, max", float(volume.max()), "l", MAX_VOLUME * (1 + ROUNDING), f"<= {MAX_VOLUME:g}")
+    largest = Row(limited.name, limited.value, "l") if any_volume else limited
     return [
         Row("arrangements at rest", len(piles), ""),
         Row("arrangements given up", results.given_up, "", "= 0", results.given_up == 0),
@@ -254,18 +244,18 @@ def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
         *_percentiles("speed, instantaneous", speed, "mm/s", (50, 90, 99), MAX_SPEED),
         *_percentiles("speed, by displacement over a tick", tick_speed, "mm/s", (50, 90, 99), MAX_SPEED),
         *_percentiles("penetration", depth, "mm", (50,)),
-        _bounded("penetration, 99 %", float(np.percentile(depth, 99)), "mm", MAX_DEPTH, f"< {MAX_DEPTH:g}"),
+        _bounded("penetration, 99 %", float(np.percentile(depth, 99)), "mm", MAX_DEPTH),
         *_percentiles("penetration", depth, "mm", (100,)),
         Row("objects inside the tote", inside, "%", f">= {MIN_INSIDE:g}", inside >= MIN_INSIDE),
         *_percentiles("kinetic energy of a world", energy, "µJ", (50, 90, 100)),
-        _bounded("contacts a world, most in a tick", results.contacts, "", physics.contacts_per_world, f"< {physics.contacts_per_world}"),
-        _bounded("pairs of shapes a world, most in a tick", results.pairs, "", physics.pairs_per_world, f"< {physics.pairs_per_world}"),
+        _bounded("contacts a world, most in a tick", results.contacts, "", physics.contacts_per_world),
+        _bounded("pairs of shapes a world, most in a tick", results.pairs, "", physics.pairs_per_world),
     ]
 
 
-def _bounded(name: str, value: float, unit: str, limit: float, bound: str) -> Row:
+def _bounded(name: str, value: float, unit: str, limit: float, bound: str = "") -> Row:
     """Row of a value that must be below `limit`; NaN violates it."""
-    return Row(name, value, unit, bound, value < limit)  # NaN violates it.
+    return Row(name, value, unit, bound or f"< {limit:g}", value < limit)
 
 
 def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], max_median: float | None = None) -> list[Row]:
@@ -273,7 +263,7 @@ def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...
     names = {50: "median", 100: "max"}
     rows = [Row(f"{name}, {names.get(level, f'{level} %')}", float(np.percentile(values, level)), unit) for level in which]
     if max_median is not None:
-        rows[0] = _bounded(rows[0].name, rows[0].value, unit, max_median, f"< {max_median:g}")
+        rows[0] = _bounded(rows[0].name, rows[0].value, unit, max_median)
     return rows
 
 
