@@ -46,7 +46,7 @@ class Usage(NamedTuple):
 
     def plus(self, other: Usage) -> Usage:
         """Sum of the resources of two."""
-        return Usage(*(one + another for one, another in zip(self, other, strict=True)))
+        return Usage(self.cpu + other.cpu, self.resident + other.resident, self.anonymous + other.anonymous)
 
 
 def measure_usage() -> dict[int, Usage]:

@@ -205,8 +205,9 @@ def measure_sensor(bench: Bench) -> Iterator[Row]:
     images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
     ours = bench.seconds_per_call(partial(renderer.render_gbuffer, snapshot, views, out), 0.25) / count
     orders = {name: bench.seconds_per_call(partial(scene.render, order, images), 0.25) / count for name, order in ORDERS.items()}
-    arrays = [array[: min(count, CHECKED_VIEWS)].numpy() for array in (*images.values(), out.instance, out.depth)]
-    yield from compare_hits(scene.segment, *arrays, config.bop.depth_scale)
+    checked = (array[: min(count, CHECKED_VIEWS)].numpy() for array in (*images.values(), out.instance, out.depth))
+    index, depth, segment, counts = checked
+    yield from compare_hits(scene.segment, index, depth, segment, counts, config.bop.depth_scale)
     for name, seconds in orders.items():
         yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
         yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / ours, "")

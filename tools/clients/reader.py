@@ -6,6 +6,7 @@ import json
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,8 @@ def main() -> None:
     client = CLIENTS[name]
     reading = client.read(Path(place), Path(data), toolkit)
     folder = Path(out)
-    np.savez(folder / "values.npz", **reading.values)
+    values: dict[str, Any] = dict(reading.values)
+    np.savez(folder / "values.npz", **values)
     versions = {package: version_of(package) for package in client.packages} | reading.versions
     (folder / "report.json").write_text(json.dumps({"what": reading.what, "remarks": reading.remarks, "versions": versions}))
 

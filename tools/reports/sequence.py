@@ -71,8 +71,8 @@ class Studio:
 
     def render(self, snapshot: Snapshot, world: int) -> Shot:
         """Render one world."""
-        indices = (wp.array([index], dtype=wp.int32, device=self.device) for index in (world, 0))
-        self.renderer.render(snapshot, make_views(*indices, 1, self.renderer.instances), self.out)
+        worlds, cameras = (wp.array([index], dtype=wp.int32, device=self.device) for index in (world, 0))
+        self.renderer.render(snapshot, make_views(worlds, cameras, 1, self.renderer.instances), self.out)
         return Shot(self.out.color.numpy()[0].copy(), self.renderer.image.radiance.numpy()[0].copy())
 
 
