@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome, Segment
+from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.files.load import load_config
 from synpick_warp.environment.episodes import Episodes, make_seeds
+from synpick_warp.environment.make import make_picking
+from synpick_warp.environment.settings import make_choice
 from synpick_warp.errors import ActionError, ConfigError, StateError
+from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.trials import Trials, own_grasps
 from synpick_warp.system.random_numbers import _mix
+from tests.builders import PICKING, boxes
 from tests.environment.conftest import SIZE, build, centers, same
+from tests.worlds.small_worlds import QUICK
 
 FLOOR = 1e-3
 """Error of a point on the floor of the tote, by a depth in single precision [m]."""
@@ -274,3 +281,22 @@ def test_more_branches_than_memory_holds_are_refused(environment, monkeypatch):
 
 def test_pixels_are_those_of_the_user(environment):
     assert environment.observe()["depth"].shape == (2, SIZE[1], SIZE[0])
+
+
+def test_a_pixel_is_picked_as_its_label_was(device):
+    """Surface point, normal, yaw and tilt of a pick at a pixel are those of the candidate of trials there."""
+    with boxes():
+        config = load_config("smoke", QUICK | PICKING | {"perception.resolution": [64, 36], "perception.normal_window": 1})
+        choice = make_choice("pick", 1, ("depth",), (64, 36), "pixel", "disabled", "numpy", 0, None, None, "attempt")
+        environment = make_picking(choice, config)
+    environment.reset()
+    state, worlds = environment.get_state(), environment.worlds
+    sampler = CandidateSampler(worlds.simulation, Picks(candidates=256, uniform=0.0))
+    grasps, candidates, _ = sampler.sample(state.worlds, [0])
+    pixels = candidates.pixel.numpy()
+    environment.set_state(state)
+    for row in (1, 100, 255):
+        worlds.attempt_pixels(np.ones(1, bool), pixels[row : row + 1])
+        for name in ("point", "normal", "yaw", "tilt"):
+            np.testing.assert_allclose(getattr(worlds.simulation.plan, name).numpy()[0], getattr(grasps, name).numpy()[row], atol=1e-6)
+        environment.set_state(state)
