@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Outcome, Segment
-from synpick_warp.configs.episodes.picks import Picks
+from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.environment.episodes import Episodes, make_seeds
 from synpick_warp.environment.make import make_picking
