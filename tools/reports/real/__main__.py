@@ -46,29 +46,25 @@ VIEWS_PER_BATCH = 48
 """Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
+COUNTS = {
+    "views": (24_000, "views of the stream"),
+    "seeds": (3, "trainings, each with piles of its own"),
+    "worlds": (512, "worlds simulated in parallel"),
+    "held-out": (400, "synthetic views to measure on"),
+    "capacity": (24_000, "views in the pool, at most"),
+    "batch": (16, "views of a batch"),
+    "width": (64, "channels of the network's first level"),
+    "stride": (2, "every n-th frame of an episode is taken"),
+    "enlarge": (2, "factor by which the resolution of all cameras is enlarged"),
+}
+"""Options that are integers above 0: default and meaning."""
 OWN = {
-    "views": {"type": positive_count, "default": 24_000, "help": "views of the stream (default: 24000)"},
+    **{name: {"type": positive_count, "default": value, "help": f"{text} (default: {value})"} for name, (value, text) in COUNTS.items()},
     "passes": {"type": number_in(0.0), "default": 4.0, "help": "number of epochs (default: 4)"},
-    "seconds": {
-        "type": number_in(0.0),
-        "default": 280.0,
-        "help": "time limit of a training with its stream, of which the first views take at most half [s] (default: 280)",
-    },
-    "seeds": {"type": positive_count, "default": 3, "help": "trainings, each with piles of its own (default: 3)"},
+    "seconds": {"type": number_in(0.0), "default": 280.0, "help": "time limit of a training with its stream [s] (default: 280)"},
+    "crop": {"type": number_in(0.1, 1.0), "default": Recipe.crop, "help": "side length of late crops, as a fraction (default: 0.5)"},
     "first-seed": {"type": int, "default": 0, "help": "first seed (default: 0)"},
-    "worlds": {"type": positive_count, "default": 512, "help": "worlds simulated in parallel (default: 512)"},
-    "held-out": {"type": positive_count, "default": 400, "help": "synthetic views to measure on (default: 400)"},
-    "capacity": {"type": positive_count, "default": 24_000, "help": "views in the pool, at most (default: 24000)"},
-    "batch": {"type": positive_count, "default": 16, "help": "views of a batch (default: 16)"},
-    "width": {"type": positive_count, "default": 64, "help": "channels of the network's first level (default: 64)"},
-    "stride": {"type": positive_count, "default": 2, "help": "every n-th frame of an episode is taken (default: 2)"},
     "cameras": {"type": int, "nargs": "+", "help": "indices of the cameras to train on (default: all)"},
-    "enlarge": {"type": positive_count, "default": 2, "help": "factor by which the resolution of all cameras is enlarged (default: 2)"},
-    "crop": {
-        "type": number_in(0.1, 1.0),
-        "default": Recipe.crop,
-        "help": "side length of random crops in the rest, as a fraction of the image's; 1: whole images (default: %(default)g)",
-    },
     "name": {"default": "real", "help": "name of the run, in files (default: real)"},
     "pictures": {"type": existing_folder, "metavar": "DIR", "help": "write overlays of all frames to this folder"},
 }
