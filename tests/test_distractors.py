@@ -15,7 +15,7 @@ import synpick_warp
 from synpick_warp.codes import Ending, Mode, Phase, Stream, Task
 from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.dataset.commit.digests import digest_inputs
+from synpick_warp.dataset.commit.writing import digest_inputs
 from synpick_warp.scenes.build import count_distractor_slots
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.embedded.objects import procedural_objects

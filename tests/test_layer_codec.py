@@ -107,7 +107,7 @@ def test_layer_files_round_trip(tmp_path, name):
     (tmp_path / name).mkdir()
     write_rendered_layer(VALUES[name], write_layer, tmp_path, 0, name, 12)
     assert layer_path(tmp_path, name, 12) == tmp_path / name / "000012.png"
-    back = read_layer(SceneFolder(tmp_path), name, 12)
+    back = read_layer(SceneFolder(tmp_path, VALUES[name].shape[1::-1]), name, 12)
     assert (back.shape, back.dtype) == (VALUES[name].shape, VALUES[name].dtype)
     assert (back.dtype.name, back.shape[2:] or (1,)) == (LAYER_TABLE[name].dtype, (LAYER_TABLE[name].components,))
     np.testing.assert_allclose(back, VALUES[name], atol=2e-5)
@@ -125,4 +125,4 @@ def test_missing_and_invalid_files_are_reported(tmp_path):
     for content in (b"", b"no picture", grey, eight):
         path.write_bytes(content)
         with pytest.raises(DatasetError, match=r"flow/000003\.png is not an image|flow of image 3 in .*; expected: 3 of type uint16"):
-            read_layer(SceneFolder(tmp_path), "flow", 3)
+            read_layer(SceneFolder(tmp_path, (4, 4)), "flow", 3)

@@ -35,6 +35,8 @@ Rotation = Annotated[list[Annotated[float, Meta(ge=-1.01, le=1.01)]], Meta(min_l
 Matrix4 = Annotated[list[Length], Meta(min_length=16, max_length=16)]
 Box = Annotated[list[Annotated[int, Meta(ge=-(2**20), le=2**20)]], Meta(min_length=4, max_length=4)]
 """x, y, width, height [px]."""
+Scale = Annotated[float, Meta(gt=0.0, le=1e6)]
+"""Depth of one count [mm]."""
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
 """Width or height of an image [px]."""
@@ -44,30 +46,24 @@ MAX_SYMMETRIES = 1024
 """Most symmetries of an object; a polyhedron has up to 60 rotations, and every one multiplies the work of evaluation."""
 
 
-class CameraEntry(Struct, gc=False):
-    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], which data sets of
-    other programs may lack.
-    """
-
-    cam_K: Matrix3  # noqa: N815
-    depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)]
-    cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
-    cam_t_w2c: Vector3 | UnsetType = UNSET
-    cam_dist: Any = UNSET
-    cam_dist_model: Any = UNSET
-
-
-class LenientCameraEntry(Struct, gc=False):
-    """Schema of a view's entry in scene_camera.json as other programs write it: any of K (camera model instead), depth scale and extrinsics
-    may be missing.
+class ForeignCameraEntry(Struct, gc=False, frozen=True, kw_only=True):
+    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm]. Those of other
+    programs may lack any of them.
     """
 
     cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
-    depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)] | UnsetType = UNSET
+    depth_scale: Scale | UnsetType = UNSET
     cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
     cam_t_w2c: Vector3 | UnsetType = UNSET
     cam_dist: Any = UNSET
     cam_dist_model: Any = UNSET
+
+
+class CameraEntry(ForeignCameraEntry, gc=False, frozen=True, kw_only=True):
+    """Schema of a view's entry in scene_camera.json with what every bake writes."""
+
+    cam_K: Matrix3  # noqa: N815
+    depth_scale: Scale
 
 
 class TruthEntry(Struct, gc=False):
@@ -95,7 +91,6 @@ class RunLengths(Struct, gc=False):
 
     counts: list[Index]
     size: tuple[Side, Side]
-    """Height and width [px]."""
 
 
 class ContinuousSymmetry(Struct, gc=False):
@@ -165,11 +160,6 @@ VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 GRAPH_SCHEMA = dict[Key, GraphEntry]
 """Schema of scene_graph.json: the entries by frame."""
-SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()}
-"""Schema of these files: the entries by frame."""
-LENIENT_VIEW_SCHEMAS = VIEW_SCHEMAS | {"camera": LenientCameraEntry}
-LENIENT_SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in LENIENT_VIEW_SCHEMAS.items()}
-"""The same for data sets from other sources."""
 MASK_SCHEMA = dict[Key, RunLengths]
 """Schema of a view's run lengths in a shard: masks by instance index."""
 

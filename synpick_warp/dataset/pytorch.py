@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.grasp_maps import candidates, find_pixels, mean_by_candidate
 from synpick_warp.dataset.reading import DataSet, open_data_set
+from synpick_warp.dataset.view import candidates, find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError, suggest
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.dataset.splits import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
-from synpick_warp.dataset.commit.frame_counts import check_frames
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
+from synpick_warp.dataset.commit.plausibility import check_frames
 from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from synpick_warp.configs.schema import Config
-    from synpick_warp.dataset.bop.scenes import FoundScenes
+    from synpick_warp.dataset.bop.foreign import ForeignScenes
     from synpick_warp.dataset.tracks import Track, Tracks
     from synpick_warp.dataset.view import View
     from synpick_warp.dataset.view_files import SceneFiles
@@ -226,7 +226,7 @@ class Episode(PickTables):
 class DataSet(Mapping[int, Episode]):
     """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access.
 
-    In a BOP data set from another source, an episode is a scene, with the scene's index, and a camera is a sensor; see `FoundScenes`.
+    In a BOP data set from another source, an episode is a scene, with the scene's index, and a camera is a sensor; see `ForeignScenes`.
     """
 
     def __init__(self, folder: Path, episodes: range | None = None, split: str | None = None) -> None:
@@ -241,7 +241,7 @@ class DataSet(Mapping[int, Episode]):
         self._only, self._found_split = episodes, split
 
     @cached_property
-    def found(self) -> FoundScenes | None:
+    def found(self) -> ForeignScenes | None:
         """Scenes that were found in the folder of a data set from another source; None: the data set is of a bake.
 
         Raises:
@@ -249,11 +249,11 @@ class DataSet(Mapping[int, Episode]):
         """
         if (self.folder / MANIFEST_FILE).is_file() or self.has_store:
             return None
+        from synpick_warp.dataset.bop.foreign import ForeignScenes
         from synpick_warp.dataset.bop.layout import NoLayoutError
-        from synpick_warp.dataset.bop.scenes import FoundScenes
 
         try:
-            return FoundScenes(self.folder, self._found_split)
+            return ForeignScenes(self.folder, self._found_split)
         except NoLayoutError:
             has = f"has neither {MANIFEST_FILE} nor {STORE} nor BOP scenes, such as test/000001 with a scene_camera.json"
             why = f"it {has if self.folder.exists() else 'does not exist'}"
@@ -428,7 +428,7 @@ class DataSet(Mapping[int, Episode]):
         return sum(len(each) for each in DataLayout.of(self.config).plan() if self._only in (None, each))
 
     @cached_property
-    def _scenes(self) -> SceneIndex | FoundScenes | None:
+    def _scenes(self) -> SceneIndex | ForeignScenes | None:
         """Locations of the scenes' files; None: without settings they are not known."""
         if self.found is not None:
             return self.found

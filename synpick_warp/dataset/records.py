@@ -52,18 +52,14 @@ class Entry(msgspec.Struct):
     """Schema of a manifest entry: number and size [B] of its files, and SHA-256 of its checksum list."""
 
     files: Index
-    """Number of files."""
     bytes: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
-    """Their total size."""
     checksum: Checksum
-    """SHA-256 of the checksum list."""
 
 
 class IndicesEntry(Entry):
     """Schema of the manifest entry of files over all episodes, with the episodes that they cover, sorted."""
 
     episodes: list[Index]
-    """Episodes that the indices cover, sorted."""
 
 
 class BinRecord(msgspec.Struct):

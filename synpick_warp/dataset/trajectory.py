@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from synpick_warp.dataset.annotations import ADVICE, check_content
-from synpick_warp.dataset.array_layout import MAX_STEPS_PER_TICK, ArrayMetadata, check_layout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, OBJECTS, GroupSpec
-from synpick_warp.system.inputs.files import check_regular_file, read_file
+from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import decode_json
 
 if TYPE_CHECKING:
@@ -23,8 +21,10 @@ if TYPE_CHECKING:
 
 GROUP_FILE = "zarr.json"
 """Metadata of a zarr group or array (zarr format 3)."""
-_MAX_METADATA = 2**24
+MAX_METADATA = 2**24
 """Largest zarr.json [bytes]; those of a bake have some kilobytes."""
+MAX_STEPS_PER_TICK = 1000
+"""As in `physics.steps_per_tick`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,6 @@ class StoreAttributes(Struct):
 
     steps_per_tick: Annotated[int, Meta(ge=1, le=MAX_STEPS_PER_TICK)]
     lights: Annotated[list[str], Meta(max_length=2**16)] = []
-    """Names of the environment maps."""
 
 
 class _ObjectsAttributes(Struct):
@@ -107,25 +106,9 @@ class Arrays(Mapping[str, "zarr.Array"]):
     def __getitem__(self, name: str) -> zarr.Array:
         if "/" in name or name in (".", "..") or not (self._folder / name / GROUP_FILE).exists():
             raise KeyError(f"{name}; there are {', '.join(self) or 'no arrays'}")
-        folder = self._folder / name
-        metadata = decode_json(
-            read_file(folder / GROUP_FILE, _MAX_METADATA, DatasetError), ArrayMetadata, folder / GROUP_FILE, DatasetError, ADVICE
-        )
-        self._check_files(folder, check_layout(folder, metadata, self._schema.arrays.get(name), self._context.sizes()))
-        from synpick_warp.dataset.stored_array import open_stored_array
+        from synpick_warp.dataset.stored_array import open_array
 
-        return open_stored_array(folder)
-
-    def _check_files(self, folder: Path, largest: int) -> None:
-        """Check that the chunk files that the manifest lists exist, and that all are regular files of up to `largest` bytes.
-
-        Zarr reads a missing chunk file as fill values, and writes no file for a chunk of these: only the manifest shows that one was lost.
-        """
-        present = {folder / entry.name for entry in os.scandir(folder)}
-        for path in sorted(path for path in self._context.files() if path.parent == folder and path not in present):
-            raise DatasetError(f"there is no {path}, which the manifest lists; {ADVICE}")
-        for path in present:
-            check_regular_file(path, max(largest, _MAX_METADATA) if path.name == GROUP_FILE else largest, DatasetError)
+        return open_array(self._folder / name, self._schema.arrays.get(name), self._context)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(path.parent.name for path in self._folder.glob(f"*/{GROUP_FILE}")))
@@ -170,7 +153,7 @@ def read_attributes(group: Path) -> dict[str, Any]:
         DatasetError: The group's zarr.json is missing or damaged.
     """
     path = group / GROUP_FILE
-    return decode_json(read_file(path, _MAX_METADATA, DatasetError), _GroupMetadata, path, DatasetError, ADVICE).attributes
+    return decode_json(read_file(path, MAX_METADATA, DatasetError), _GroupMetadata, path, DatasetError, ADVICE).attributes
 
 
 def read_array(array: zarr.Array) -> np.ndarray:

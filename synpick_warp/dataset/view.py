@@ -14,7 +14,6 @@ from msgspec import UNSET
 
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
-from synpick_warp.dataset.bop.arrays import instance_ids
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import ConfigError, DatasetError, format_value, suggest
 from synpick_warp.views.layer_codec import decode_layer, image_format
@@ -181,8 +180,8 @@ class View:
 
     @cached_property
     def instance_ids(self) -> np.ndarray:
-        """Track id of each instance (N) int64: the same object through its whole episode and in all cameras; see `instance_ids`."""
-        ids = instance_ids([(row["obj_id"], row.get("instance_id", UNSET)) for row in self.records.gt], self._files.lenient)
+        """Track id of each instance (N) int64: the same object in its whole episode and in all cameras; see `SceneFiles.instance_ids`."""
+        ids = self._files.instance_ids([(row["obj_id"], row.get("instance_id", UNSET)) for row in self.records.gt])
         if ids is None:
             raise DatasetError(f"{self._files.place}: an instance of image {self.image_id} has no instance_id; {ADVICE}")
         return np.array(ids, np.int64)
@@ -256,18 +255,14 @@ class View:
 
     @cached_property
     def graspable(self) -> np.ndarray:
-        """Simulated success at tried pixels (H, W) float32; NaN elsewhere. See `grasp_maps.graspable_map`; errors as of `picks`."""
-        from synpick_warp.dataset.grasp_maps import graspable_map
-
+        """Simulated success at tried pixels (H, W) float32; NaN elsewhere. See `graspable_map`; errors as of `picks`."""
         picks = self.picks
         states = self._owner.pick_states if self._owner else ()
         return graspable_map(self, picks, hides=any(each.frame == self.frame and each.camera != self.camera for each in states))
 
     @property
     def suctions(self) -> np.ndarray:
-        """Grasp candidates as suctionnetAPI has them (candidate, 7) float32; see `grasp_maps.suction_group`, errors as of `picks`."""
-        from synpick_warp.dataset.grasp_maps import suction_group
-
+        """Grasp candidates as suctionnetAPI has them (candidate, 7) float32; see `suction_group`, errors as of `picks`."""
         return suction_group(self, self.picks)
 
     def _column(self, record: str, key: str, dtype: type) -> np.ndarray:
@@ -321,3 +316,56 @@ def make_transform(rotation: Any, translation: Any) -> np.ndarray:
     transform[:3, :3] = np.reshape(np.asarray(rotation, np.float64), (3, 3))
     transform[:3, 3] = np.asarray(translation, np.float64) / MILLIMETERS
     return transform
+
+
+def mean_by_candidate(picks: np.ndarray, name: str = "success") -> tuple[np.ndarray, np.ndarray]:
+    """Group trials by candidate: the first trial of each, and the mean of a column over its repeats.
+
+    Returns:
+        Index of the first trial of each candidate (candidate) int64, and means (candidate) float64.
+    """
+    _, first, which = np.unique(picks[["state", "candidate"]], return_index=True, return_inverse=True)
+    return first, np.bincount(which, picks[name], len(first)) / np.bincount(which, minlength=len(first))
+
+
+def candidates(picks: np.ndarray) -> np.ndarray:
+    """The first trial of each candidate, with the columns of a trial, in the order of `mean_by_candidate`."""
+    return picks[mean_by_candidate(picks)[0]]
+
+
+def find_pixels(view: View, picks: np.ndarray) -> np.ndarray:
+    """Project grasp points to pixels of a view: column, row (trial, 2) int64; points may be hidden, or outside of the image."""
+    return np.floor(view.project(picks["point"], view.world_to_camera)).astype(np.int64)
+
+
+def graspable_map(view: View, picks: np.ndarray, hides: bool) -> np.ndarray:
+    """Sparse success map (H, W) float32: share of the trials at a pixel that held an object; NaN: not tried.
+
+    Args:
+        view: The view.
+        picks: Trials from its frame.
+        hides: Whether to leave out (NaN) grasp points that the view does not show: for other cameras than the candidates'.
+    """
+    width, height = view.size
+    result = np.full((height, width), np.nan, np.float32)
+    if not len(picks):
+        return result
+    pixels = find_pixels(view, picks)
+    inside = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+    flat, which = np.unique(pixels[inside, 0] + width * pixels[inside, 1], return_inverse=True)
+    means = np.bincount(which, picks["success"][inside], len(flat)) / np.bincount(which, minlength=len(flat))
+    result.ravel()[flat] = means
+    for instance in np.unique(picks["instance"]).tolist() if hides else ():
+        own = np.unique(flat[which[picks["instance"][inside] == instance]])
+        shown = view.masks[view.instance_ids == instance].any(axis=0).ravel()[own]
+        result.ravel()[own[~shown]] = np.nan
+    return result
+
+
+def suction_group(view: View, picks: np.ndarray) -> np.ndarray:
+    """Candidates as an array of suctionnetAPI (candidate, 7) float32: share of successful trials, direction (outward normal) and
+    translation (grasp point) [m] in the camera frame."""
+    first, success = mean_by_candidate(picks)
+    rotation, offset = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
+    rows = (success, picks["normal"][first] @ rotation.T, picks["point"][first] @ rotation.T + offset)
+    return np.column_stack(rows).astype(np.float32)

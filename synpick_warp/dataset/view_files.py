@@ -13,25 +13,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec import UNSET
 
 from synpick_warp.dataset.annotations import (
     ADVICE,
     GRAPH_SCHEMA,
-    LENIENT_SCENE_SCHEMAS,
-    LENIENT_VIEW_SCHEMAS,
     MASK_SCHEMA,
-    SCENE_SCHEMAS,
     VIEW_SCHEMAS,
+    Key,
     check_json,
     read_checked,
 )
-from synpick_warp.dataset.bop.folders import Listing
-from synpick_warp.dataset.bop.images import COLOR, FolderImages, KeyedImages
-from synpick_warp.dataset.bop.layout import SceneRef
-from synpick_warp.dataset.bop.measured import UNKNOWN, measure_info
+from synpick_warp.dataset.bop.images import COLOR, KeyedImages
+from synpick_warp.dataset.bop.layout import Listing, SceneRef
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file_if_present
-from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, decode_picture, image_size
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_picture, image_size
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
@@ -45,25 +42,25 @@ class ViewRecords(NamedTuple):
 
     camera: dict[str, Any]
     gt: list[dict[str, Any]]
-    """One per instance."""
     gt_info: list[dict[str, Any]]
-    """One per instance, in the same order."""
 
 
 class SceneFiles(ABC):
     """Files of one scene: all frames of one camera in one episode.
 
-    A scene of a bake has all parts, and images of one size. A lenient scene is from another source: parts may be missing, images may have
-    any format that BOP data sets have, and grey images stand in for colour.
+    A scene has all parts, as those of a bake; `bop.foreign` completes scenes from other sources.
     """
 
-    def __init__(self, size: tuple[int, int] | None, lenient: bool = False) -> None:
-        """
-        Args:
-            size: Width and height of the camera's images [px]; None: not checked.
-            lenient: Whether parts may be missing.
-        """
-        self.size, self.lenient = size, lenient
+    schemas: Mapping[str, Any] = VIEW_SCHEMAS
+    """Schema of a frame's annotations by name."""
+    complete = True
+    """Whether parts that are missing are a fault."""
+    advice = "; the data set is not complete"
+    """End of the message on a missing image, whose path ends in ".png or .jpg"."""
+
+    def __init__(self, size: tuple[int, int] | None) -> None:
+        """Scene of images of this width and height [px]; None: that of each frame's first image."""
+        self.size = size
         self._frame_size: tuple[int, tuple[int, int]] | None = None
 
     @property
@@ -81,7 +78,7 @@ class SceneFiles(ABC):
 
     @abstractmethod
     def layers(self) -> set[str]:
-        """Names of image types besides colour, depth and masks; none of a lenient scene, where such folders may have any content."""
+        """Names of image types besides colour, depth and masks."""
 
     @abstractmethod
     def _part(self, name: str, frame: int) -> Any:
@@ -115,22 +112,17 @@ class SceneFiles(ABC):
         return found or {}
 
     def records(self, frame: int) -> ViewRecords:
-        """Annotations of a frame. A lenient scene may lack scene_gt_info: it is measured from visible masks, or without these UNKNOWN."""
+        """Annotations of a frame."""
         camera, gt, info = (self._part(name, frame) for name in RECORD_NAMES)
-        if not self.lenient:
-            if camera is None or gt is None or info is None or len(gt) != len(info):
-                names = "scene_camera.json, scene_gt.json and scene_gt_info.json"
-                raise DatasetError(f"{self.place}: {names} do not agree about image {frame}")
-            return ViewRecords(camera, gt, info)
-        if gt is None and info:
-            raise DatasetError(f"there is no file {self.place}/scene_gt.json, but a scene_gt_info.json")
-        gt = gt or []
-        if info is not None and len(info) != len(gt):
-            raise DatasetError(f"{self.place}: scene_gt.json and scene_gt_info.json do not agree about image {frame}")
-        if info is None and gt and self.has("mask_visib"):
-            amodal = self.masks("mask", frame, len(gt)) if self.has("mask") else None
-            info = measure_info(self.masks("mask_visib", frame, len(gt)), amodal)
-        return ViewRecords(self.camera(frame), gt, [dict(UNKNOWN) for _ in gt] if info is None else info)
+        if camera is None or gt is None or info is None or len(gt) != len(info):
+            names = "scene_camera.json, scene_gt.json and scene_gt_info.json"
+            raise DatasetError(f"{self.place}: {names} do not agree about image {frame}")
+        return ViewRecords(camera, gt, info)
+
+    def instance_ids(self, instances: Sequence[tuple[int, Any]]) -> list[int] | None:
+        """Ids of the instances of an image from the obj_id and instance_id, or UNSET, of each; None: they have none."""
+        ids = [instance for _, instance in instances]
+        return None if UNSET in ids else ids
 
     def graph(self, frame: int) -> dict[str, Any] | None:
         """A frame's entry in scene_graph.json; None: there is none, as in shards."""
@@ -144,12 +136,8 @@ class SceneFiles(ABC):
         return found
 
     def image(self, name: str, frame: int) -> np.ndarray:
-        """Decoded image "rgb", "depth" or a layer (H, W[, C]), as stored, blue first; lenient: "rgb" is converted to (H, W, 3) uint8."""
+        """Decoded image "rgb", "depth" or a layer (H, W[, C]), as stored, blue first."""
         _, data, source = self._need(name, frame)
-        if not self.lenient:
-            return decode_image(data, source, DatasetError, size=self.size)
-        if name == "rgb":
-            return to_color(decode_picture(data, source, DatasetError))
         return decode_picture(data, source, DatasetError, self.image_size(frame))
 
     def typed_image(self, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
@@ -159,7 +147,7 @@ class SceneFiles(ABC):
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """Suffix and content of an image's file; raises DatasetError unless its header states the scene's size. `name` as for `image`."""
         suffix, data, source = self._need(name, frame)
-        return suffix, check_stated_size(data, self.image_size(frame) if self.lenient else self.size, source)
+        return suffix, _check_stated_size(data, self.image_size(frame), source)
 
     def image_size(self, frame: int) -> tuple[int, int]:
         """Width and height of a frame's images [px]: of colour, or else depth, or else the first mask."""
@@ -184,25 +172,24 @@ class SceneFiles(ABC):
 class SceneFolder(SceneFiles):
     """A BOP "scenewise" folder: one file per image and mask."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "", images: FolderImages | None = None) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "") -> None:
         """
         Args:
             folder: Scene folder, such as DATA/train_pbr/000000.
-            size: Width and height of the camera's images [px]; None: not checked.
+            size: See `SceneFiles`.
             suffix: Suffix of the files of one sensor, such as "_cam1"; empty: the classic layout.
-            images: Names of files that may be written otherwise; None: the scene is not lenient.
         """
-        super().__init__(size, images is not None)
-        self.folder, self.suffix, self._images = folder, suffix, images
+        super().__init__(size)
+        self.folder, self.suffix = folder, suffix
 
     @property
     def place(self) -> Path:
-        """The scene's folder. See `SceneFiles`."""
+        """The scene's folder."""
         return self.folder
 
     def images(self, name: str) -> Path:
         """Folder of one kind of images, such as "rgb"."""
-        return self.folder / (f"{name}{self.suffix}" if self._images is None else self._images.folder(name))
+        return self.folder / f"{name}{self.suffix}"
 
     def annotations(self, name: str) -> Path:
         """Path of an annotation file: "camera", "gt", "gt_info" or "graph"."""
@@ -210,10 +197,10 @@ class SceneFolder(SceneFiles):
 
     @cached_property
     def _records(self) -> list[dict[int, Any] | None]:
-        """Annotations by image of each of RECORD_NAMES; None: a lenient scene has no such file, others raise DatasetError."""
-        schemas = LENIENT_SCENE_SCHEMAS if self.lenient else SCENE_SCHEMAS
+        """Annotations by image of each of RECORD_NAMES; None: there is no such file, and need not be."""
         return [
-            read_checked(self.annotations(name), schemas[name]) if not self.lenient or self.has(name) else None for name in RECORD_NAMES
+            read_checked(self.annotations(name), dict[Key, self.schemas[name]]) if self.complete or self.has(name) else None
+            for name in RECORD_NAMES
         ]
 
     @cached_property
@@ -223,31 +210,20 @@ class SceneFolder(SceneFiles):
         return read_checked(path, GRAPH_SCHEMA) if path.exists() else {}
 
     def graph(self, frame: int) -> dict[str, Any] | None:
-        """Entry of a frame. See `SceneFiles`."""
         return self._graphs.get(frame)
 
     def _part(self, name: str, frame: int) -> Any:
-        """Record of a frame by name; None: none, but an empty list if a lenient gt or gt_info file exists without it. See `SceneFiles`."""
         part = self._records[RECORD_NAMES.index(name)]
-        return None if part is None else part.get(frame, [] if self.lenient and name != "camera" else None)
+        return None if part is None else part.get(frame)
 
     def frames(self) -> tuple[int, ...]:
-        """Sorted im_ids of the annotations, or without these of images. See `SceneFiles`."""
-        named = next((part for part in self._records[:2] if part is not None), None)
-        if named is None and self._images is not None:
-            named = {image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)}
-        return tuple(sorted(named or ()))
+        named = next((part for part in self._records[:2] if part is not None), {})
+        return tuple(sorted(named))
 
     def has(self, name: str) -> bool:
-        """Whether there is an annotation file or image folder of this name. See `SceneFiles`."""
-        if name in RECORD_NAMES:
-            return self.annotations(name).exists()
-        return any(self.images(kind).exists() for kind in (COLOR if self.lenient and name == "rgb" else (name,)))
+        return (self.annotations(name) if name in RECORD_NAMES else self.images(name)).exists()
 
     def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
-        """(suffix, content, source) of an image; None: there is none. See `SceneFiles`."""
-        if self._images is not None:
-            return self._images.find(name, frame, index)
         base = f"{self.folder}{os.sep}{name}{self.suffix}{os.sep}{_stem(frame, index)}"
         for suffix in SUFFIXES:
             data = read_file_if_present(f"{base}{suffix}", MAX_IMAGE_FILE, DatasetError)
@@ -256,32 +232,23 @@ class SceneFolder(SceneFiles):
         return None
 
     def _missing(self, name: str, frame: int, index: int | None = None) -> str:
-        """Message on a missing image. See `SceneFiles`."""
-        base, folder = self.images(name) / _stem(frame, index), self.images(name)
-        if self.lenient:
-            return f"there is no {base}.png or .jpg or .tif"
-        if index is not None and not folder.is_dir():
+        folder = self.images(name)
+        if index is not None and self.complete and not folder.is_dir():
             return f"{self.folder} has no {folder.name}; bake with bop.masks = true"
-        return f"there is no {base}.png or .jpg; the data set is not complete"
+        return f"there is no {folder / _stem(frame, index)}.png or .jpg{self.advice}"
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """Decoded mask (H, W) bool; lenient: of any channels. See `SceneFiles`."""
         _, data, source = self._need(name, frame, index)
-        if not self.lenient:
-            return check_planes(decode_image(data, source, DatasetError, size=self.size), None, source) > 0
-        mask = decode_picture(data, source, DatasetError, self.image_size(frame)) > 0
-        return mask if mask.ndim == 2 else np.asarray(mask.any(axis=2))
+        return check_planes(decode_picture(data, source, DatasetError, self.image_size(frame)), None, source) > 0
 
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
-        """Part of a mask, bool; of a PNG only these rows are decoded. See `SceneFiles`."""
         suffix, data, _ = self._need(name, frame, index)
         crop = decode_grey_crop(data, self.image_size(frame), rows, columns) if suffix == ".png" else None
         return self.mask(name, frame, index)[rows, columns] if crop is None else crop > 0
 
     def layers(self) -> set[str]:
-        """Names of the scene's layer folders; lenient: none. See `SceneFiles`."""
         names = {path.name for path in self.folder.iterdir() if path.is_dir() and path.name.endswith(self.suffix)}
-        return set() if self.lenient else {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
+        return {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
 
 
 class SceneShards(SceneFiles):
@@ -292,10 +259,10 @@ class SceneShards(SceneFiles):
         Args:
             shards: The scene's tar files; of the imagewise layout its folder.
             scene: Index of the scene, with which keys begin.
-            size: Width and height of the camera's images [px]; None: not checked.
-            images: Members that may be missing, or of other formats; None: the scene is not lenient.
+            size: See `SceneFiles`.
+            images: Members of the scene; None: those of the shards.
         """
-        super().__init__(size, images is not None)
+        super().__init__(size)
         self.shards, self.scene = tuple(shards), scene
         names = tuple(shard.name for shard in shards)
         self._images = images or KeyedImages(Listing(self.shards[0].parent, ""), SceneRef("", scene, "", "", names))
@@ -303,36 +270,33 @@ class SceneShards(SceneFiles):
 
     @property
     def place(self) -> Path:
-        """The first shard. See `SceneFiles`."""
+        """The first shard."""
         return self.shards[0]
 
     def frames(self) -> tuple[int, ...]:
-        """Sorted im_ids of the views that have camera.json, else gt.json, else (only if lenient) images. See `SceneFiles`."""
+        """Sorted im_ids of the views that have camera.json, else gt.json."""
         for name in ("camera.json", "gt.json"):
             if found := [frame for frame, content in self._images.members if content == name]:
                 return tuple(sorted(found))
-        return tuple(sorted({image for kind in (*COLOR, "depth") for image, _ in self._images.indices(kind)} if self.lenient else ()))
+        return ()
 
     def has(self, name: str) -> bool:
-        """Whether any view has a member of this name. See `SceneFiles`."""
-        kinds = COLOR if self.lenient and name == "rgb" else (name,)
+        """Whether any view has a member of this name."""
+        kinds = COLOR if name == "rgb" else (name,)
         return any(content.partition(".")[0] in kinds for _, content in self._images.members)
 
     def _part(self, name: str, frame: int) -> Any:
-        """Record of a frame by name, checked by its schema; None: there is none. See `SceneFiles`."""
-        return self._json(frame, name, (LENIENT_VIEW_SCHEMAS if self.lenient else VIEW_SCHEMAS)[name])
+        return self._json(frame, name, self.schemas[name])
 
     def _find(self, name: str, frame: int, index: int | None = None) -> tuple[str, bytes, str] | None:
-        """(suffix, content, source) of an image; None for masks, which are run lengths here. See `SceneFiles`."""
+        """(suffix, content, source) of an image; None for masks, which are run lengths here."""
         return None if name.startswith("mask") else self._images.find(name, frame, index)
 
     def _missing(self, name: str, frame: int, index: int | None = None) -> str:
-        """Message on a missing image. See `SceneFiles`."""
-        advice = " or .jpg or .tif" if self.lenient else "; the data set is not complete"
-        return f"{self.shards[0].parent} has no {self.scene:06d}_{frame:06d}.{name}.png{advice}"
+        return f"{self.shards[0].parent} has no {self.scene:06d}_{frame:06d}.{name}.png or .jpg{self.advice}"
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
-        """Decoded masks 0 to count - 1; raises DatasetError if one is missing, others are ignored. See `SceneFiles`."""
+        """Decoded masks 0 to count - 1; raises DatasetError if one is missing, others are ignored."""
         if (runs := self._read_runs(name, frame)) is None:
             raise DatasetError(f"{self.shards[0]} has no {name}; bake with bop.masks = true")
         if missing := set(range(count)) - set(runs):
@@ -341,16 +305,13 @@ class SceneShards(SceneFiles):
         return super().masks(name, frame, count)
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
-        """Mask (H, W) bool, decoded from run lengths. See `SceneFiles`."""
         runs = (self._read_runs(name, frame) or {}).get(index)
         if runs is None:
             raise DatasetError(f"{self.shards[0]} has no {name} of instance {index} in image {frame}; bake with bop.masks = true")
-        size = self.image_size(frame) if self.lenient else self.size
-        check_run_lengths(runs, size, f"{self._source(self._images.file(name, frame, index))},")
+        check_run_lengths(runs, self.image_size(frame), f"{self._source(self._images.file(name, frame, index))},")
         return decode_run_lengths(runs["counts"], runs["size"])
 
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
-        """Part of a mask, bool; the whole mask is decoded. See `SceneFiles`."""
         return self.mask(name, frame, index)[rows, columns]
 
     def _read_runs(self, name: str, frame: int) -> dict[int, Any] | None:
@@ -360,16 +321,15 @@ class SceneShards(SceneFiles):
         return self._runs[1]
 
     def _read_size(self, frame: int) -> tuple[int, int]:
-        """Width and height of a view [px]; without images those of its first mask. See `SceneFiles`."""
+        """Width and height of a view [px]; without images those of its first mask."""
         for name in ("mask", "mask_visib") if not (self.has("rgb") or self.has("depth")) else ():
             for runs in (self._read_runs(name, frame) or {}).values():
                 return tuple(runs["size"][::-1])
         return super()._read_size(frame)
 
     def layers(self) -> set[str]:
-        """Names of layers by the members' suffixes; lenient: none. See `SceneFiles`."""
         names = {content for _, content in self._images.members}
-        return set() if self.lenient else {Path(name).stem for name in names if name.endswith(SUFFIXES)} - {"rgb", "depth"}
+        return {Path(name).stem for name in names if name.endswith(SUFFIXES)} - {"rgb", "depth"}
 
     def _json(self, frame: int, name: str, schema: Any) -> Any:
         """Checked content of a JSON member; None: there is none."""
@@ -386,19 +346,10 @@ def _stem(frame: int, index: int | None) -> str:
     return f"{frame:06d}" if index is None else f"{frame:06d}_{index:06d}"
 
 
-def to_color(image: np.ndarray) -> np.ndarray:
-    """An image (H, W[, C]) as colour (H, W, 3) uint8: grey in all channels, without alpha, of 16 bits the upper 8."""
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    if image.ndim == 2:
-        return np.repeat(image[..., None], 3, axis=2)
-    return np.ascontiguousarray(image[..., :3]) if image.shape[2] == 4 else image
-
-
-def check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
-    """Return an image file's content; raises DatasetError if its header is no image's or states another size (None: any)."""
+def _check_stated_size(data: bytes, size: tuple[int, int], source: object) -> bytes:
+    """Return an image file's content; raises DatasetError if its header is no image's or states another size."""
     stated = image_size(data)
-    if stated is None or (size is not None and stated != size):
+    if stated != size:
         there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
         raise DatasetError(f"{source} {there}")
     return data

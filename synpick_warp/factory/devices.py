@@ -26,9 +26,8 @@ import warp as wp
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.digests import digest_inputs
 from synpick_warp.dataset.commit.manifest import committed_episodes
-from synpick_warp.dataset.commit.writing import OutputFolder
+from synpick_warp.dataset.commit.writing import OutputFolder, digest_inputs
 from synpick_warp.errors import DeviceError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting

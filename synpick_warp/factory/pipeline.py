@@ -15,10 +15,9 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.digests import digest_inputs
-from synpick_warp.dataset.commit.file_names import describe_strays
 from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_entry
-from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set
+from synpick_warp.dataset.commit.plausibility import describe_strays
+from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, digest_inputs, finalize_data_set
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting

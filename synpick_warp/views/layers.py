@@ -29,9 +29,7 @@ SCENE_FLOW_STEP = 2e-5
 
 @dataclass(frozen=True)
 class Layer:
-    """Annotation layer (AOV): type, components and unit of its values, meaning of the value that stands for none, and encoding in PNG
-    files.
-    """
+    """Annotation layer (AOV)."""
 
     dtype: str
     """Type of the values, in device buffers, in `FrameBatch.layers` and as decoded: a NumPy name."""

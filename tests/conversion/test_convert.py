@@ -59,7 +59,7 @@ def assets(monkeypatch):
     monkeypatch.setattr("synpick_warp.scenes.catalog.load_catalog", lambda _: box_views.catalog())
     monkeypatch.setattr("synpick_warp.scenes.lights.load_lights", lambda _: skies())
     monkeypatch.setattr("synpick_warp.scenes.cameras.make_cameras", lambda _: box_views.cameras(16, 12))
-    monkeypatch.setattr("synpick_warp.dataset.commit.digests.digest_inputs", lambda *_: INPUTS)
+    monkeypatch.setattr("synpick_warp.dataset.commit.writing.digest_inputs", lambda *_: INPUTS)
 
 
 def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
@@ -181,7 +181,7 @@ def test_keypoints_need_the_objects_of_the_bake(sets, tmp_path, assets, monkeypa
     truth.write_text(truth.read_text().replace('"obj_id":7', '"obj_id":8'))
     with pytest.raises(DatasetError, match="obj_id 8, which is none of the bake's objects"):
         run(source, tmp_path / "first", "coco")
-    monkeypatch.setattr("synpick_warp.dataset.commit.digests.digest_inputs", lambda *_: {"objects": "other"})
+    monkeypatch.setattr("synpick_warp.dataset.commit.writing.digest_inputs", lambda *_: {"objects": "other"})
     with pytest.raises(DatasetError, match="have changed since its bake"):
         run(sets["keypoints"], tmp_path / "second", "coco")
 
@@ -193,7 +193,7 @@ def test_output_folders_lie_apart_from_the_source(sets, place):
 
 
 def test_changed_objects_are_refused_for_usd(sets, tmp_path, assets, monkeypatch):
-    monkeypatch.setattr("synpick_warp.dataset.commit.digests.digest_inputs", lambda *_: {"objects": "other"})
+    monkeypatch.setattr("synpick_warp.dataset.commit.writing.digest_inputs", lambda *_: {"objects": "other"})
     with pytest.raises(DatasetError, match="have changed since its bake"):
         run(sets["source"], tmp_path / "out", "usd")
     assert not (tmp_path / "out").exists()

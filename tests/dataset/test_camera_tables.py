@@ -1,4 +1,5 @@
-"""A bake of cameras of three sizes, with matrix, field of view and lens, in every format, read back by other libraries."""
+"""A bake of cameras of three sizes, with matrix, field of view and lens, in every format, read back by other libraries;
+and of a lens as it is and rectified."""
 
 from __future__ import annotations
 
@@ -18,6 +19,7 @@ import synpick_warp
 from synpick_warp.configs.schema import FORMATS
 from tests.builders import once, run
 from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, make_camera
+from tools.checks.dataset import check
 
 CAMERAS = (
     make_camera("left", **SIDE, matrix=camera_matrix(82.5, 82.38, 49.14, 35.25)),
@@ -132,3 +134,20 @@ def test_zarr_and_lerobot_have_cameras_of_their_sizes(cell):
         (video,) = cell.rglob(f"observation.images.{name}/**/*.mp4")
         with av.open(str(video)) as container:
             assert {(frame.width, frame.height) for frame in container.decode(video=0)} == {(width, height)}
+
+
+BENT = make_camera("bent", **SIDE, matrix=MATRICES[0].tolist(), distortion=[-0.3, 0.08, 0.0005, -0.0003]), make_camera("flat", fov=40.0)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rectified):
+    bake_cell(tmp_path / "set", cell_config(BENT, **{"bop.rectified": rectified, "bake.formats": ["bop", "shards"]}))
+    bent, flat = (json.loads((tmp_path / f"set/train/{scene:06d}/scene_camera.json").read_text())["0"] for scene in (0, 1))
+    assert bent["cam_K"] == np.ravel(MATRICES[0]).tolist()
+    assert (bent.get("cam_dist"), flat.get("cam_dist")) == (None if rectified else [-0.3, 0.08, 0.0005, -0.0003], None)
+    assert ("cam_dist" in (tmp_path / "set/camera_bent.json").read_text()) is not rectified
+    assert all(line.holds for line in vars(check(tmp_path / "set", 4)).values())
+    for card in ("dataset_info.md", "README.md"):
+        lines = (tmp_path / "set" / card).read_text().splitlines()
+        (first,) = (lines[index + 2] for index, line in enumerate(lines) if line.startswith("# "))
+        assert first.startswith("**Pictures are rectified**" if rectified else "**Pictures are distorted** by the lens of bent:")

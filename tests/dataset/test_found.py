@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.dataset.bop.measured import measure_info
+from synpick_warp.dataset.bop.foreign import measure_info
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from tests.builders import run

@@ -18,8 +18,7 @@ from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest
-from synpick_warp.dataset.commit.digests import digest_inputs
-from synpick_warp.dataset.commit.writing import commit_episode
+from synpick_warp.dataset.commit.writing import commit_episode, digest_inputs
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.exporters.writing.files import PARTIAL

@@ -19,7 +19,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import picks as reader
-from synpick_warp.dataset.grasp_maps import find_pixels, mean_by_candidate
+from synpick_warp.dataset.view import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files

@@ -1,4 +1,5 @@
-"""Views read back from BOP folders and from shards: the arrays that went in, in metres, lazily, whatever the format."""
+"""Views read back from BOP folders and from shards: the arrays that went in, in metres, lazily, whatever the format;
+and tracks of instances over cameras and time."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.dataset.commit.manifest import episode_entry
+from synpick_warp.dataset.tracks import Tracks
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -180,3 +182,58 @@ def test_a_part_is_read_once(data):
     view = data[0].view(0)
     assert view.rgb is view.rgb
     assert view.rgb.flags.c_contiguous
+
+
+# ---- tracks ----
+
+SETS = {"bop": (BopExporter, {}), "shards": (ShardsExporter, {}), "multisensor": (BopExporter, {"layout": "multisensor"})}
+
+
+@pytest.fixture(scope="module", params=SETS)
+def tracked(request, tmp_path_factory):
+    """A data set in scene folders of both layouts, and in shards."""
+    exporter, bop = SETS[request.param]
+    return synpick_warp.open(write_set(tmp_path_factory.mktemp("tracks") / "set", exporter, **bop))
+
+
+def test_tracks_have_every_instance_in_every_camera_and_frame(tracked):
+    present = PRESENT.tolist()
+    for batch in batches(1, EPISODES, FRAMES, LENSES):
+        episode, camera, frame = int(batch.episode[0]), int(batch.camera[0]), int(batch.frame[0])
+        tracks = tracked[episode].tracks
+        view = tracked[episode].view(frame, camera)
+        assert list(tracks) == present
+        for row, instance in enumerate(present):
+            track = tracks[instance]
+            assert len(track) == FRAMES
+            assert track.object_id == OBJECT_IDS[instance]
+            assert track.present[frame]
+            np.testing.assert_allclose(track.object_to_world[frame, :3, 3], batch.pose[0, instance, :3], atol=1e-6)
+            np.testing.assert_array_equal(track.object_to_camera[camera, frame], view.object_to_camera[row])
+            assert track.visible_pixels[camera, frame] == batch.pixels[0, instance, 2] == view.masks[row].sum()
+            assert track.visibility[camera, frame] == view.visibility[row]
+            np.testing.assert_array_equal(track.boxes[camera, frame], view.boxes[row])
+            np.testing.assert_array_equal(track.visible_boxes[camera, frame], view.visible_boxes[row])
+
+
+def test_tracks_of_all_episodes_come_in_order(tracked):
+    assert [(episode.index, track.instance_id) for episode, track in tracked.tracks] == [(e, i) for e in EPISODES for i in (0, 2, 3)]
+
+
+def test_an_instance_that_left_has_no_poses_afterwards(tracked):
+    views = [view for view in tracked[0].views() if view.frame == 0]
+    track = Tracks(views, cameras=3, frames=2)[0]
+    assert track.present.tolist() == [True, False]
+    assert np.isnan(track.object_to_world[1]).all()
+    assert np.isnan(track.object_to_camera[:, 1]).all()
+    assert (track.boxes[:, 1] == -1).all()
+    assert repr(track) == "Track(instance 0, object 3, in 1 of 2 frames)"
+
+
+def test_views_of_all_layouts_have_images_masks_and_layers(tracked):
+    view = tracked[2].view(1, camera=2)
+    assert view.rgb.shape == (72, 96, 3)
+    assert view.layers == ("classes", "flow")
+    assert view.layer("classes").shape == view.depth.shape
+    assert view.masks.any()
+    assert not (view.masks & ~view.amodal_masks).any()

@@ -195,7 +195,7 @@ def crash(path: Path, unit: float) -> None:
 
 
 def test_a_model_whose_reader_crashes_is_one_line(bop, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("synpick_warp.apps.estimation.models.read_mesh", crash)
+    monkeypatch.setattr("synpick_warp.apps.estimation.gicp.read_mesh", crash)
     assert run(bop, "--method", "single", "--out", tmp_path / "out.csv") == 2
     line = capsys.readouterr().err
     assert re.search(r"obj_\d{6}\.ply: the process that reads it crashed \(SIGSEGV\); repair or simplify the file\n$", line)

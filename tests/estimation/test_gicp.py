@@ -7,10 +7,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
-from synpick_warp.apps.estimation.disturbance import OFFSET, TURN, disturb_pose
-from synpick_warp.apps.estimation.gicp import MIN_POINTS, Aligner
-from synpick_warp.apps.estimation.models import read_object_models
-from synpick_warp.apps.estimation.run import REFINE, SINGLE, Options, observed_points, read_scenes, run_estimation
+from synpick_warp.apps.estimation.gicp import MIN_POINTS, Aligner, read_object_models
+from synpick_warp.apps.estimation.run import (
+    OFFSET,
+    REFINE,
+    SINGLE,
+    TURN,
+    Options,
+    disturb_pose,
+    observed_points,
+    read_scenes,
+    run_estimation,
+)
 from synpick_warp.apps.estimation.scenes import ScenePlan
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.worlds.box_sets import write_set

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import os
 import shlex
 import shutil
 import subprocess
 from types import SimpleNamespace
 
 import cv2
+import numpy as np
 import pytest
 
 import synpick_warp
@@ -250,3 +253,28 @@ def test_methods_of_odd_names_have_pictures_of_their_own(folder, files, tmp_path
     ending = "scene_000000_instance_3.png"
     names = {path.name for path in (tmp_path / "plots").glob("trajectory*")}
     assert names == {f"trajectory_{number}_{name}_{ending}" for number, name in ((1, "Ground_truth"), (2, "a_b"), (3, "a_b"))}
+
+
+@pytest.fixture(scope="module", params=["bop,zarr", "shards"])
+def baked(request, picked_set, tmp_path_factory):
+    others = ("train", "trajectory.zarr") if request.param == "shards" else ("train_web",)
+    return shutil.copytree(picked_set, tmp_path_factory.mktemp("baked") / "set", ignore=lambda *_: others, copy_function=os.link)
+
+
+def test_the_truth_of_a_bake_scores_100(baked, tmp_path, capsys):
+    data = synpick_warp.open(baked)
+    truth = read_truth(data)
+    assert len(truth.images) == sum(len(episode) for episode in data.values()) * data.camera_count
+    assert set(truth.mode) == {"pick"}
+    assert np.isfinite(truth.speed).all()
+    assert 0.0 <= truth.speed.min() <= truth.speed.max() < 10.0
+    results, table = tmp_path / "truth.csv", tmp_path / "table.csv"
+    write_results(results, truth.poses)
+    options = ("--format", "csv", "--out", str(table), "--visib-min", "0")
+    assert main(["eval", "--data", str(baked), "--results", str(results), *options]) == 0
+    capsys.readouterr()
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    values = [float(row[column]) for row in rows for column in row if column.startswith("ADD")]
+    assert (min(values), max(values)) == pytest.approx((100.0, 100.0))
+    labels = {row["label"] for row in rows if row["group"] == "object"}
+    assert labels <= ({"boxes_1", "boxes_2", "boxes_3"} if data.has_store else {"obj_000001", "obj_000002", "obj_000003"})

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.apps.evaluation import filter_poses, sweep_alpha
 from synpick_warp.apps.evaluation.figures import write_figures
 from synpick_warp.apps.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
+from synpick_warp.apps.evaluation.tracking import filter_poses, sweep_alpha
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.system.codecs.charts import (
     INK,
@@ -88,7 +88,7 @@ def test_fuzz_ticks_are_few_round_and_inside(low, span, count):
 
 def test_recall_is_the_fraction_of_errors_up_to_the_threshold():
     errors = np.array([0.02] * 30 + [0.06] * 20 + [np.inf] * 50)
-    picture = picture_of(plot_recall({"method": errors}))
+    picture = picture_of(plot_recall({"method": errors}, "ADD"))
     for threshold, recall in ((0.01, 0.0), (0.04, 0.3), (0.08, 0.5)):
         heights = rows_at(picture, LEFT + threshold / 0.1 * (RIGHT - LEFT), PALETTE[0], 600)
         assert heights.mean() == pytest.approx(recall, abs=0.01)
@@ -127,9 +127,9 @@ def test_the_order_of_rows_does_not_matter_to_a_trajectory():
 def test_bins_show_medians_with_misses_as_the_largest_error():
     speed = np.repeat([0.001, 0.7, 5.0], 10)
     errors = np.repeat([0.03, np.inf, np.inf], 10)
-    picture = picture_of(plot_error_by_speed(speed, {"method": errors}, edges=(0.0, 0.01, 1.0)))
+    picture = picture_of(plot_error_by_speed(speed, {"method": errors}, "ADD"))
     dots = near(picture, PALETTE[0])
-    for middle, share in ((0.25, 1 / 3), (0.75, 2 / 3)):
+    for middle, share in ((0.5 / 8, 1 / 3), (7.5 / 8, 2 / 3)):
         column = round(LEFT + middle * (RIGHT - LEFT))
         assert dots[: len(picture) - BOTTOM - 274, column].any()
         bar = near(picture, "#6e6e6e", 3)[-BOTTOM - 240 : -BOTTOM, column + 20].sum()
@@ -138,10 +138,10 @@ def test_bins_show_medians_with_misses_as_the_largest_error():
 
 def test_sweeps_ring_the_optimum():
     sweep = sweep_alpha(
-        {"move": true_poses(Motion(velocity=(1, 0, 0)))}, lambda table: -abs(table.translation[-1, 0] - 6.4), [0.1, 0.5, 1.0]
+        {"move": true_poses(Motion(velocity=(1, 0, 0)))}, lambda mode, table: -abs(table.translation[-1, 0] - 6.4), [0.1, 0.5, 1.0]
     )
     assert sweep.best("move")[0] == 0.5
-    picture = picture_of(plot_sweep(sweep))
+    picture = picture_of(plot_sweep(sweep, "score"))
     x = np.log([0.1 / 1.2, 0.5, 1.2])
     column = round(LEFT + (x[1] - x[0]) / (x[2] - x[0]) * (RIGHT - LEFT))
     drawn = near(picture, PALETTE[0])[80:-BOTTOM]
@@ -154,12 +154,12 @@ def test_long_and_strange_names_are_shortened_and_stay_distinct():
     names = ["W" * 99, "W" * 98 + "V" * 9 + "W" * 30, "Pick attempt"]
     shown = [Legend(dict.fromkeys(names, RED)).color(name)["datum"] for name in names]
     assert len(set(shown)) == 3
-    assert picture_of(plot_recall({"W" * count: np.zeros(1) for count in range(90, 99)})).shape[1] == WIDTH
+    assert picture_of(plot_recall({"W" * count: np.zeros(1) for count in range(90, 99)}, "ADD")).shape[1] == WIDTH
 
 
 def test_names_stand_in_values_only():
     evil = "datum['x'] + {'signal': 'width'}"
-    rest = plot_error_by_speed(np.ones(2), {evil: np.zeros(2)})
+    rest = plot_error_by_speed(np.ones(2), {evil: np.zeros(2)}, "ADD")
 
     def drop(part: object) -> object:
         if isinstance(part, dict):
@@ -171,7 +171,7 @@ def test_names_stand_in_values_only():
 
 
 def test_written_charts_read_back(tmp_path, monkeypatch):
-    spec = plot_recall({"method": np.array([0.01, 0.05])})
+    spec = plot_recall({"method": np.array([0.01, 0.05])}, "ADD")
     (tmp_path / "json.py").write_text("raise ImportError('of the current folder')")
     monkeypatch.chdir(tmp_path)
     first, second = render_charts([spec, spec])
@@ -186,7 +186,7 @@ def test_a_library_that_cannot_run_is_one_line(tmp_path, monkeypatch):
     (tmp_path / "vl_convert.py").write_text("raise ImportError")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     with pytest.raises(ChartError, match=r"^the charts' library vl-convert-python ended with exit code 1; .* install the package again$"):
-        render_charts([plot_recall({"method": np.array([0.01])})])
+        render_charts([plot_recall({"method": np.array([0.01])}, "ADD")])
 
 
 def test_a_file_that_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
@@ -199,26 +199,10 @@ def test_a_file_that_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder.png"]
 
 
-def test_what_cannot_be_drawn_is_refused():
+def test_a_trajectory_is_of_one_track():
     truth = true_poses(Motion(images=3))
-    empty = truth.select(np.arange(0))
-    twice = truth.select(np.array([0, 0, 1]))
-    errors = np.array([0.01, 0.02])
-    cases = [
-        (lambda: plot_trajectory(truth, empty, {}), "at least one true and one estimated"),
-        (lambda: plot_trajectory(truth, twice, {}), "Estimate has several rows of an image"),
-        (lambda: plot_trajectory(truth, truth, {"Estimate": truth}), "the same name"),
-        (lambda: plot_recall({"m": np.array([])}), "errors of m"),
-        (lambda: plot_recall({"m": np.array([np.nan])}), "errors of m"),
-        (lambda: plot_recall({"m": np.array([-1.0])}), "errors of m"),
-        (lambda: plot_error_by_visibility(np.ones(3), {"m": errors}), "m has 2 errors for 3 instances"),
-        (lambda: plot_error_by_visibility(np.array([0.5, np.nan]), {"m": errors}), "not finite"),
-        (lambda: plot_error_by_speed(np.ones(2), {"m": errors}, edges=[1.0]), "at least two, rising"),
-        (lambda: plot_error_by_speed(np.ones(2), {"m": errors}, edges=[1.0, 0.5]), "at least two, rising"),
-    ]
-    for call, message in cases:
-        with pytest.raises(DatasetError, match=message):
-            call()
+    with pytest.raises(DatasetError, match="Estimate has several rows of an image"):
+        plot_trajectory(truth, truth.select(np.array([0, 0, 1])), {})
 
 
 @given(st.data())
@@ -229,7 +213,7 @@ def test_fuzz_no_data_and_no_name_breaks_a_drawing(data):
     numbers = st.one_of(st.floats(0.0, 0.2), st.floats(0.0, 1e300), st.just(float("inf")))
     errors = {name: np.array(data.draw(st.lists(numbers, min_size=count, max_size=count))) for name in names}
     values = np.array(data.draw(st.lists(st.floats(-1e6, 1e6), min_size=count, max_size=count)))
-    pictures = [plot_recall(errors), plot_error_by_visibility(values, errors)]
+    pictures = [plot_recall(errors, "ADD"), plot_error_by_visibility(values, errors, "ADD")]
     motion = Motion(images=count, velocity=tuple(data.draw(st.floats(-1e5, 1e5)) for _ in range(3)))
     truth = true_poses(motion)
     table = estimates(truth, data.draw(st.integers(0, 99)), noise=data.draw(st.floats(0.0, 10.0)))
@@ -238,8 +222,7 @@ def test_fuzz_no_data_and_no_name_breaks_a_drawing(data):
         name: float(score) for name, score in zip(names, data.draw(st.lists(st.floats(-1e6, 1e6), min_size=9, max_size=9)), strict=False)
     }
     alphas = data.draw(st.lists(st.floats(1e-6, 1.0), min_size=1, max_size=4))
-    functions = {name: lambda _, score=score: score for name, score in scores.items()}
-    pictures.append(plot_sweep(sweep_alpha(dict.fromkeys(scores, truth), functions, alphas)))
+    pictures.append(plot_sweep(sweep_alpha(dict.fromkeys(scores, truth), lambda mode, _: scores[mode], sorted(set(alphas))), "score"))
     for picture in (picture_of(each, 1.0) for each in pictures):
         assert WIDTH - 4 <= SCALE * picture.shape[1] <= 1.2 * WIDTH  # Labels of large numbers widen it, and bounds are rounded.
         assert near(picture, INK).any()

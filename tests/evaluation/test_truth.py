@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import synpick_warp
-from synpick_warp.apps.evaluation import filter_poses
 from synpick_warp.apps.evaluation.models import read_models
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.results import ResultFile
+from synpick_warp.apps.evaluation.tracking import filter_poses
 from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
 from synpick_warp.cli.commands.evaluate import make_methods
 from synpick_warp.errors import CatalogError, DatasetError

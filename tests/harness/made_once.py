@@ -12,7 +12,7 @@ from contextlib import contextmanager
 import pytest
 from newton._src.geometry import narrow_phase
 
-from synpick_warp.apps.conversion import found, run
+from synpick_warp.apps.conversion import foreign, run
 from synpick_warp.apps.evaluation import figures
 from synpick_warp.apps.viz import explain
 from synpick_warp.dataset.commit import merge
@@ -70,7 +70,7 @@ def written_here() -> Iterator[None]:
         return WriterPool(processes if processes > 1 else 0, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (pipeline, run, found, merge):
+        for module in (pipeline, run, foreign, merge):
             patch.setattr(module, "WriterPool", pool)
         for module in (explain, figures):
             patch.setattr(module, "render_charts", render_here)

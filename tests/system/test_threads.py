@@ -13,7 +13,8 @@ import pytest
 import rich.progress
 import zarr
 
-from synpick_warp.dataset.stored_array import open_stored_array
+from synpick_warp.dataset.stored_array import open_array
+from synpick_warp.dataset.trajectory import GroupContext
 from synpick_warp.system.processes import threads
 from synpick_warp.system.processes.garbage import collection_paused
 
@@ -59,7 +60,7 @@ def test_unknown_threads_may_launch_kernels(name, only):
 
 def test_reading_a_zarr_array_starts_harmless_threads(tmp_path):
     zarr.save_array(tmp_path / "array", np.arange(10_000, dtype=np.float32))
-    assert open_stored_array(tmp_path / "array")[5] == 5.0
+    assert open_array(tmp_path / "array", None, GroupContext())[5] == 5.0
     assert any(thread.name.startswith("zarr_") for thread in threading.enumerate())
     assert threads.is_only_launcher()
 

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.validation.deviations import distributions
 from synpick_warp.apps.validation.diagnosis import DiagnosedView
-from synpick_warp.apps.validation.pictures import crop_mask
-from synpick_warp.apps.validation.registry import Tolerance, load_rules
-from synpick_warp.apps.validation.rules.masks import _farthest
+from synpick_warp.apps.validation.registry import Tolerance, distributions, load_rules
+from synpick_warp.apps.validation.rules.images import _farthest
 from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.scene_files import crop_mask
 from tests.validation.faults import masks_swapped
 from tests.validation.planting import SCENE, edit_entry
 

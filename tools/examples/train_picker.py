@@ -35,8 +35,8 @@ except ModuleNotFoundError as missing:
 import synpick_warp
 from synpick_warp.apps.statistics.ranking import Interval, Scored, estimate, weighted_auc
 from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.dataset.grasp_maps import find_pixels
 from synpick_warp.dataset.reading import Episode
+from synpick_warp.dataset.view import find_pixels
 from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.environment.settings import ATTEMPT, DISABLED, PICK, PIXEL, POINT, TARGET, TORCH, make_choice

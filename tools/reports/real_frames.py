@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.validation.rendering import ObjectRenderer
+from synpick_warp.dataset.bop.foreign import measure_info
 from synpick_warp.dataset.bop.layout import Layout
-from synpick_warp.dataset.bop.measured import measure_info
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.system.inputs.image_files import decode_image

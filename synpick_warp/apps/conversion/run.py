@@ -7,9 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-from synpick_warp.apps.conversion.context import StoredContext
-from synpick_warp.apps.conversion.found import convert_found
-from synpick_warp.apps.conversion.source import Source
+from synpick_warp.apps.conversion.foreign import convert_foreign
+from synpick_warp.apps.conversion.source import Source, StoredContext
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
@@ -31,9 +30,7 @@ class Converted(NamedTuple):
     """Result of a conversion: numbers of episodes of the converted data set and of those that earlier runs had converted, and a remark."""
 
     episodes: int
-    """Episodes of the converted data set."""
     resumed: int
-    """Those of earlier runs."""
     remark: str = ""
     """What was made that the source does not have."""
 
@@ -57,7 +54,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     data = open_data_set(folder)
     if data.found is not None:
         _check_apart(folder, out)
-        count, remark = convert_found(data if split is None else data.split(split), out, formats, processes, report)
+        count, remark = convert_foreign(data if split is None else data.split(split), out, formats, processes, report)
         return Converted(count, 0, remark)
     if split is not None:
         raise ConfigError("--split is for data sets from other sources; those of synpick-warp bake are converted as a whole")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,27 +14,6 @@ from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
-
-
-@dataclass(frozen=True, eq=False)
-class StoredSceneFiles:
-    """`StoredScene` of a scene folder or of shards."""
-
-    files: SceneFiles
-    """Files of the scene; none has been read yet, so that this is small when pickled."""
-    scene: int
-    """BOP scene_id."""
-    images: Sequence[int]
-    """BOP im_id of each frame."""
-
-    @property
-    def frames(self) -> int:
-        """Number of frames. See `StoredScene`."""
-        return len(self.images)
-
-    def views(self, frames: range) -> Iterator[StoredViewFiles]:
-        """Views of these frames (indices, not im_ids). See `StoredScene`."""
-        return (StoredViewFiles(self.files, self.scene, self.images[frame]) for frame in frames)
 
 
 class StoredViewFiles:
@@ -56,51 +35,51 @@ class StoredViewFiles:
 
     @property
     def camera(self) -> dict[str, Any]:
-        """Entry in scene_camera.json. See `EncodedView`."""
+        """Entry in scene_camera.json."""
         return self._records.camera
 
     @property
     def gt(self) -> list[dict[str, Any]]:
-        """Entries in scene_gt.json, one per instance. See `EncodedView`."""
+        """Entries in scene_gt.json, one per instance."""
         return self._records.gt
 
     @property
     def gt_info(self) -> list[dict[str, Any]]:
-        """Entries in scene_gt_info.json, one per instance. See `EncodedView`."""
+        """Entries in scene_gt_info.json, one per instance."""
         return self._records.gt_info
 
     @property
     def graph(self) -> dict[str, Any] | None:
-        """Entry in scene_graph.json; None: there is none. See `EncodedView`."""
+        """Entry in scene_graph.json; None: there is none."""
         return self.files.graph(self.frame)
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """Suffix and bytes of the colour file, as stored. See `EncodedView`."""
+        """Suffix and bytes of the colour file, as stored."""
         return self.files.image_file("rgb", self.frame)
 
     @property
     def depth(self) -> Buffer:
-        """Bytes of the depth file (PNG), as stored. See `EncodedView`."""
+        """Bytes of the depth file (PNG), as stored."""
         return self.layer("depth")
 
     def layer(self, name: str) -> Buffer:
-        """Bytes of a layer's file, as stored; raises DatasetError if it is no PNG. See `StoredView`."""
+        """Bytes of a layer's file, as stored; raises DatasetError if it is no PNG."""
         suffix, data = self.files.image_file(name, self.frame)
         if suffix != ".png":
             raise DatasetError(f"{name} of image {self.frame} in {self.files.place} is a {suffix} file, expected: .png; {ADVICE}")
         return data
 
     def color_image(self) -> np.ndarray:
-        """Decoded colour image, sRGB, RGB order (H, W, 3) uint8. See `StoredView`."""
+        """Decoded colour image, sRGB, RGB order (H, W, 3) uint8."""
         return np.ascontiguousarray(self.files.typed_image("rgb", self.frame, 3, "uint8")[..., ::-1])
 
     def depth_image(self) -> np.ndarray:
-        """Decoded depth image (H, W) uint16 in counts. See `EncodedView`."""
+        """Decoded depth image (H, W) uint16 in counts."""
         return self.files.typed_image("depth", self.frame, None, "uint16")
 
     def masks(self) -> list[Masks]:
-        """Run lengths of the amodal and visible mask of each instance; decoded within its box where that suffices. See `EncodedView`."""
+        """Run lengths of the amodal and visible mask of each instance; decoded within its box where that suffices."""
         return [
             Masks(
                 self._read_runs("mask", index, info["bbox_obj"], info["px_count_valid"]),
@@ -119,3 +98,25 @@ class StoredViewFiles:
             if runs.count == count:
                 return runs
         return find_runs(self.files.mask(name, self.frame, index))
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSceneFiles:
+    """`StoredScene` of a scene folder or of shards."""
+
+    files: SceneFiles
+    """Files of the scene; none has been read yet, so that this is small when pickled."""
+    scene: int
+    """BOP scene_id."""
+    images: Sequence[int]
+    """BOP im_id of each frame."""
+    view: Callable[[SceneFiles, int, int], StoredViewFiles] = StoredViewFiles
+    """Opens a view, by the scene's files, scene_id and im_id."""
+
+    @property
+    def frames(self) -> int:
+        return len(self.images)
+
+    def views(self, frames: range) -> Iterator[StoredViewFiles]:
+        """Views of these frames (indices, not im_ids)."""
+        return (self.view(self.files, self.scene, self.images[frame]) for frame in frames)

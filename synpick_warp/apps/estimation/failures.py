@@ -12,7 +12,7 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.estimation.models import ObjectModel
+from synpick_warp.apps.estimation.gicp import ObjectModel
 from synpick_warp.apps.evaluation.auc import LIMIT
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.scoring import Scores
@@ -48,9 +48,7 @@ _HEADINGS = ("observed, with its mask", "estimate (red), truth (green)", "estima
 
 @dataclass(frozen=True, eq=False)
 class Failure:
-    """Row of an instance in the ground truth, row of the nearest estimate of its object in the image (-1: none), its error (infinity:
-    missed) and distance [m].
-    """
+    """An instance that a method has missed or estimated badly."""
 
     truth: int
     """Row of the ground truth."""

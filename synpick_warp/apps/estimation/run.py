@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.estimation.disturbance import disturb_pose
 from synpick_warp.apps.estimation.gicp import Aligner
 from synpick_warp.apps.estimation.scenes import ABSENT, Scene, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.poses import PoseTable
@@ -27,6 +27,11 @@ from synpick_warp.system.progress import Report, ignore_progress
 SINGLE, REFINE, TRACK = METHODS = ("single", "refine", "track")
 SPARSE = 20
 """Default of `--every` for methods that look at one frame at a time: consecutive frames differ little."""
+OFFSET = 0.02
+"""Length of the displacement [m]; the direction is uniform on the sphere. Length and angle are the same for all, so that a result states
+its convergence at this distance instead of a mean over easy and hard starts."""
+TURN = 15.0
+"""Angle of the rotation about the object's origin [°]; the axis is uniform on the sphere."""
 DEPTHS = {"clean": "depth", "sensor": "depth_sensor"}
 """Choices of depth images, and the folders they are in."""
 
@@ -207,3 +212,15 @@ def _tabulate(rows: Sequence[Estimate]) -> PoseTable:
     poses = np.array([row.pose for row in rows]).reshape(-1, 4, 4)
     score, seconds = (np.array([getattr(row, name) for row in rows], np.float64) for name in ("score", "seconds"))
     return PoseTable(scene, image, object_id, poses[:, :3, :3], poses[:, :3, 3], score, seconds, instance)
+
+
+def disturb_pose(pose: np.ndarray, *key: int) -> np.ndarray:
+    """Displace and rotate a pose (4, 4) [m], by exactly OFFSET and TURN in random directions.
+
+    `key`: seed of the estimation, scene, frame and instance, which name the random numbers, whatever else is estimated.
+    """
+    move, axis = np.random.default_rng(key).normal(size=(2, 3))
+    result = np.array(pose, np.float64)
+    result[:3, 3] += OFFSET * move / np.linalg.norm(move)
+    result[:3, :3] = Rotation.from_rotvec(np.radians(TURN) * axis / np.linalg.norm(axis)).as_matrix() @ result[:3, :3]
+    return result

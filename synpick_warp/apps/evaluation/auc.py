@@ -69,9 +69,7 @@ def recall_curve(errors: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Band:
-    """Scores of the instances whose quantity, such as visibility or speed, lies in [low, high): number, AUC (0 to 1), recall, median error
-    [m]; NaN without instances.
-    """
+    """Scores of the instances whose quantity, such as visibility or speed, lies in [low, high)."""
 
     low: float
     high: float

@@ -18,8 +18,7 @@ from synpick_warp.apps.evaluation.plots import plot_error_by_speed, plot_error_b
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.scoring import METRICS, Scores, score
 from synpick_warp.apps.evaluation.tables import summarize
-from synpick_warp.apps.evaluation.tracking.sweep import AlphaSweep, split_by_mode, sweep_alpha
-from synpick_warp.apps.evaluation.tracking.tracks import find_tracks, track_of_instance
+from synpick_warp.apps.evaluation.tracking import AlphaSweep, find_tracks, split_by_mode, sweep_alpha, track_of_instance
 from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.errors import ConfigError, OutputError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
@@ -38,9 +37,7 @@ _KNOWN = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """Estimates of one method: name, pose table as it came, and the same through the tracking filter of weight `alpha` (None:
-    no filter).
-    """
+    """Estimates of one method."""
 
     name: str
     poses: PoseTable
@@ -107,7 +104,7 @@ def draw_figures(
             charts[f"trajectory_{name}_{ending}.png"] = _draw_trajectory(world.poses.select(rows), method, chosen, frames)
     for method, name in zip(methods, names, strict=True):
         if method.filtered is not None:
-            charts[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), score="ADD-S AUC [%]")
+            charts[f"alpha_sweep_{name}.png"] = plot_sweep(_sweep(truth, method, settings), "ADD-S AUC [%]")
     return dict(zip(charts, render_charts(list(charts.values())), strict=True))
 
 
@@ -119,13 +116,13 @@ def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
     pictures = {}
     for metric in METRICS:
         errors = {each.name: each.errors[metric] for each in scores}
-        pictures[f"recall_{_FILES[metric]}.png"] = plot_recall(errors, metric=metric)
+        pictures[f"recall_{_FILES[metric]}.png"] = plot_recall(errors, metric)
         if rated.any():
             shown = {name: values[rated] for name, values in errors.items()}
-            pictures[f"error_by_visibility_{_FILES[metric]}.png"] = plot_error_by_visibility(visibility[rated], shown, metric=metric)
+            pictures[f"error_by_visibility_{_FILES[metric]}.png"] = plot_error_by_visibility(visibility[rated], shown, metric)
         if known.any():
             moving = {name: values[known] for name, values in errors.items()}
-            pictures[f"error_by_speed_{_FILES[metric]}.png"] = plot_error_by_speed(speed[known], moving, metric=metric)
+            pictures[f"error_by_speed_{_FILES[metric]}.png"] = plot_error_by_speed(speed[known], moving, metric)
     return pictures
 
 
@@ -187,18 +184,11 @@ def _sweep(truth: Truth, method: Method, settings: Settings) -> AlphaSweep:
     poses = truth.motion.to_world(method.poses.select(np.isin(method.poses.scene, list(modes))))
 
     def score_of(mode: str, estimates: PoseTable) -> float:
-        part = _part(truth, truth.mode == mode)
+        part = truth.select(truth.mode == mode)
         scores = score(method.name, part, truth.motion.to_camera(estimates), thinned, settings.min_visibility, settings.top)
         return summarize(part, [scores], {}, ())[-1].cells[0]["ADD-S exact"]
 
-    tables = split_by_mode(poses, modes)
-    return sweep_alpha(tables, {mode: lambda estimates, mode=mode: score_of(mode, estimates) for mode in tables})
-
-
-def _part(truth: Truth, rows: np.ndarray) -> Truth:
-    """Ground truth reduced to the rows that a mask selects."""
-    names = ("visibility", "episode", "camera", "mode", "speed")
-    return replace(truth, poses=truth.poses.select(rows), **{name: getattr(truth, name)[rows] for name in names})
+    return sweep_alpha(split_by_mode(poses, modes), score_of)
 
 
 def file_names(names: Sequence[str]) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.evaluation.nearest import VertexSearch
+from synpick_warp.apps.evaluation.errors import VertexSearch
 from synpick_warp.dataset.bop.models import find_models
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.models_info import ModelInfo
@@ -24,9 +24,7 @@ _MAX_STEP = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Object model for evaluation: vertices [m], rotational symmetries (the first is the identity), and whether
-    models_info.json lists any.
-    """
+    """Object model for evaluation."""
 
     object_id: int
     vertices: np.ndarray

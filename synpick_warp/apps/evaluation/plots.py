@@ -12,7 +12,7 @@ import numpy as np
 
 from synpick_warp.apps.evaluation.auc import LIMIT
 from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.tracking.sweep import AlphaSweep
+from synpick_warp.apps.evaluation.tracking import AlphaSweep
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.charts import INK, PALETTE, SOFT, Legend, Spec, axis, chart, line, panel, points
 
@@ -29,9 +29,9 @@ _WHISKER = 4.5
 _CURVE, _DOT = 1.75, 61.0
 """Width of a curve [px], and area of the discs on it [px²]."""
 VISIBILITY_BINS = tuple(round(0.1 * number, 1) for number in range(11))
-"""Default bin edges of the visible fraction: finer than the bands of tables."""
+"""Bin edges of the visible fraction: finer than the bands of tables."""
 SPEED_BINS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Default bin edges of an object's speed [m/s], finer than the bands of tables; all columns have the same width."""
+"""Bin edges of an object's speed [m/s], finer than the bands of tables; values beyond count in the outermost bins."""
 
 
 def plot_trajectory(
@@ -52,13 +52,9 @@ def plot_trajectory(
         method: Name of the method.
 
     Raises:
-        DatasetError: A table has several rows of an image, two curves have the same name, or there is nothing to draw.
+        DatasetError: A table has several rows of an image.
     """
     named = {"Ground truth": truth, method: estimates, **filtered}
-    if len(named) != 2 + len(filtered):
-        raise DatasetError(f"two curves have the same name; names are Ground truth, {method}, {', '.join(filtered)}: choose others")
-    if not len(truth) or not len(estimates):
-        raise DatasetError("a trajectory needs at least one true and one estimated pose; choose an instance that was estimated")
     curves = {name: _curve(table, name) for name, table in named.items()}
     order = [method, *filtered, "Ground truth"]
     colors = {"Ground truth": INK, method: _RAW, **dict(zip(filtered, _colors(len(filtered)), strict=True))}
@@ -83,46 +79,38 @@ def plot_trajectory(
     return chart(axis("x", "Frame", first, max(last, first + 1), tickCount=5), panels)
 
 
-def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_error: float = LIMIT) -> Spec:
+def plot_recall(errors: Mapping[str, np.ndarray], metric: str) -> Spec:
     """Accuracy-threshold curves: the fraction of instances with an error of at most the threshold.
 
     Args:
-        errors: Name of a method or an object -> errors of all instances (N,) [m], infinity for misses; the legend shows the names.
+        errors: Name of a method -> errors of all instances (N,) [m], infinity for misses; the legend shows the names.
         metric: Name of the error.
-        max_error: Largest threshold [m].
     """
-    threshold = np.linspace(0.0, max_error, 1001)
-    curves = {name: np.searchsorted(np.sort(_checked(name, one)), threshold, side="right") / len(one) for name, one in errors.items()}
+    threshold = np.linspace(0.0, LIMIT, 1001)
+    curves = {name: np.searchsorted(np.sort(one), threshold, side="right") / len(one) for name, one in errors.items()}
     legend = _legend(curves)
     lines = [points(line(_CURVE, legend.color(name)), 0.0, 100.0, 100 * one, x=_CENTIMETERS * threshold) for name, one in curves.items()]
-    x = axis("x", f"{metric} threshold [cm]", 0.0, _CENTIMETERS * max_error, tickCount=5)
+    x = axis("x", f"{metric} threshold [cm]", 0.0, _CENTIMETERS * LIMIT, tickCount=5)
     return chart(x, [panel(axis("y", "Recall [%]", 0.0, 100.0), 300, lines)])
 
 
-def plot_error_by_visibility(
-    visibility: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = VISIBILITY_BINS
-) -> Spec:
+def plot_error_by_visibility(visibility: np.ndarray, errors: Mapping[str, np.ndarray], metric: str) -> Spec:
     """Error against the visible fraction of instances (N,), from 0 to 1: the panels and arguments of `plot_error_by_speed`."""
-    ticks = [f"{100 * edge:g}" for edge in edges]
-    return _plot_bins(np.asarray(visibility, np.float64), errors, metric, np.asarray(edges, np.float64), ticks, "Visible fraction [%]")
+    return _plot_bins(visibility, errors, metric, VISIBILITY_BINS, 100.0, "Visible fraction [%]")
 
 
-def plot_error_by_speed(
-    speed: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = SPEED_BINS
-) -> Spec:
+def plot_error_by_speed(speed: np.ndarray, errors: Mapping[str, np.ndarray], metric: str) -> Spec:
     """Error against speed, in bins: above, median and quartiles of each method [cm]; below, the share of all instances [%].
 
     Args:
         speed: Speed of each true instance (N,) [m/s].
         errors: Name of a method -> error of each instance (N,) [m]; infinity for misses, which count as `LIMIT` as larger errors do.
         metric: Name of the error.
-        edges: Rising bin edges [m/s]; values beyond them count in the outermost bins.
     """
-    ticks = [f"{_CENTIMETERS * edge:g}" for edge in edges]
-    return _plot_bins(np.asarray(speed, np.float64), errors, metric, np.asarray(edges, np.float64), ticks, "Speed of the object [cm/s]")
+    return _plot_bins(speed, errors, metric, SPEED_BINS, _CENTIMETERS, "Speed of the object [cm/s]")
 
 
-def plot_sweep(sweep: AlphaSweep, *, score: str = "ADD-S AUC") -> Spec:
+def plot_sweep(sweep: AlphaSweep, score: str) -> Spec:
     """Score against the filter's weight for each mode; rings mark the optima, thin lines the unfiltered scores."""
     alphas, colors = np.array(sweep.alphas), _colors(len(sweep.modes))
     names = {mode: f"{mode}: best {sweep.best(mode)[0]:g}" for mode in sweep.modes}
@@ -144,19 +132,17 @@ def plot_sweep(sweep: AlphaSweep, *, score: str = "ADD-S AUC") -> Spec:
     return chart(x, [panel(axis("y", score, low, high), 300, layers)])
 
 
-def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str, edges: np.ndarray, ticks: list[str], label: str) -> Spec:
-    """Chart of errors by bins, drawn equally wide: median and quartiles of each method above, the share of instances [%] below."""
-    if len(edges) < 2 or not (np.diff(edges) > 0).all():
-        raise DatasetError(f"bin edges {edges.tolist()} are not allowed; give at least two, rising")
-    if values.ndim != 1 or not np.isfinite(values).all():
-        raise DatasetError(f"values for {label} are not finite numbers; leave out instances without one")
+def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str, edges: Sequence[float], scale: float, label: str) -> Spec:
+    """Chart of errors by bins, drawn equally wide: median and quartiles of each method above, the share of instances [%] below.
+
+    `scale`: factor of the edges in the texts of the axis.
+    """
+    ticks = [f"{scale * edge:g}" for edge in edges]
     index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(index, minlength=len(edges) - 1)
     legend, columns = _legend(errors), len(edges) - 1
     whiskers, lines, top = [], [], 0.1
     for number, (name, one) in enumerate(errors.items()):
-        if len(_checked(name, one)) != len(values):
-            raise DatasetError(f"{name} has {len(one)} errors for {len(values)} instances; give infinity for misses")
         lower, median, upper = _CENTIMETERS * np.array(list(_quartiles(np.minimum(one, LIMIT), index, columns))).T
         # Beside each other, since quartiles of several methods on one place hide each other.
         place = np.arange(columns) + 0.5 + _BESIDE * (number - (len(errors) - 1) / 2) / max(1, len(errors))
@@ -182,14 +168,6 @@ def _quartiles(errors: np.ndarray, index: np.ndarray, count: int) -> Iterator[np
     for number in range(count):
         members = errors[index == number]
         yield np.percentile(members, (25, 50, 75)) if len(members) else np.full(3, np.nan)
-
-
-def _checked(name: str, errors: np.ndarray) -> np.ndarray:
-    """Errors (N,) as an array; raises unless there is at least one, and none negative or NaN."""
-    errors = np.asarray(errors)
-    if errors.ndim != 1 or not len(errors) or not (errors >= 0.0).all():
-        raise DatasetError(f"errors of {name} have shape {errors.shape} or a value that is no error; give one number >= 0 an instance")
-    return errors
 
 
 def _curve(table: PoseTable, name: str) -> tuple[np.ndarray, np.ndarray]:

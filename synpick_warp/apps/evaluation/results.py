@@ -88,7 +88,7 @@ def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np
     for number, (line, row) in enumerate(zip(lines, rows, strict=True), start):
         # Cheap checks of every line, which make the conversion below fit; the messages are composed only if one fails.
         if len(row) != _FIELDS or len(row[4].split()) != 9 or len(row[5].split()) != 3 or line.translate(None, _CHARACTERS):
-            raise ResultError(_describe_line(line, path, number))
+            raise ResultError(_find_fault(line, f"{path}, line {number}"))
     try:
         indices = np.array([[int(text) for text in row[:3]] for row in rows], np.int64)
         reals = np.array(
@@ -97,14 +97,14 @@ def _convert(lines: list[bytes], path: Path, start: int) -> tuple[np.ndarray, np
         return indices, reals
     except (ValueError, OverflowError):
         for number, line in enumerate(lines, start):
-            if message := _describe_numbers(line, path, number):
+            if message := _find_fault(line, f"{path}, line {number}"):
                 raise ResultError(message) from None
         raise
 
 
-def _describe_line(line: bytes, path: Path, number: int) -> str:
-    """Error message on a line that is not of FORMAT: wrong number of columns or of their numbers, or a text that is no number."""
-    place, row = f"{path}, line {number}", line.split(b",")
+def _find_fault(line: bytes, place: str) -> str:
+    """Message about the first fault of a line: wrong number of columns or of their numbers, a text that is no number; empty: none."""
+    row = line.split(b",")
     if not line.strip():
         return f"{place} is empty; each line is {FORMAT}"
     if len(row) != _FIELDS:
@@ -112,24 +112,18 @@ def _describe_line(line: bytes, path: Path, number: int) -> str:
     for name, part, count in (("R", row[4], 9), ("t", row[5], 3)):
         if len(part.split()) != count:
             return f"{place} has {len(part.split())} numbers in {name}; allowed: {count} separated by spaces"
-    return _describe_numbers(line, path, number) or f"{place} has a character that is not part of a number: {_show(line)}"
-
-
-def _describe_numbers(line: bytes, path: Path, number: int) -> str:
-    """Message about the first text that is no number; empty if all are."""
-    row = line.split(b",")
     for name, text in zip(_NAMES, row, strict=False):
         if _WHOLE.fullmatch(text) is None:
-            return f"{path}, line {number}: {name} is {_show(text)}; allowed: a whole number from 0 to {MAX_INDEX}"
+            return f"{place}: {name} is {_show(text)}; allowed: a whole number from 0 to {MAX_INDEX}"
     for name, part in zip(("score", "R", "t", "time"), row[3:], strict=True):
         for text in part.split() or [b""]:
             try:
                 float(text)
             except ValueError:
-                return f"{path}, line {number}: {name} has {_show(text)}, which is no number"
+                return f"{place}: {name} has {_show(text)}, which is no number"
         if name in ("score", "time") and len(part.split()) != 1:
-            return f"{path}, line {number}: {name} is {_show(part)}; allowed: one number"
-    return ""
+            return f"{place}: {name} is {_show(part)}; allowed: one number"
+    return f"{place} has a character that is not part of a number: {_show(line)}" if line.translate(None, _CHARACTERS) else ""
 
 
 def _show(text: bytes) -> str:

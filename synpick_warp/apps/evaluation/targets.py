@@ -128,5 +128,4 @@ def select_targets(truth: Truth, targets: TargetList) -> Truth:
     nothing: frozenset[int] = frozenset()
     keys = zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), truth.poses.object_id.tolist(), strict=True)
     rows = np.array([(ids := objects.get((scene, image), nothing)) is None or object_id in ids for scene, image, object_id in keys], bool)
-    columns = {name: getattr(truth, name)[rows] for name in ("visibility", "episode", "camera", "mode", "speed")}
-    return replace(truth, poses=truth.poses.select(rows), images=truth.images[images], **columns)
+    return replace(truth.select(rows), images=truth.images[images])

@@ -19,9 +19,7 @@ _METERS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Ground-truth poses (N rows) with visibility, episode, camera, mode and speed of each row, and the list of all images, also those
-    without objects.
-    """
+    """Ground-truth poses (N rows), and the list of all images."""
 
     poses: PoseTable
     visibility: np.ndarray
@@ -43,6 +41,11 @@ class Truth:
     def shown(self, minimum: float) -> np.ndarray:
         """Whether instances are at least so visible (N,) bool; also those of which it is not known."""
         return ~(self.visibility < minimum)
+
+    def select(self, rows: np.ndarray) -> Truth:
+        """Ground truth of the rows that a mask selects; images stay."""
+        columns = {name: getattr(self, name)[rows] for name in ("visibility", "episode", "camera", "mode", "speed")}
+        return replace(self, poses=self.poses.select(rows), **columns)
 
     def __len__(self) -> int:
         return len(self.poses)

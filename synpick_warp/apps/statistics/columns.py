@@ -15,7 +15,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from synpick_warp.apps.statistics.counts import Block, Group
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.dataset.annotations import ADVICE, Index, Length, LenientCameraEntry
+from synpick_warp.dataset.annotations import ADVICE, ForeignCameraEntry, Index, Length
 from synpick_warp.dataset.bop.arrays import SceneArrays
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.errors import DatasetError
@@ -116,7 +116,7 @@ class Light(msgspec.Struct, gc=False):
     exposure: Length
 
 
-class LitCameraEntry(LenientCameraEntry, gc=False):
+class LitCameraEntry(ForeignCameraEntry, gc=False):
     """Schema of a view's entry in scene_camera.json with its light, which only data sets of this program have."""
 
     light: Light | UnsetType = UNSET

@@ -13,7 +13,7 @@ from synpick_warp.apps.statistics.counts import Counts, Group
 from synpick_warp.apps.statistics.paper import compare
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.bop.models import object_names
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.hardware.cores import count_cores

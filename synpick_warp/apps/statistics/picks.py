@@ -20,7 +20,7 @@ from synpick_warp.apps.statistics.ranking import (
     weighted_auc,
 )
 from synpick_warp.codes import Outcome, Share
-from synpick_warp.dataset.object_names import names_of
+from synpick_warp.dataset.bop.models import names_of
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.tables import Table, parse_columns
 

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import UNSET
 from scipy.signal import fftconvolve
 
-from synpick_warp.apps.validation.pictures import Mask, crop_mask
+from synpick_warp.apps.validation.scene_files import Mask, crop_mask
 from synpick_warp.apps.validation.subjects import ViewSubject
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.errors import ConfigError
@@ -35,9 +35,7 @@ MARGIN = 24
 
 @dataclass(eq=False)
 class Instance:
-    """Instance with crops (h, w) at (left, top): rendered depth alone (inf: beside) and of all, both masks and stored depth (None: the data
-    set has none), depths in mm; and the translation of its pose [mm].
-    """
+    """Instance of a view in crops (h, w) of its images at (left, top)."""
 
     index: int
     obj_id: int
@@ -78,7 +76,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class Fit:
-    """Agreement of two masks: pixels of one only, IoU, whether their outlines explain the difference, and mean distance of the outlines."""
+    """Agreement of two masks; `iou` is intersection over union."""
 
     differing: int
     """Pixels of one only."""

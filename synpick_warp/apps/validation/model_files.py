@@ -11,8 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synpick_warp.apps.validation.schemas import convert
 from synpick_warp.dataset.annotations import ModelInfo
-from synpick_warp.dataset.bop.folders import Listing
-from synpick_warp.dataset.bop.layout import MODEL_FILE
+from synpick_warp.dataset.bop.layout import MODEL_FILE, Listing
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
 from synpick_warp.scenes.assets.meshes import read_mesh

@@ -1,17 +1,22 @@
-"""Registry of validation rules: a rule is a function with a name and advice, declared by `rule`; its docstring says what holds."""
+"""Registry of validation rules: a rule is a function with a name and advice, declared by `rule`; its docstring says what holds.
+
+Deviations are summed up by rule and object as median, 95th percentile and maximum, which `validate --tolerance` reports.
+"""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple, TypeVar
 
-from synpick_warp.errors import SynpickError
+import numpy as np
 
-MODULES = ("tree", "records", "info", "images", "masks", "coco", "models", "targets", "rig", "shards", "graph", "poses", "trials")
+from synpick_warp.errors import ConfigError, SynpickError, format_value
+
+MODULES = ("tree", "records", "images", "coco", "models", "sets", "graph", "poses", "trials")
 """Modules in `validation.rules`, in the order of their rules."""
 UNITS = ("mm", "px")
 """Units of deviations."""
@@ -61,14 +66,11 @@ class Violation(NamedTuple):
     """Path relative to the data set; a member of a shard follows after a colon."""
     rule: str
     text: str
-    """What is wrong."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule about one type of subject: name, level, what holds in a correct data set, how to mend a violation, and the check that yields
-    (file, what is wrong).
-    """
+    """Rule about one type of subject; its check yields (file, what is wrong)."""
 
     name: str
     subject: type
@@ -139,3 +141,47 @@ def apply_rules(
                 yield Violation(item.level, found[0], item.name, found[1])
         except SynpickError as error:
             yield Violation(Level.ERROR, getattr(subject, "place", "."), item.name, f"cannot be checked: {error}")
+
+
+class Distribution(NamedTuple):
+    """Distribution of the deviations of one rule over the instances of an object, or of all."""
+
+    rule: str
+    obj_id: int | None
+    """None: all objects."""
+    unit: str
+    instances: int
+    median: float
+    percentile_95: float
+    largest: float
+
+
+def distributions(deviations: Mapping[tuple[str, int], Sequence[float]]) -> list[Distribution]:
+    """Distributions of deviations by (rule, obj_id): of each rule over all objects, then over each, in the order of the rules."""
+    found = []
+    for item in load_rules().values():
+        parts = {obj_id: np.array(values) for (rule, obj_id), values in sorted(deviations.items()) if rule == item.name}
+        if parts:
+            every = {None: np.concatenate(list(parts.values()))} | parts
+            found += [Distribution(item.name, obj_id, item.unit, len(part), *_summarize(part)) for obj_id, part in every.items()]
+    return found
+
+
+def _summarize(values: np.ndarray) -> tuple[float, float, float]:
+    """Median, 95th percentile and maximum."""
+    return float(np.median(values)), float(np.quantile(values, 0.95)), float(values.max())
+
+
+def parse_tolerance(text: str) -> Tolerance:
+    """Parse the tolerance MM,PX.
+
+    Raises:
+        ConfigError: The text is not two numbers above 0.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(UNITS) or not all(np.isfinite(value) and value > 0.0 for value in values):
+        raise ConfigError(f"--tolerance is {format_value(text)}; allowed: millimetres, and pixels, above 0, such as 15,3")
+    return Tolerance(*values)

@@ -14,10 +14,9 @@ import numpy as np
 from synpick_warp.apps.validation.model_files import ModelsFolder
 from synpick_warp.apps.validation.registry import Level, Tolerance, Violation, apply_rules
 from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
-from synpick_warp.apps.validation.subjects import TreeSubject
-from synpick_warp.apps.validation.target_lists import TargetLists
+from synpick_warp.apps.validation.subjects import TargetLists, TreeSubject
 from synpick_warp.apps.validation.tasks import CheckModel, CheckPicks, CheckRig, CheckScene, State, Task
-from synpick_warp.dataset.bop.keyed import KeyedFolder
+from synpick_warp.dataset.bop.images import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.commit.manifest import committed_episodes, read_manifest, read_settings
 from synpick_warp.errors import SynpickError
@@ -35,7 +34,7 @@ VIEWS_PER_PROCESS = 100
 
 @dataclass(frozen=True)
 class Options:
-    """What is checked: number of views that are rendered again (None: all), whether images are read, number of processes, tolerance."""
+    """What is checked, by how many processes."""
 
     sample: int | None = DEFAULT_SAMPLE
     """Views that are rendered again, spread over all views; None: all."""

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from synpick_warp.dataset.annotations import GraphEntry, Index, InfoEntry, Length, LenientCameraEntry, Matrix3, TruthEntry
+from synpick_warp.dataset.annotations import ForeignCameraEntry, GraphEntry, Index, InfoEntry, Length, Matrix3, TruthEntry
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
 
 
-class Camera(LenientCameraEntry, gc=False):
+class Camera(ForeignCameraEntry, gc=False):
     """Schema of an entry of scene_camera.json: intrinsics [px], depth scale [mm per count], world-to-camera rotation and translation [mm];
     UNSET: missing.
     """

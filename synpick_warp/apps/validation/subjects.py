@@ -1,21 +1,23 @@
-"""Subjects of the rules: the data set, a scene of one sensor, a view; their files are read once and when they are needed."""
+"""Subjects of the rules: data set, target lists, scene of one sensor, view; their files are read once and when they are needed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from synpick_warp.apps.validation.pictures import Mask, png_type
-from synpick_warp.apps.validation.scene_files import CheckedScene, RecordFile
+from synpick_warp.apps.validation.scene_files import CheckedScene, Mask, RecordFile, png_type
 from synpick_warp.apps.validation.schemas import Annotation, Camera, Coco, Info, Truth
-from synpick_warp.dataset.bop.layout import Layout
+from synpick_warp.dataset.annotations import TargetEntry
+from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_picture
+from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
+_Result = TypeVar("_Result")
 COLOURS = ("rgb", "gray")
 """Folders of colour and greyscale images; a scene has one of them."""
 MASKS = ("mask", "mask_visib")
@@ -27,10 +29,8 @@ class CocoFile:
 
     file: str
     content: Coco | None
-    """None: it does not fit the schema."""
     fault: str
     modal: bool
-    """Whether boxes are those of visible masks."""
 
     @cached_property
     def by_image(self) -> dict[int, list[Annotation]]:
@@ -112,6 +112,21 @@ class SceneSubject:
         return next((name for name in COLOURS if name in self.files.kinds), None)
 
 
+class Picture(NamedTuple):
+    """Decoded image of a view."""
+
+    file: str
+    pixels: np.ndarray
+    """(H, W[, C])."""
+    kind: tuple[int, str] | None
+    """Bit depth and colour type of the file; None: no PNG."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
 class ViewSubject:
     """An image of a scene, with its annotations, depth and masks."""
 
@@ -127,28 +142,19 @@ class ViewSubject:
         """As long as `truths`, or empty."""
 
     @cached_property
-    def colour(self) -> tuple[str, np.ndarray] | None:
-        """File and content (H, W[, C]) of the colour or greyscale image."""
+    def colour(self) -> Picture | None:
+        """Colour or greyscale image."""
         return self._picture(self.scene.colour) if self.scene.colour else None
 
     @cached_property
-    def _depth(self) -> tuple[str, np.ndarray, tuple[int, str] | None] | None:
-        """(file, image, type of the PNG) of the depth image; None: missing, or a fault."""
-        found = self._read("depth", None)
-        if found is None:
-            return None
-        image = self._decode(*found)
-        return None if image is None else (found[0], image, png_type(found[1]))
-
-    @property
-    def depth_file(self) -> tuple[str, np.ndarray, tuple[int, str] | None] | None:
-        """File, content and PNG type of the depth image."""
-        return self._depth
+    def depth_file(self) -> Picture | None:
+        """Depth image."""
+        return self._picture("depth")
 
     @cached_property
     def depth(self) -> np.ndarray | None:
         """Depth in counts (H, W); None: there is none, or it has several channels."""
-        return None if self._depth is None or self._depth[1].ndim != 2 else self._depth[1]
+        return None if self.depth_file is None or self.depth_file.pixels.ndim != 2 else self.depth_file.pixels
 
     @cached_property
     def masks(self) -> dict[str, list[Mask | None]]:
@@ -158,39 +164,90 @@ class ViewSubject:
     @cached_property
     def size(self) -> tuple[int, int] | None:
         """Width and height [px]: of the colour image, else of depth, else of the first mask."""
-        for found in (self.colour, self._depth):
+        for found in (self.colour, self.depth_file):
             if found is not None:
-                return found[1].shape[1], found[1].shape[0]
+                return found.size
         return next((mask.size for masks in self.masks.values() for mask in masks if mask is not None), None)
 
     def _mask(self, kind: str, index: int) -> Mask | None:
-        """Mask of an instance; None: missing, or not readable, which becomes a fault."""
-        try:
-            return self.scene.files.mask(kind, self.image, index)
-        except DatasetError as error:
-            self.faults.append((self.scene.files.file(kind, self.image, index), str(error)))
-            return None
+        """Mask of an instance; None: missing, or a fault."""
+        return self._try(self.scene.files.file(kind, self.image, index), lambda: self.scene.files.mask(kind, self.image, index))
 
-    def _picture(self, kind: str) -> tuple[str, np.ndarray] | None:
-        """(file, image) of the image of a kind; None: missing, or a fault."""
-        found = self._read(kind, None)
-        image = None if found is None else self._decode(*found)
-        return None if found is None or image is None else (found[0], image)
+    def _picture(self, kind: str) -> Picture | None:
+        """Image of a kind; None: missing, or a fault."""
+        file = self.scene.files.file(kind, self.image)
 
-    def _read(self, kind: str, index: int | None) -> tuple[str, bytes] | None:
-        """Name and content of an image; None: there is none."""
-        file = self.scene.files.file(kind, self.image, index)
-        try:
-            data = self.scene.files.read(kind, self.image, index, MAX_IMAGE_FILE)
-        except DatasetError as error:
-            self.faults.append((file, str(error)))
-            return None
-        return None if data is None else (file, data)
+        def read() -> Picture | None:
+            data = self.scene.files.read(kind, self.image, None, MAX_IMAGE_FILE)
+            return None if data is None else Picture(file, decode_picture(data, file, DatasetError), png_type(data))
 
-    def _decode(self, file: str, data: bytes) -> np.ndarray | None:
-        """Decode an image; None if that fails, which becomes a fault."""
+        return self._try(file, read)
+
+    def _try(self, file: str, read: Callable[[], _Result | None]) -> _Result | None:
+        """Result of reading a file; None if that fails, which becomes a fault."""
         try:
-            return decode_picture(data, file, DatasetError)
+            return read()
         except DatasetError as error:
             self.faults.append((file, str(error)))
             return None
+
+
+@dataclass(frozen=True)
+class TargetFile:
+    """Target list: its records of single images, by scene and image, and what is wrong with the file."""
+
+    scenes: dict[int, dict[int, list[TargetEntry]]] = field(default_factory=dict)
+    """Records by scene and image. Those of several images (multi-view lists) are dropped; their scene stays, with what else it has."""
+    fault: str = ""
+    """What is wrong with the file; empty: nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetLists:
+    """Subject of rules about all target lists of a data set."""
+
+    layout: Layout
+    place: str = "."
+
+    @cached_property
+    def lists(self) -> dict[str, TargetFile]:
+        """Target lists by file name. Cached."""
+        return {name: self._read(name) for name in sorted(filter(TARGETS.fullmatch, self.layout.listing.files))}
+
+    def _read(self, name: str) -> TargetFile:
+        """Read a target list; one that does not fit the schema has a fault instead of records."""
+        try:
+            records = decode_json(self.layout.listing.read(name, MAX_JSON), list[TargetEntry], name, DatasetError)
+        except DatasetError as error:
+            return TargetFile(fault=str(error))
+        scenes: dict[int, dict[int, list[TargetEntry]]] = {}
+        for record in records:
+            images = scenes.setdefault(record.scene_id, {})
+            if isinstance(record.im_id, int):
+                images.setdefault(record.im_id, []).append(record)
+        return TargetFile(scenes)
+
+    def splits(self, name: str) -> list[str]:
+        """Splits that a target list refers to: `PREFIX` and `PREFIX_*` of a file `PREFIX_targets*`, else `val` and `val_*`, else all.
+
+        Splits with scene folders come first: others count only if no split has any.
+        """
+        prefix = name.split("_targets")[0]
+        with_scenes = [split for split, listing in self.layout.splits.items() if any(map(is_index, listing.folders))]
+        names = with_scenes or list(self.layout.splits) or list(self.layout.keyed)
+        for start in (prefix, "val"):
+            found = [split for split in names if split == start or split.startswith(f"{start}_")]
+            if found:
+                return found
+        return names
+
+    def scene_ids(self, name: str) -> set[int]:
+        """Indices of the scenes in the splits that a list is about; without scene folders (shards, imagewise), those that it names."""
+        splits = self.splits(name)
+        if not self.layout.splits:
+            return set(self.lists[name].scenes)
+        return {int(folder) for split in splits for folder in self.layout.splits[split].folders if folder.isdecimal()}
+
+    def of_scene(self, split: str, scene: int) -> dict[str, dict[int, list[TargetEntry]]]:
+        """Records about a scene: by list and image."""
+        return {name: found.scenes[scene] for name, found in self.lists.items() if scene in found.scenes and split in self.splits(name)}

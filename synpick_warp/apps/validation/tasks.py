@@ -10,11 +10,10 @@ from typing import Any, NamedTuple, Protocol
 
 from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject
 from synpick_warp.apps.validation.registry import Tolerance, Violation, apply_rules
-from synpick_warp.apps.validation.rules.rig import RigSubject
+from synpick_warp.apps.validation.rules.sets import RigSubject
 from synpick_warp.apps.validation.scene_files import open_scene
 from synpick_warp.apps.validation.subjects import SceneSubject, ViewSubject
-from synpick_warp.dataset.bop.folders import Listing
-from synpick_warp.dataset.bop.layout import Layout, SceneRef
+from synpick_warp.dataset.bop.layout import Layout, Listing, SceneRef
 
 
 class Checked(NamedTuple):

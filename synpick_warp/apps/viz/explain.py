@@ -41,7 +41,7 @@ from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.bop.models import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.scene_index import SceneIndex
 from synpick_warp.dataset.view import View

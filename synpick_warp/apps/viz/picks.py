@@ -15,8 +15,8 @@ from synpick_warp.apps.viz.drawing import INK, WHITE, Image, blank, check_pictur
 from synpick_warp.apps.viz.explain import GREEN, LINE, TEXT, wrapped
 from synpick_warp.apps.viz.explain_graph import disc, fixed
 from synpick_warp.codes import Ending, Outcome, Share
-from synpick_warp.dataset.grasp_maps import mean_by_candidate
-from synpick_warp.dataset.object_names import names_of
+from synpick_warp.dataset.bop.models import names_of
+from synpick_warp.dataset.view import mean_by_candidate
 from synpick_warp.errors import DatasetError
 
 if TYPE_CHECKING:

@@ -19,10 +19,10 @@ from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_l
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.bop.foreign import ForeignScenes
 from synpick_warp.dataset.bop.layout import NoLayoutError
-from synpick_warp.dataset.bop.scenes import FoundScenes
+from synpick_warp.dataset.bop.models import object_names
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry
-from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 
@@ -141,7 +141,7 @@ def find_scenes(dataset: Path) -> list[SheetScene]:
         DatasetError: There is none.
     """
     try:
-        found = FoundScenes(dataset)
+        found = ForeignScenes(dataset)
     except NoLayoutError:
         if not dataset.is_dir():
             raise

@@ -15,7 +15,7 @@ from synpick_warp.errors import ConfigError, OutputError, escape, format_value
 
 if TYPE_CHECKING:
     from synpick_warp.apps.estimation.run import Options, Run
-    from synpick_warp.apps.estimation.selection import Selection
+    from synpick_warp.apps.estimation.scenes import Selection
 
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
@@ -92,10 +92,9 @@ def estimate(
 
 def run_method(data: Path, selection: Selection, options: Options, out: Path, *, split: str | None = None) -> tuple[Run, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
-    from synpick_warp.apps.estimation.gicp import Aligner
-    from synpick_warp.apps.estimation.models import read_object_models
+    from synpick_warp.apps.estimation.gicp import Aligner, read_object_models
     from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
-    from synpick_warp.apps.estimation.selection import plan_scenes
+    from synpick_warp.apps.estimation.scenes import plan_scenes
     from synpick_warp.apps.evaluation.results import write_results
     from synpick_warp.apps.evaluation.targets import encode_targets, in_layout
     from synpick_warp.cli.display import CountProgress, make_console
@@ -130,7 +129,7 @@ def make_selection(
         ResultError: The target list cannot be read.
     """
     from synpick_warp.apps.estimation.run import METHODS, SPARSE, TRACK
-    from synpick_warp.apps.estimation.selection import Selection
+    from synpick_warp.apps.estimation.scenes import Selection
     from synpick_warp.apps.evaluation.targets import read_targets
 
     if method not in METHODS:

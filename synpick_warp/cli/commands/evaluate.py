@@ -194,7 +194,7 @@ def describe_gaps(files: Sequence[ResultFile], truth: Truth, *, listed: bool) ->
 def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None, motion: CameraMotion) -> list[Method]:
     """Named estimates of each file, with the filtered ones, by their motion in the world, if there is a weight `alpha`."""
     from synpick_warp.apps.evaluation.figures import Method
-    from synpick_warp.apps.evaluation.tracking.filtering import filter_poses
+    from synpick_warp.apps.evaluation.tracking import filter_poses
 
     def filtered(poses: PoseTable) -> PoseTable | None:
         return None if alpha is None else motion.to_camera(filter_poses(motion.to_world(poses), alpha))
@@ -205,7 +205,7 @@ def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: fl
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
     """Sheets of the worst estimate of each object, one for each method: file name -> PNG file. None without the images they need."""
     from synpick_warp.apps.estimation.failures import draw_failures, find_failures
-    from synpick_warp.apps.estimation.models import read_object_models
+    from synpick_warp.apps.estimation.gicp import read_object_models
     from synpick_warp.apps.evaluation.figures import file_names
     from synpick_warp.exporters.writing.png import encode_png
     from synpick_warp.system.hardware.device import pick_device
@@ -284,7 +284,7 @@ def check_filter(name: str | None, alpha: float | None) -> float | None:
     Raises:
         ConfigError: There is no such filter, or the weight is out of range or without one.
     """
-    from synpick_warp.apps.evaluation.tracking.filtering import PAPER_ALPHAS, check_alpha
+    from synpick_warp.apps.evaluation.tracking import PAPER_ALPHAS, check_alpha
 
     if name is None:
         if alpha is not None:

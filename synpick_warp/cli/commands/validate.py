@@ -86,7 +86,7 @@ def _make_options(sample: int | None, threads: int, tolerance: str | None, *, po
     Raises:
         ConfigError: A value is not allowed, or two options exclude each other.
     """
-    from synpick_warp.apps.validation.deviations import parse_tolerance
+    from synpick_warp.apps.validation.registry import parse_tolerance
     from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, Options
 
     if fast and (poses or sample):
@@ -133,7 +133,7 @@ def _print_rules(*, as_json: bool) -> None:
 
 def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bool) -> None:
     """Print how many violations were held back by rule (limit 0: none), distributions of deviations, and the totals; or these as JSON."""
-    from synpick_warp.apps.validation.deviations import distributions
+    from synpick_warp.apps.validation.registry import distributions
 
     found = distributions(summary.deviations)
     if as_json:

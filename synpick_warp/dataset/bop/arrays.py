@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,13 +10,11 @@ import msgspec
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.dataset.annotations import ADVICE, CameraEntry, InfoEntry, Key, LenientCameraEntry, TruthEntry, check_content
+from synpick_warp.dataset.annotations import ADVICE, InfoEntry, Key, TruthEntry, check_content
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.json import read_json
 
-_PER_OBJECT = 1000
-"""An instance without id gets one from _PER_OBJECT * obj_id on; see `instance_ids`."""
 _INFO = InfoEntry.__struct_fields__
 
 
@@ -34,7 +31,7 @@ class SceneArrays:
     object_id: np.ndarray
     """obj_id (N,) int64."""
     instance: np.ndarray
-    """Instance id (N,) int64; -1: it has none. See `instance_ids`."""
+    """Instance id (N,) int64; -1: it has none. See `SceneFiles.instance_ids`."""
     tracked: bool
     """Whether the annotations have the instance ids, so that instances can be followed from image to image."""
     rotation: np.ndarray
@@ -68,14 +65,14 @@ def read_arrays(files: SceneFiles, images: Sequence[int], camera: Any = None, *,
     Args:
         files: The scene.
         images: im_id of each.
-        camera: Schema of the entries in scene_camera.json; None: `CameraEntry`, or that of lenient scenes.
+        camera: Schema of the entries in scene_camera.json; None: that of the scene.
         whole: Whether annotations of a bake must have these images and no others.
 
     Raises:
         DatasetError: A file is missing or damaged, or has not all of the images.
     """
-    camera = camera or (LenientCameraEntry if files.lenient else CameraEntry)
-    if isinstance(files, SceneFolder) and not files.lenient:
+    camera = camera or files.schemas["camera"]
+    if isinstance(files, SceneFolder) and files.complete:
         cameras, truth, infos = _read_folder(files, images, camera, whole)
     else:
         cameras, truth, infos = _read_views(files, images, camera)
@@ -84,7 +81,7 @@ def read_arrays(files: SceneFiles, images: Sequence[int], camera: Any = None, *,
             raise DatasetError(f"{files.place}: image {image} has other instances in scene_gt than in scene_gt_info; {ADVICE}")
     entries = [entry for each in truth for entry in each]
     details = [info for each in infos for info in each]
-    ids = [instance_ids([(one.obj_id, one.instance_id) for one in each], files.lenient) or [-1] * len(each) for each in truth]
+    ids = [files.instance_ids([(one.obj_id, one.instance_id) for one in each]) or [-1] * len(each) for each in truth]
     return SceneArrays(
         images=np.array(images, np.int64),
         cameras=cameras,
@@ -120,31 +117,9 @@ def _read_folder(files: SceneFolder, images: Sequence[int], camera: Any, whole: 
 
 
 def _read_views(files: SceneFiles, images: Sequence[int], camera: Any) -> _Parts:
-    """Entries of the views in shards, or of a lenient scene."""
+    """Entries of the views in shards, or of a scene from another source."""
     records = [files.records(image) for image in images]
     cameras = [check_content(record.camera, camera, files.place) for record in records]
     truth = [msgspec.convert(record.gt, list[TruthEntry]) for record in records]
     # A missing scene_gt_info is filled in with measured values, or NaN where nothing is known, which the schema would refuse.
     return cameras, truth, [[InfoEntry(**{key: entry[key] for key in _INFO}) for entry in record.gt_info] for record in records]
-
-
-def instance_ids(instances: Sequence[tuple[int, Any]], lenient: bool) -> list[int] | None:
-    """Ids of the instances of an image; None: they have none.
-
-    Those of a lenient scene are then made up: 1000 obj_id, plus the number of instances of the same object before it in the image's list.
-    They follow an instance through a scene that has one of each object; of several, nothing tells which is which in the next image.
-
-    Args:
-        instances: obj_id and instance_id, or UNSET, of each.
-        lenient: Whether ids may be missing.
-    """
-    if all(instance is not UNSET for _, instance in instances):
-        return [instance for _, instance in instances]
-    if not lenient:
-        return None
-    seen: Counter[int] = Counter()
-    result = []
-    for object_id, _ in instances:
-        result.append(_PER_OBJECT * object_id + seen[object_id])
-        seen[object_id] += 1
-    return result

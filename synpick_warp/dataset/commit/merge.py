@@ -11,7 +11,6 @@ import itertools
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -19,14 +18,10 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import (
-    ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
     ENTRIES,
-    EPISODES_FILE,
-    INDICES,
     committed_episodes,
     describe_differences,
     encode_manifest,
@@ -36,12 +31,12 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.commit.writing import finalize_data_set, lock_folder
+from synpick_warp.dataset.commit.plausibility import check_file_names, describe_strays
+from synpick_warp.dataset.commit.writing import finalize_data_set, lock_folder, remove_path
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.registry import Needs, shared_files
+from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.checksums import open_regular
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, check_output_folder, output_error, remove_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.urls import store_url
@@ -58,11 +53,9 @@ class Merged(NamedTuple):
     """Result of a merge: number of episodes, indices of missing ones, sentences on files that were left out."""
 
     episodes: int
-    """Number of episodes."""
     missing: list[int]
     """Indices that no part has; a bake with the same settings generates them."""
     left_out: list[str]
-    """Sentences on files of episodes that a part has not committed."""
 
 
 def merge(parts: Sequence[Path], out: Path) -> Merged:
@@ -161,109 +154,75 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
 
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
-    """Link all files, then all entries, and build the indices; an error removes all of it again."""
-    needs = Needs.of(config)
-    added = _Added(out)
-    lock = lock_folder(out)
+    """Link all files, then all entries, and build the indices, in a staging folder from which all is moved; an error removes it again."""
+    created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    work = out / PARTIAL
+    names: list[str] = []
     try:
+        (work / ENTRIES).mkdir(parents=True)
+        lock = lock_folder(out)
         try:
-            added.make_folder(out / ENTRIES)
-            for entry, part in sources.items():
-                for name in read_checksums(part, entry):
-                    added.link(part / name, out / name)
-                for suffix in (".sha256", ".json"):
-                    added.link(part / f"{entry}{suffix}", out / f"{entry}{suffix}")
-            added.paths += _later_paths(out, shared_files(needs.classes, DataLayout.of(config)))
-            write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
-            write_atomically(out / MANIFEST_FILE, manifest)
-            with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:
-                finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
-        except BaseException:
-            added.remove()
-            raise
-    finally:
-        os.close(lock)
+            _stage(work, sources, config, manifest, lock)
+            # The manifest marks a data set, so it comes last.
+            names = sorted(os.listdir(work), key=lambda name: name == MANIFEST_FILE)
+            for name in names:
+                (work / name).rename(out / name)
+        finally:
+            os.close(lock)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for name in (name for name in names if not os.path.lexists(work / name)):
+                remove_path(out / name)
+            remove_folder(work, ignore_errors=True)
+            for folder in created:
+                folder.rmdir()
+        raise
+    remove_folder(work)
 
 
-def _later_paths(out: Path, shared: SharedFiles) -> list[Path]:
-    """Files and folders that are not linked but written, folders before what is in them."""
-    entry = (INDICES.with_suffix(suffix) for suffix in (".json", ".sha256"))
-    names = (*reversed(shared.folders), *shared.indices, EPISODES_FILE, ATTEMPTS_FILE, *entry, CONFIG_FILE, MANIFEST_FILE)
-    return [out / name for name in names]
+def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: bytes, lock: int) -> None:
+    """Fill an empty folder with the files of all entries, the entries, settings, manifest and indices."""
+    for entry, part in sources.items():
+        for name in (*read_checksums(part, entry), f"{entry}.sha256", f"{entry}.json"):
+            _link(part / name, work / name)
+    write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
+    write_atomically(work / MANIFEST_FILE, manifest)
+    needs = Needs.of(config)
+    with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:
+        finalize_data_set(work, ExportSettings.of(config), needs.classes, pool)
 
 
-class _Added:
-    """Rollback list: files and folders that the merge adds to the output folder, and the folder. An error removes them, nothing else."""
+def _link(source: Path, target: Path) -> None:
+    """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along.
 
-    def __init__(self, out: Path) -> None:
-        self.paths: list[Path] = []
-        """In order of creation."""
-        self._folders: set[Path] = set()
-        self.make_folder(out)
+    Raises:
+        DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
+        OSError: The target cannot be written, or exists: it may be a hard link, so that it is never written to.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        handle = open_regular(source)
+    except FileNotFoundError:
+        raise DatasetError(f"{source} is missing; `synpick-warp verify` names what is damaged") from None
+    except OSError as error:
+        raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
+    with open(source, "rb", opener=lambda *_: handle) as file:
+        if os.fstat(handle).st_mode & _EXECUTE or not _hard_link(source, target):
+            _copy(file, target)
 
-    def make_folder(self, folder: Path) -> None:
-        """Create a folder and its parents, where they are missing."""
-        if folder in self._folders:
-            return
-        missing = list(takewhile(lambda each: not each.is_dir(), (folder, *folder.parents)))
-        for each in reversed(missing):
-            with self._noted(each):
-                each.mkdir()
-        self._folders.add(folder)
 
-    def link(self, source: Path, target: Path) -> None:
-        """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along. An existing
-        file is never written to: it may be a hard link.
-
-        Raises:
-            DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
-            OSError: The target cannot be written.
-        """
-        self.make_folder(target.parent)
+def _copy(source: BinaryIO, target: Path) -> None:
+    """Copy an open file to a new path, with its mode (not executable) and times."""
+    with open(target, "xb") as file:
         try:
-            handle = open_regular(source)
-        except FileNotFoundError:
-            raise DatasetError(f"{source} is missing; `synpick-warp verify` names what is damaged") from None
+            for block in _read_blocks(source):
+                file.write(block)
+            file.flush()
+            state = os.fstat(source.fileno())
+            os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode) & ~_EXECUTE)
+            os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
         except OSError as error:
-            raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
-        with open(source, "rb", opener=lambda *_: handle) as file:
-            with self._noted(target):
-                is_linked = not os.fstat(handle).st_mode & _EXECUTE and _hard_link(source, target)
-            if not is_linked:
-                self.paths.pop()
-                self._copy(file, target)
-
-    @contextlib.contextmanager
-    def _noted(self, path: Path) -> Iterator[None]:
-        """Context manager that notes a path for removal while it is created, as an interrupt may follow at once; not if
-        creating it fails.
-        """
-        self.paths.append(path)
-        try:
-            yield
-        except OSError:
-            self.paths.pop()
-            raise
-
-    def _copy(self, source: BinaryIO, target: Path) -> None:
-        """Copy an open file to a new path, with its mode (not executable) and times; remembers the path for removal."""
-        with open(target, "xb") as file:
-            self.paths.append(target)
-            try:
-                for block in _read_blocks(source):
-                    file.write(block)
-                file.flush()
-                state = os.fstat(source.fileno())
-                os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode) & ~_EXECUTE)
-                os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
-            except OSError as error:
-                raise OSError(error.errno, error.strerror, str(target)) from error
-
-    def remove(self) -> None:
-        """Remove all files and folders that the merge has added."""
-        for path in reversed(self.paths):
-            with contextlib.suppress(OSError):
-                path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
+            raise OSError(error.errno, error.strerror, str(target)) from error
 
 
 def _hard_link(source: Path, target: Path) -> bool:

@@ -13,8 +13,6 @@ from typing import NamedTuple
 
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.file_names import check_file_names
-from synpick_warp.dataset.commit.frame_counts import check_frames, check_listed_frames
 from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,
     INDICES,
@@ -25,6 +23,7 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
+from synpick_warp.dataset.commit.plausibility import check_file_names, check_frames, check_listed_frames
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
 from synpick_warp.system.hardware.cores import count_cores
@@ -44,13 +43,9 @@ class Verdict(NamedTuple):
     """Result of a verification: first problem (empty: none), committed episodes, checked files, whether the bake finished."""
 
     problem: str
-    """First file that is missing or damaged, and how; empty: none."""
     episodes: int
-    """Number of committed episodes."""
     files: int
-    """Number of files that were checked."""
     finished: bool
-    """Whether the bake finished."""
 
 
 class CheckPart(NamedTuple):
@@ -60,7 +55,6 @@ class CheckPart(NamedTuple):
     part: int = 0
     """Index of the part."""
     parts: int = 1
-    """Number of parts of the entry."""
 
 
 class Checked(NamedTuple):
@@ -69,7 +63,6 @@ class Checked(NamedTuple):
     files: int
     """Number of checked files, including the damaged one."""
     problem: str
-    """Description of the first problem; empty: none."""
 
 
 def verify(folder: Path, threads: int | None = None, report: Report = ignore_progress) -> Verdict:

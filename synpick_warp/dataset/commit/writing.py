@@ -8,17 +8,21 @@ files in the folder. The manifest marks the folder as ours: it is written first 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import errno
 import fcntl
+import hashlib
 import json
 import os
 import re
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout, may_pick
@@ -60,6 +64,8 @@ from synpick_warp.exporters.writing.files import (
     write_atomically,
 )
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import check_regular_file
 from synpick_warp.system.inputs.toml import MAX_TOML
@@ -202,7 +208,7 @@ class OutputFolder:
         """Delete the constants, and folders of formats if they are empty then."""
         self._remove_entry(CONSTANTS)
         for name in self._shared.constants:
-            _remove(self.out / name)
+            remove_path(self.out / name)
         for name in list_folders(self.out, self._shared.folders):
             with contextlib.suppress(OSError):
                 (self.out / name).rmdir()
@@ -213,7 +219,7 @@ class OutputFolder:
         for episode in sorted(index for index in self._named_episodes() - self._complete if index < end):
             self._remove_entry(episode_entry(episode))
             for path in self._exporters.files(episode):
-                _remove(self.out / path)
+                remove_path(self.out / path)
 
     def _named_episodes(self) -> set[int]:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
@@ -408,6 +414,42 @@ def lock_folder(out: Path) -> int:
             return handle
 
 
-def _remove(path: Path) -> None:
+def remove_path(path: Path) -> None:
     """Remove a file, or a folder with its content."""
     remove_folder(path) if is_folder(path) else path.unlink(missing_ok=True)
+
+
+def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
+    """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
+
+    SHA-256 over objects, lights, distractors and textures, without the names of their files. Names and order of the dataclasses' fields are
+    hashed, too: renaming a field of `Catalog` or `EnvironmentMap` changes every manifest.
+    """
+    textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
+    distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
+    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures
+
+
+def _digest_data(value: object) -> str:
+    """SHA-256 of nested data, by type and content."""
+    state = hashlib.sha256()
+    for part in _parts(value):
+        state.update(part)
+    return state.hexdigest()
+
+
+def _parts(value: object) -> Iterator[bytes]:
+    """Serialize dataclasses, tuples, arrays and plain values; paths, and fields that are not hashed, are left out."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype.str}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, tuple):
+        yield f"({len(value)}".encode()
+        for part in value:
+            yield from _parts(part)
+    elif dataclasses.is_dataclass(value):
+        for item in (item for item in dataclasses.fields(value) if item.hash is not False):
+            yield item.name.encode()
+            yield from _parts(getattr(value, item.name))
+    elif not isinstance(value, Path):
+        yield repr(value).encode()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import shutil
 import struct
 from pathlib import Path
@@ -13,9 +15,11 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.dataset.array_layout import ArrayMetadata, check_layout
+from synpick_warp.dataset.commit.manifest import CONSTANTS, encode_manifest
+from synpick_warp.dataset.stored_array import ArrayMetadata, check_layout
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import STEPS
+from tests.harness.hostile import replaced
 from tests.worlds import trajectories
 
 HUGE = 2**26
@@ -26,6 +30,11 @@ BLOCK = 2**17
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> Path:
     return trajectories.write_set(tmp_path_factory.mktemp("arrays") / "set", trajectories.config(), (0,), 3)
+
+
+@pytest.fixture
+def store(written, tmp_path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "set"))
 
 
 def repeated_byte(size: int, header: bytes = b"\x00\x58") -> bytes:
@@ -48,8 +57,7 @@ FRAMES = {
 
 @pytest.mark.parametrize("sharded", [False, True])
 @pytest.mark.parametrize("name", FRAMES)
-def test_a_chunk_that_holds_more_or_less_than_its_place_is_not_decompressed(written, tmp_path, name, sharded):
-    store = Path(shutil.copytree(written, tmp_path / "set"))
+def test_a_chunk_that_holds_more_or_less_than_its_place_is_not_decompressed(store, name, sharded):
     array = store / "trajectory.zarr/episodes/000000/steps/pose"
     metadata = json.loads((array / "zarr.json").read_text())
     shard = metadata["codecs"][0]["configuration"]
@@ -113,11 +121,104 @@ def test_an_array_of_others_is_compared_with_what_is_stored(tmp_path):
         check_layout(array, layout([100_000_000], [1000]), None, {})
 
 
-def test_a_chunk_file_is_no_larger_than_its_chunk(written, tmp_path):
+def test_a_chunk_file_is_no_larger_than_its_chunk(store):
     """A file with a hole of gigabytes would be read whole."""
-    store = Path(shutil.copytree(written, tmp_path / "set"))
     [chunk] = (store / "trajectory.zarr/objects/mass").glob("c.*")
     with chunk.open("r+b") as stream:
         stream.truncate(2**33)
     with pytest.raises(DatasetError, match=r"c\.0 is larger than"):
         _ = synpick_warp.open(store).objects
+
+
+# ---- metadata ----
+
+
+def change(path: Path, place: tuple[object, ...], value: object) -> None:
+    path.write_text(json.dumps(replaced(json.loads(path.read_text()), place, value)))
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        (("shape", 0), 10**12, "is float32 of shape .*; expected: float32 of shape 12 x instance x 7"),
+        (("shape",), [12], "is float32 of shape 12; expected"),
+        (("shape", 1), 2**39, "more than its .* can hold"),
+        (("data_type",), "float64", "is float64 of shape .*; expected: float32"),
+        (("data_type",), "null_terminated_bytes", "invalid enum value"),
+        (("codecs", 0, "name"), "pickle", "invalid enum value 'pickle'"),
+        (("codecs", 0, "configuration", "chunk_shape", 0), 7, "cannot be read: "),
+        (("codecs", 0, "configuration"), None, "cannot be read: "),
+        (("chunk_grid", "configuration", "chunk_shape", 0), 0, "expected int >= 1"),
+        (("fill_value",), "x", "cannot be read: "),
+        (("chunk_grid", "configuration", "chunk_shape", 1), 2**33, "larger than its"),
+        (("chunk_grid", "configuration", "chunk_shape", 0), 2**33, "larger than its"),
+        (("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "larger than its"),
+        (("codecs", 0, "configuration", "chunk_shape"), [2, 2], "chunks of another shape"),
+        (("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "invalid enum value 'pickle'"),
+        (("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "invalid enum value 'zstd'"),
+    ],
+)
+def test_metadata_of_an_array_that_do_not_fit_are_named(store, place, value, said):
+    change(store / "trajectory.zarr/episodes/000000/steps/pose/zarr.json", place, value)
+    steps = synpick_warp.open(store)[0].steps
+    with pytest.raises(DatasetError, match=said) as caught:
+        _ = steps["pose"][...]
+    assert str(caught.value).isprintable()
+
+
+def test_a_damaged_chunk_is_named_and_a_wrong_index_is_an_index_error(store):
+    array = store / "trajectory.zarr/episodes/000000/steps/pose"
+    [chunk] = [path for path in array.iterdir() if path.name != "zarr.json"]
+    steps = synpick_warp.open(store)[0].steps
+    with pytest.raises(IndexError):
+        _ = steps["pose"][10**6]
+    chunk.write_bytes(chunk.read_bytes()[:50])
+    for read in (
+        lambda: steps["pose"][...],
+        lambda: steps["pose"][0, 0],
+        lambda: np.asarray(steps["pose"]),
+        lambda: steps["pose"].oindex[[0]],
+    ):
+        with pytest.raises(DatasetError, match=r"the array .*/steps/pose cannot be read: .*; restore the file"):
+            read()
+    chunk.unlink()
+    os.mkfifo(chunk)
+    with pytest.raises(DatasetError, match="is not a regular file"):
+        _ = steps["pose"]
+
+
+def test_a_chunk_that_the_manifest_lists_must_be_there(store):
+    """Zarr reads a missing chunk as NaN or 0."""
+    (store / "manifest").mkdir(exist_ok=True)
+    array = store / "trajectory.zarr/objects/mass"
+    lines = "".join(f"{'0' * 64}  {path.relative_to(store)}\n" for path in sorted(array.iterdir()))
+    write_entry(store, lines)
+    assert len(synpick_warp.open(store).objects) > 0
+    (array / "c.0").unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*objects/mass/c\.0, which the manifest lists"):
+        _ = synpick_warp.open(store).objects
+    write_entry(store, f"{'0' * 64}  trajectory.zarr/../../outside\n")
+    with pytest.raises(DatasetError, match=r"constants\.sha256, line 1, names the file"):
+        _ = synpick_warp.open(store).objects
+
+
+def write_entry(store: Path, lines: str) -> None:
+    """Write the manifest entry of the constants."""
+    content = {"files": lines.count("\n"), "checksum": hashlib.sha256(lines.encode()).hexdigest(), "bytes": 0}
+    (store / f"{CONSTANTS}.sha256").write_text(lines)
+    (store / f"{CONSTANTS}.json").write_bytes(encode_manifest(content))
+
+
+def test_tables_whose_lengths_differ_are_named(store):
+    change(store / "trajectory.zarr/objects/zarr.json", ("attributes", "names"), ["one"])
+    with pytest.raises(DatasetError, match=r"expected: .* of shape 1"):
+        _ = synpick_warp.open(store).objects
+    change(store / "trajectory.zarr/objects/zarr.json", ("attributes", "names"), 3)
+    with pytest.raises(DatasetError, match=r"zarr\.json is damaged: expected array, got int - at \$\.names"):
+        _ = synpick_warp.open(store).objects
+
+
+def test_folders_with_other_names_are_no_episodes(store):
+    for name in ("12abc", "0", "000²", "notes"):
+        (store / "trajectory.zarr" / "episodes" / name).mkdir()
+    assert list(synpick_warp.open(store)) == [0]

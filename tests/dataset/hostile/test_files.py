@@ -1,12 +1,10 @@
-"""Hostile images, shards and arrays of a data set: each is a DatasetError of one line, before memory is filled."""
+"""Hostile images, annotations and shards of a data set: each is a DatasetError of one line, before memory is filled."""
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
-import shutil
 import struct
 import tarfile
 import zlib
@@ -21,8 +19,8 @@ from hypothesis import strategies as st
 import synpick_warp
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset import view_files
-from synpick_warp.dataset.annotations import MASK_SCHEMA, SCENE_SCHEMAS, ModelInfo, check_json, read_checked
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, encode_manifest
+from synpick_warp.dataset.annotations import MASK_SCHEMA, VIEW_SCHEMAS, Key, ModelInfo, check_json, read_checked
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -32,7 +30,6 @@ from synpick_warp.system.inputs.tar_files import list_members
 from tests.harness.exporter_contract import LENSES, export
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import places, replaced
-from tests.worlds import trajectories
 from tests.worlds.box_views import config
 
 SIZE, FRAMES = (LENSES[0].width, LENSES[0].height), 2
@@ -182,7 +179,7 @@ DOCUMENTS = {
         "0": [{"bbox_obj": [1] * 4, "bbox_visib": [1] * 4, "px_count_all": 1, "px_count_valid": 1, "px_count_visib": 1, "visib_fract": 1.0}]
     },
 }
-SCHEMAS = SCENE_SCHEMAS | {"mask": MASK_SCHEMA, "models": dict[int, ModelInfo]}
+SCHEMAS = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()} | {"mask": MASK_SCHEMA, "models": dict[int, ModelInfo]}
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
     lambda inner: (
@@ -302,107 +299,3 @@ def test_run_lengths_that_do_not_fill_the_image_are_named(tmp_path, masks, said)
     path.write_bytes(tar((member("000000_000000.mask.json", len(data)), data)))
     with pytest.raises(DatasetError, match=said):
         SceneShards([path], 0, SIZE).masks("mask", 0, 1)
-
-
-# ---- arrays ----
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Path:
-    return trajectories.write_set(tmp_path_factory.mktemp("arrays") / "set", trajectories.config(), (0,), 3)
-
-
-@pytest.fixture
-def store(written, tmp_path) -> Path:
-    return Path(shutil.copytree(written, tmp_path / "set"))
-
-
-def change(path: Path, place: tuple[object, ...], value: object) -> None:
-    path.write_text(json.dumps(replaced(json.loads(path.read_text()), place, value)))
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "said"),
-    [
-        (("shape", 0), 10**12, "is float32 of shape .*; expected: float32 of shape 12 x instance x 7"),
-        (("shape",), [12], "is float32 of shape 12; expected"),
-        (("shape", 1), 2**39, "more than its .* can hold"),
-        (("data_type",), "float64", "is float64 of shape .*; expected: float32"),
-        (("data_type",), "null_terminated_bytes", "invalid enum value"),
-        (("codecs", 0, "name"), "pickle", "invalid enum value 'pickle'"),
-        (("codecs", 0, "configuration", "chunk_shape", 0), 7, "cannot be read: "),
-        (("codecs", 0, "configuration"), None, "cannot be read: "),
-        (("chunk_grid", "configuration", "chunk_shape", 0), 0, "expected int >= 1"),
-        (("fill_value",), "x", "cannot be read: "),
-        (("chunk_grid", "configuration", "chunk_shape", 1), 2**33, "larger than its"),
-        (("chunk_grid", "configuration", "chunk_shape", 0), 2**33, "larger than its"),
-        (("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "larger than its"),
-        (("codecs", 0, "configuration", "chunk_shape"), [2, 2], "chunks of another shape"),
-        (("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "invalid enum value 'pickle'"),
-        (("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "invalid enum value 'zstd'"),
-    ],
-)
-def test_metadata_of_an_array_that_do_not_fit_are_named(store, place, value, said):
-    change(store / "trajectory.zarr/episodes/000000/steps/pose/zarr.json", place, value)
-    steps = synpick_warp.open(store)[0].steps
-    with pytest.raises(DatasetError, match=said) as caught:
-        _ = steps["pose"][...]
-    assert str(caught.value).isprintable()
-
-
-def test_a_damaged_chunk_is_named_and_a_wrong_index_is_an_index_error(store):
-    array = store / "trajectory.zarr/episodes/000000/steps/pose"
-    [chunk] = [path for path in array.iterdir() if path.name != "zarr.json"]
-    steps = synpick_warp.open(store)[0].steps
-    with pytest.raises(IndexError):
-        _ = steps["pose"][10**6]
-    chunk.write_bytes(chunk.read_bytes()[:50])
-    for read in (
-        lambda: steps["pose"][...],
-        lambda: steps["pose"][0, 0],
-        lambda: np.asarray(steps["pose"]),
-        lambda: steps["pose"].oindex[[0]],
-    ):
-        with pytest.raises(DatasetError, match=r"the array .*/steps/pose cannot be read: .*; restore the file"):
-            read()
-    chunk.unlink()
-    os.mkfifo(chunk)
-    with pytest.raises(DatasetError, match="is not a regular file"):
-        _ = steps["pose"]
-
-
-def test_a_chunk_that_the_manifest_lists_must_be_there(store):
-    """Zarr reads a missing chunk as NaN or 0."""
-    (store / "manifest").mkdir(exist_ok=True)
-    array = store / "trajectory.zarr/objects/mass"
-    lines = "".join(f"{'0' * 64}  {path.relative_to(store)}\n" for path in sorted(array.iterdir()))
-    write_entry(store, lines)
-    assert len(synpick_warp.open(store).objects) > 0
-    (array / "c.0").unlink()
-    with pytest.raises(DatasetError, match=r"there is no .*objects/mass/c\.0, which the manifest lists"):
-        _ = synpick_warp.open(store).objects
-    write_entry(store, f"{'0' * 64}  trajectory.zarr/../../outside\n")
-    with pytest.raises(DatasetError, match=r"constants\.sha256, line 1, names the file"):
-        _ = synpick_warp.open(store).objects
-
-
-def write_entry(store: Path, lines: str) -> None:
-    """Write the manifest entry of the constants."""
-    content = {"files": lines.count("\n"), "checksum": hashlib.sha256(lines.encode()).hexdigest(), "bytes": 0}
-    (store / f"{CONSTANTS}.sha256").write_text(lines)
-    (store / f"{CONSTANTS}.json").write_bytes(encode_manifest(content))
-
-
-def test_tables_whose_lengths_differ_are_named(store):
-    change(store / "trajectory.zarr/objects/zarr.json", ("attributes", "names"), ["one"])
-    with pytest.raises(DatasetError, match=r"expected: .* of shape 1"):
-        _ = synpick_warp.open(store).objects
-    change(store / "trajectory.zarr/objects/zarr.json", ("attributes", "names"), 3)
-    with pytest.raises(DatasetError, match=r"zarr\.json is damaged: expected array, got int - at \$\.names"):
-        _ = synpick_warp.open(store).objects
-
-
-def test_folders_with_other_names_are_no_episodes(store):
-    for name in ("12abc", "0", "000²", "notes"):
-        (store / "trajectory.zarr" / "episodes" / name).mkdir()
-    assert list(synpick_warp.open(store)) == [0]

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.dataset.commit.file_names import check_file_names, describe_strays
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry, read_checksums
 from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.plausibility import check_file_names, describe_strays
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.bop.shards.tar_files import list_keys
@@ -194,7 +194,9 @@ PLACES = (
     "manifest",
     "manifest.json",
     "manifest/000000.json",
+    "manifest/000000.sha256",
     "manifest/.000001.json.new",
+    "models/models_info.json",
     "episodes.jsonl",
     "train_pbr/000000",
     "train_pbr/000000/scene_gt.json",

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.apps.validation.pictures import Mask
 from synpick_warp.apps.validation.registry import Findings, rule
+from synpick_warp.apps.validation.scene_files import Mask
 from synpick_warp.apps.validation.schemas import Annotation
 from synpick_warp.apps.validation.subjects import CocoFile, SceneSubject, ViewSubject
 from synpick_warp.exporters.writing.rle import find_run_boundaries

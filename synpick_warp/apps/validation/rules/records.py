@@ -1,13 +1,15 @@
-"""Rules about scene_camera.json and scene_gt.json: schema, indices, rotations, intrinsics, units."""
+"""Rules about scene_camera.json, scene_gt.json and scene_gt_info.json; the last by the definitions of the toolkit's calc_gt_info.py."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.apps.validation.registry import Findings, Level, rule
+from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
+from synpick_warp.apps.validation.schemas import Camera, Info, Truth
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 ROTATION_TOLERANCE = 1e-3
@@ -16,6 +18,10 @@ NEAR = 20.0
 """Largest distance that is taken for metres [mm]: no camera of a data set is this close to an object, and few are 20 m away."""
 MAX_DEPTH_SCALE = 100.0
 """Largest depth_scale [mm]; BOP's sets have 0.1 to 1."""
+FRACTION_TOLERANCE = 1e-3
+"""Largest error of visib_fract; files are often rounded."""
+EMPTY, SKIPPED = [-1, -1, -1, -1], [-1.0, -1.0, -1.0]
+"""Box of an instance without visible pixels, and translation that the toolkit takes for 'fully occluded, skip'."""
 _KEY = re.compile(r"-?[0-9]+")
 
 
@@ -55,74 +61,60 @@ def check_same_images(scene: SceneSubject) -> Findings:
 )
 def check_rotations(scene: SceneSubject) -> Findings:
     """Rotations (cam_R_m2c, cam_R_w2c) are orthonormal with determinant +1."""
-    camera, truth = scene.record("camera"), scene.record("gt")
-    places, matrices = [], []
-    for image, entry in scene.cameras.items():
-        if entry.cam_R_w2c is not UNSET:
-            places.append((camera.where(image), f"image {image}: cam_R_w2c"))
-            matrices.append(entry.cam_R_w2c)
-    for image, entries in scene.truths.items():
-        for index, item in enumerate(entries):
-            places.append((truth.where(image), f"image {image}, instance {index}: cam_R_m2c"))
-            matrices.append(item.cam_R_m2c)
-    if not matrices:
+    found = [(file, f"{place}: cam_R_w2c", entry.cam_R_w2c) for file, place, entry in _cameras(scene) if entry.cam_R_w2c is not UNSET]
+    found += [(file, f"{place}: cam_R_m2c", item.cam_R_m2c) for file, place, _, _, item in _truths(scene)]
+    if not found:
         return
-    rotations = np.reshape(np.array(matrices, np.float64), (-1, 3, 3))
+    rotations = np.reshape(np.array([matrix for *_, matrix in found], np.float64), (-1, 3, 3))
     off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     determinant = np.linalg.det(rotations)
     for row in np.flatnonzero((off > ROTATION_TOLERANCE) | (np.abs(determinant - 1.0) > ROTATION_TOLERANCE)).tolist():
-        file, place = places[row]
+        file, place, _ = found[row]
         yield file, f"{place} is no rotation: its determinant is {determinant[row]:.4g}, R Rᵀ differs from 1 by up to {off[row]:.2g}"
 
 
 @rule(SceneSubject, "camera-model", "keep one of the two; cam_K is fx s cx 0 fy cy 0 0 1 in pixels")
 def check_camera_model(scene: SceneSubject) -> Findings:
     """An image has either cam_K, with focal lengths above 0 and 0 0 1 as its last row, or cam_model; never both."""
-    record = scene.record("camera")
-    for image, entry in scene.cameras.items():
+    for file, place, entry in _cameras(scene):
         has_matrix, has_model = entry.cam_K is not UNSET, entry.cam_model is not UNSET
         if has_matrix == has_model:
-            yield record.where(image), f"image {image} has {'both cam_K and cam_model' if has_model else 'neither cam_K nor cam_model'}"
+            yield file, f"{place} has {'both cam_K and cam_model' if has_model else 'neither cam_K nor cam_model'}"
         if not isinstance(entry.cam_K, list):
             continue
         k = entry.cam_K
         if not (k[0] > 0.0 and k[4] > 0.0):
-            yield record.where(image), f"image {image}: focal lengths {k[0]:g} and {k[4]:g} px in cam_K"
+            yield file, f"{place}: focal lengths {k[0]:g} and {k[4]:g} px in cam_K"
         elif k[3] or k[6] or k[7] or k[8] != 1.0:
             hint = "; it looks column by column" if k[6] and k[7] and not k[2] and not k[5] else ""
-            yield record.where(image), f"image {image}: cam_K is no intrinsic matrix{hint}"
+            yield file, f"{place}: cam_K is no intrinsic matrix{hint}"
 
 
 @rule(SceneSubject, "depth-scale", "add depth_scale: the toolkit's calc_gt_info.py, calc_gt_masks.py and VSD read it")
 def check_depth_scale(scene: SceneSubject) -> Findings:
     """scene_camera.json has a depth_scale above 0 for every image with depth: millimetres per count."""
-    record = scene.record("camera")
-    for image, entry in scene.cameras.items() if "depth" in scene.files.kinds else ():
+    for file, place, entry in _cameras(scene) if "depth" in scene.files.kinds else ():
         if entry.depth_scale is UNSET:
-            yield record.where(image), f"image {image} has no depth_scale"
+            yield file, f"{place} has no depth_scale"
         elif not 0.0 < entry.depth_scale <= MAX_DEPTH_SCALE:
-            yield record.where(image), f"image {image}: depth_scale is {entry.depth_scale:g}; expected: above 0, up to {MAX_DEPTH_SCALE:g}"
+            yield file, f"{place}: depth_scale is {entry.depth_scale:g}; expected: above 0, up to {MAX_DEPTH_SCALE:g}"
 
 
 @rule(SceneSubject, "skip-translation", "write the pose, also of hidden instances, or leave the instance out")
 def check_skip_translation(scene: SceneSubject) -> Findings:
     """No instance has the translation -1, -1, -1, which the toolkit takes for 'fully occluded, skip'."""
-    record = scene.record("gt")
-    for image, entries in scene.truths.items():
-        for index, item in enumerate(entries):
-            if item.cam_t_m2c == [-1.0, -1.0, -1.0]:
-                yield record.where(image), f"image {image}, instance {index}: cam_t_m2c is -1, -1, -1"
+    for file, place, _, _, item in _truths(scene):
+        if item.cam_t_m2c == SKIPPED:
+            yield file, f"{place}: cam_t_m2c is -1, -1, -1"
 
 
 @rule(SceneSubject, "translation-units", "multiply cam_t_m2c by 1000 if it is in metres")
 def check_units(scene: SceneSubject) -> Findings:
     """Translations of instances are in millimetres."""
-    record = scene.record("gt")
-    for image, entries in scene.truths.items():
-        for index, item in enumerate(entries):
-            length = float(np.linalg.norm(item.cam_t_m2c))
-            if length < NEAR and item.cam_t_m2c != [-1.0, -1.0, -1.0]:
-                yield record.where(image), f"image {image}, instance {index}: {length:.3g} mm from the camera; it looks like metres"
+    for file, place, _, _, item in _truths(scene):
+        length = float(np.linalg.norm(item.cam_t_m2c))
+        if length < NEAR and item.cam_t_m2c != SKIPPED:
+            yield file, f"{place}: {length:.3g} mm from the camera; it looks like metres"
 
 
 @rule(SceneSubject, "camera-units", "multiply cam_t_w2c by 1000 if it is in metres", level=Level.WARNING)
@@ -136,22 +128,19 @@ def check_camera_units(scene: SceneSubject) -> Findings:
 @rule(SceneSubject, "extrinsics", "add the missing one, or remove the other")
 def check_extrinsics(scene: SceneSubject) -> Findings:
     """cam_R_w2c and cam_t_w2c come together."""
-    record = scene.record("camera")
-    for image, entry in scene.cameras.items():
+    for file, place, entry in _cameras(scene):
         if (entry.cam_R_w2c is UNSET) != (entry.cam_t_w2c is UNSET):
-            yield record.where(image), f"image {image} has only one of cam_R_w2c and cam_t_w2c"
+            yield file, f"{place} has only one of cam_R_w2c and cam_t_w2c"
 
 
 @rule(SceneSubject, "behind-camera", "convert poses of an OpenGL camera by diag(1, -1, -1)")
 def check_in_front(scene: SceneSubject) -> Findings:
     """Instances with visible pixels are in front of the camera (z above 0; OpenCV's axes: x right, y down, z forward)."""
-    record = scene.record("gt")
-    for image, entries in scene.truths.items():
+    for file, place, image, index, item in _truths(scene):
         infos = scene.infos.get(image, [])
-        for index, item in enumerate(entries):
-            seen = index >= len(infos) or infos[index].px_count_visib > 0
-            if item.cam_t_m2c[2] <= 0.0 and seen and item.cam_t_m2c != [-1.0, -1.0, -1.0]:
-                yield record.where(image), f"image {image}, instance {index}: z is {item.cam_t_m2c[2]:g} mm, behind the camera"
+        seen = index >= len(infos) or infos[index].px_count_visib > 0
+        if item.cam_t_m2c[2] <= 0.0 and seen and item.cam_t_m2c != SKIPPED:
+            yield file, f"{place}: z is {item.cam_t_m2c[2]:g} mm, behind the camera"
 
 
 @rule(SceneSubject, "instance-ids", "write the identity of each object over the scene; BOP's ground-truth index is only a list position")
@@ -172,8 +161,99 @@ def check_instance_ids(scene: SceneSubject) -> Findings:
 def check_object_models(scene: SceneSubject) -> Findings:
     """Every obj_id of scene_gt.json has a model obj_NNNNNN.ply in models (T-LESS: models_cad)."""
     models, reported = scene.layout.model_files, set()
-    for image, entries in scene.truths.items() if models else ():
-        for index, item in enumerate(entries):
-            if item.obj_id not in models and item.obj_id not in reported:
-                reported.add(item.obj_id)
-                yield scene.record("gt").where(image), f"image {image}, instance {index}: there is no model of obj_id {item.obj_id}"
+    for file, place, _, _, item in _truths(scene) if models else ():
+        if item.obj_id not in models and item.obj_id not in reported:
+            reported.add(item.obj_id)
+            yield file, f"{place}: there is no model of obj_id {item.obj_id}"
+
+
+@rule(SceneSubject, "list-lengths", "make scene_gt_info.json again from scene_gt.json (calc_gt_info.py)")
+def check_lengths(scene: SceneSubject) -> Findings:
+    """scene_gt_info.json has as many entries for an image as scene_gt.json, in the same order."""
+    record = scene.record("gt_info")
+    for image, infos in scene.infos.items():
+        truths = scene.truths.get(image)
+        if truths is not None and len(truths) != len(infos):
+            yield record.where(image), f"image {image} has {len(infos)} infos, but {len(truths)} instances"
+
+
+@rule(SceneSubject, "visible-fraction", "compute it from the two counts", unit="px")
+def check_fraction(scene: SceneSubject) -> Findings:
+    """visib_fract is px_count_visib / px_count_all, or 0 if px_count_all is 0."""
+    for file, place, obj_id, info in _infos(scene):
+        expected = info.px_count_visib / info.px_count_all if info.px_count_all else 0.0
+        text = f"{place}: visib_fract is {info.visib_fract:.4g}, but the counts give {expected:.4g}"
+        if abs(info.visib_fract - min(expected, 1.0)) > FRACTION_TOLERANCE and abs(info.visib_fract - expected) > FRACTION_TOLERANCE:
+            yield file, text
+        else:
+            # Clipped at 1: the visible mask has more pixels than the silhouette.
+            error = abs(info.visib_fract - expected)
+            yield Deviation(file, text, obj_id, error * info.px_count_all / _outline(info), error > FRACTION_TOLERANCE)
+
+
+@rule(SceneSubject, "count-order", "count px_count_all over the whole silhouette, up to one image size beyond each border", unit="px")
+def check_order(scene: SceneSubject) -> Findings:
+    """px_count_visib and px_count_valid are at most px_count_all, which includes the silhouette beyond the image."""
+    for file, place, obj_id, info in _infos(scene):
+        excess = max(0, info.px_count_visib - info.px_count_all)
+        text = f"{place}: px_count_visib is {info.px_count_visib}, more than px_count_all, {info.px_count_all}"
+        yield Deviation(file, text, obj_id, excess / _outline(info), excess > 0)
+        if info.px_count_valid > info.px_count_all:
+            yield file, f"{place}: px_count_valid is {info.px_count_valid}, more than px_count_all, {info.px_count_all}"
+
+
+@rule(SceneSubject, "hidden-boxes", "write four times -1 for instances of which no pixel is visible, and boxes for all others")
+def check_hidden_boxes(scene: SceneSubject) -> Findings:
+    """bbox_obj and bbox_visib are -1, -1, -1, -1 if px_count_visib is 0, and only then."""
+    for file, place, _, info in _infos(scene):
+        for name in ("bbox_obj", "bbox_visib"):
+            box = getattr(info, name)
+            if (box == EMPTY) != (info.px_count_visib == 0):
+                yield file, f"{place}: {name} is {box}, px_count_visib is {info.px_count_visib}"
+            elif box != EMPTY and min(box[2:]) < 0:
+                yield file, f"{place}: {name} is {box}; its size is negative"
+
+
+@rule(SceneSubject, "box-inside-box", "compute both from the masks: x_min, y_min, x_max - x_min, y_max - y_min", unit="px")
+def check_nested_boxes(scene: SceneSubject) -> Findings:
+    """bbox_visib lies inside bbox_obj."""
+    for file, place, obj_id, info in _infos(scene):
+        outer, inner = info.bbox_obj, info.bbox_visib
+        if EMPTY in (outer, inner):
+            continue
+        beyond = [side - limit for side, limit in zip(box_sides(inner), box_sides(outer), strict=True)]
+        text = f"{place}: bbox_visib {inner} reaches out of bbox_obj {outer}"
+        yield Deviation(file, text, obj_id, max(0, *beyond), max(beyond) > 0)
+
+
+def box_sides(box: list[int]) -> tuple[int, int, int, int]:
+    """Extents of a box to the left, top, right and bottom, each the larger the farther the box reaches: -x, -y, x + width, y + height."""
+    return -box[0], -box[1], box[0] + box[2], box[1] + box[3]
+
+
+def _outline(info: Info) -> int:
+    """Length of the outline of an instance [px], by which differences of counts are divided: that of its box."""
+    return 2 * (max(info.bbox_obj[2], 0) + max(info.bbox_obj[3], 0) + 2)
+
+
+def _cameras(scene: SceneSubject) -> Iterator[tuple[str, str, Camera]]:
+    """Yield (file, place for messages, entry) of each image in scene_camera.json."""
+    record = scene.record("camera")
+    yield from ((record.where(image), f"image {image}", entry) for image, entry in scene.cameras.items())
+
+
+def _truths(scene: SceneSubject) -> Iterator[tuple[str, str, int, int, Truth]]:
+    """Yield (file, place for messages, image, index, entry) of each instance in scene_gt.json."""
+    record = scene.record("gt")
+    for image, entries in scene.truths.items():
+        yield from ((record.where(image), f"image {image}, instance {index}", image, index, item) for index, item in enumerate(entries))
+
+
+def _infos(scene: SceneSubject) -> Iterator[tuple[str, str, int, Info]]:
+    """Yield (file, place for messages, obj_id, entry) of each instance in scene_gt_info.json; obj_id 0: unknown."""
+    record = scene.record("gt_info")
+    for image, infos in scene.infos.items():
+        truths = scene.truths.get(image, [])
+        for index, info in enumerate(infos):
+            obj_id = truths[index].obj_id if index < len(truths) else 0
+            yield record.where(image), f"image {image}, instance {index}", obj_id, info

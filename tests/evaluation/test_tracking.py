@@ -1,4 +1,4 @@
-"""The paper's filter on analytic trajectories: noise at rest, lag in motion, the shorter arc, gaps, order of rows, refused input."""
+"""Tracking over time: association of estimates, the paper's filter on analytic trajectories, and the sweep of its weight."""
 
 from __future__ import annotations
 
@@ -10,12 +10,128 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from synpick_warp.apps.evaluation import PAPER_ALPHAS, PoseTable, filter_poses
+from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.tracking import (
+    PAPER_ALPHAS,
+    SWEEP_ALPHAS,
+    filter_poses,
+    find_tracks,
+    split_by_mode,
+    sweep_alpha,
+    track_of_instance,
+)
 from synpick_warp.errors import ConfigError, DatasetError
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import FRAME, Motion, estimates, noisy_tables, true_poses
 
 ALPHAS = (0.05, 0.2, 0.5, 0.9)
+
+
+# ---- tracks ----
+
+
+def purity(tracks: np.ndarray, truth: np.ndarray) -> float:
+    """Fraction of rows whose true instance is their track's most frequent one."""
+    return sum(np.bincount(truth[tracks == track]).max() for track in np.unique(tracks)) / len(tracks)
+
+
+def test_a_single_instance_is_one_track_whatever_its_jumps_and_gaps():
+    table = estimates(true_poses(Motion(velocity=(0.5, 0, 0))), noise=0.05, outliers=0.3, jump=2.0, missing=0.5)
+    assert (find_tracks(table) == 0).all()
+
+
+def test_tracks_are_sorted_by_scene_object_and_first_image():
+    table = true_poses(
+        Motion(scene=2), Motion(scene=1, object_id=5), Motion(scene=1, object_id=3), Motion(scene=1, object_id=3, start=(1, 0, 1))
+    )
+    tracks = find_tracks(table)
+    keys = [(int(table.scene[tracks == one][0]), int(table.object_id[tracks == one][0])) for one in range(4)]
+    assert keys == [(1, 3), (1, 3), (1, 5), (2, 17)]
+    assert np.bincount(tracks).tolist() == [100] * 4
+
+
+def test_instances_of_an_object_that_pass_each_other_stay_apart():
+    truth = true_poses(Motion(start=(-0.2, 0.0, 2), velocity=(0.06, 0, 0)), Motion(start=(0.2, 0.1, 2), velocity=(-0.06, 0, 0), instance=1))
+    hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1))
+    assert purity(find_tracks(hidden), truth.instance) == 1.0
+
+
+def test_an_outlier_next_to_another_instance_does_not_swap_tracks():
+    truth = true_poses(Motion(start=(0, 0, 2)), Motion(start=(0.1, 0, 2), instance=1))
+    hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1), translation=truth.translation.copy())
+    hidden.translation[(truth.image == 50) & (truth.instance == 0)] = [0.5, 0, 2]
+    assert purity(find_tracks(hidden), truth.instance) == 1.0
+
+
+def test_the_choice_of_axes_does_not_matter_among_crowded_instances():
+    crowd = true_poses(*(Motion(start=(0.05 * instance, 0, 2), instance=instance, images=60) for instance in range(4)))
+    table = estimates(crowd, noise=0.05)
+    turn = Rotation.from_rotvec([0.4, -0.7, 1.1])
+    turned = dataclasses.replace(table, translation=turn.apply(table.translation))
+    np.testing.assert_array_equal(find_tracks(turned), find_tracks(table))
+
+
+def test_the_instance_that_stays_keeps_its_track_when_the_other_is_picked():
+    truth = true_poses(Motion(start=(0, 0, 2), images=30), Motion(start=(0.2, 0, 2), instance=1))
+    hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1))
+    assert purity(find_tracks(hidden), truth.instance) == 1.0
+
+
+def test_known_instances_are_tracks_though_they_change_places():
+    truth = true_poses(Motion(start=(0, 0, 2)), Motion(start=(0.2, 0, 2), instance=1))
+    swapped = dataclasses.replace(truth, translation=np.where((truth.image % 2 == 0)[:, None], truth.translation, 2.0 - truth.translation))
+    np.testing.assert_array_equal(find_tracks(swapped), truth.instance)
+
+
+def test_two_estimates_of_an_image_are_never_one_track_even_if_equal():
+    once = true_poses(Motion(images=5))
+    twice = once.select(np.repeat(np.arange(5), 2))
+    for known in (0, -1):
+        tracks = find_tracks(dataclasses.replace(twice, instance=np.full(10, known)))
+        assert sorted(tracks[:2]) == [0, 1]
+        assert np.bincount(tracks).tolist() == [5, 5]
+
+
+def test_the_track_of_a_true_instance_is_the_one_most_often_nearest():
+    truth = true_poses(Motion(start=(0, 0, 2)), Motion(start=(0.2, 0, 2), instance=1), Motion(scene=2), Motion(object_id=3))
+    table = estimates(truth, noise=0.02, outliers=0.1, missing=0.2)
+    tracks = find_tracks(table)
+    for instance in range(2):
+        one = truth.select((truth.scene == 1) & (truth.object_id == 17) & (truth.instance == instance))
+        rows = track_of_instance(one, table, tracks)
+        assert (table.scene[rows] == 1).all()
+        assert (table.object_id[rows] == 17).all()
+        assert (np.diff(table.image[rows]) > 0).all()
+        np.testing.assert_allclose(np.median(table.translation[rows], axis=0), one.translation[0], atol=0.01)
+        shuffled = np.random.default_rng(0).permutation(len(table))
+        np.testing.assert_array_equal(shuffled[track_of_instance(one, table.select(shuffled), tracks[shuffled])], rows)
+    gone = dataclasses.replace(one, object_id=one.object_id + 100)
+    assert len(track_of_instance(gone, table, tracks)) == 0
+
+
+@given(noisy_tables())
+@settings(max_examples=fuzz_examples(100), deadline=None)
+def test_fuzz_tracks_never_mix_scenes_objects_or_instances_nor_hold_two_rows_of_an_image(table):
+    tracks = find_tracks(table)
+    assert sorted(np.unique(tracks)) == list(range(len(np.unique(tracks))))
+    for track in np.unique(tracks):
+        rows = tracks == track
+        for name in ("scene", "object_id", "instance"):
+            assert len(np.unique(getattr(table, name)[rows])) == 1
+        assert len(np.unique(table.image[rows])) == rows.sum()
+
+
+@given(noisy_tables())
+@settings(max_examples=fuzz_examples(100), deadline=None)
+def test_fuzz_a_group_has_as_many_tracks_as_its_fullest_image(table):
+    tracks = find_tracks(table)
+    key = np.stack((table.scene, table.object_id, table.instance), axis=1)
+    for group in np.unique(key, axis=0):
+        rows = (key == group).all(axis=1)
+        assert len(np.unique(tracks[rows])) == np.bincount(table.image[rows]).max()
+
+
+# ---- filter ----
 
 
 def with_poses(table: PoseTable, rotation: Rotation | None = None, translation: np.ndarray | None = None) -> PoseTable:
@@ -36,12 +152,6 @@ def by_hand(table: PoseTable, alpha: float) -> tuple[np.ndarray, Rotation]:
         mean.append((1 - alpha) * mean[-1] + alpha * table.translation[row])
         turn.append(Slerp([0.0, 1.0], Rotation.concatenate([turn[-1], turns[row]]))(alpha))
     return np.array(mean), Rotation.concatenate(turn)
-
-
-def test_the_first_three_positions_by_hand():
-    table = with_poses(true_poses(Motion(images=3)), translation=np.array([[0.0, 0, 1], [1.0, 0, 1], [1.0, 2, 1]]))
-    filtered = filter_poses(table, 0.25)
-    np.testing.assert_allclose(filtered.translation, [[0, 0, 1], [0.25, 0, 1], [0.4375, 0.5, 1]], atol=1e-15)
 
 
 def test_alpha_is_the_papers_and_weighs_the_new_estimate():
@@ -94,14 +204,6 @@ def test_rotations_take_the_shorter_arc():
     np.testing.assert_allclose(halves, Rotation.from_euler("z", [[0.0], [180.0]], degrees=True).as_matrix(), atol=1e-12)
 
 
-def test_the_sign_of_a_quaternion_does_not_matter():
-    quaternion = Rotation.from_rotvec(np.outer(np.arange(30), [0.02, -0.05, 0.1])).as_quat()
-    signs = np.where(np.arange(30) % 2, -1.0, 1.0)[:, None]
-    truth = true_poses(Motion(images=30))
-    plain, flipped = (filter_poses(with_poses(truth, Rotation.from_quat(one)), 0.2) for one in (quaternion, signs * quaternion))
-    np.testing.assert_allclose(plain.rotation, flipped.rotation, atol=1e-14)
-
-
 def test_half_a_turn_ends_halfway_on_either_arc():
     turn = Rotation.from_euler("z", [[0.0], [180.0]], degrees=True)
     table = with_poses(true_poses(Motion(images=2)), turn)
@@ -128,31 +230,15 @@ def test_alpha_one_changes_nothing_and_all_else_stays():
 
 
 def test_a_table_without_rows_stays_empty():
-    assert len(filter_poses(true_poses(Motion()).select(np.zeros(100, bool)))) == 0
+    empty = true_poses(Motion()).select(np.zeros(100, bool))
+    assert len(filter_poses(empty)) == len(find_tracks(empty)) == 0
 
 
 def test_the_input_is_not_written_to():
     table = estimates(true_poses(Motion()), noise=0.01, angle=0.1)
     for name in ("translation", "rotation"):
         getattr(table, name).setflags(write=False)
-    filter_poses(table, symmetries={17: np.eye(4)[None]})
-
-
-def test_jumps_between_equivalent_poses_pull_the_filter_unless_symmetries_are_given():
-    half_turn = np.eye(4)
-    half_turn[:3, :3] = np.diag([-1.0, -1.0, 1.0])
-    half_turn[:3, 3] = [0.02, 0.0, 0.0]
-    truth = true_poses(Motion(images=60))
-    odd = truth.image % 3 == 2
-    rotation = np.where(odd[:, None, None], truth.rotation @ half_turn[:3, :3], truth.rotation)
-    translation = truth.translation + odd[:, None] * (truth.rotation @ half_turn[:3, 3])
-    table = dataclasses.replace(truth, rotation=rotation, translation=translation)
-    filtered = filter_poses(table, 0.2, symmetries={17: np.stack((np.eye(4), half_turn))})
-    assert angles(filtered, truth).max() < 1e-7
-    np.testing.assert_allclose(filtered.translation, truth.translation, atol=1e-12)
-    assert angles(filter_poses(table, 0.2), truth).max() > 0.5
-    other = filter_poses(table, 0.2, symmetries={3: np.stack((np.eye(4), half_turn))})
-    np.testing.assert_array_equal(other.rotation, filter_poses(table, 0.2).rotation)
+    filter_poses(table)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -0.1, 1.0001, float("nan"), float("inf")])
@@ -174,20 +260,6 @@ def test_a_left_handed_or_singular_rotation_is_refused():
     table.rotation[3] = np.diag([1.0, 1.0, -1.0])
     with pytest.raises(DatasetError, match=r"^matrix 3 of the estimates is no rotation"):
         filter_poses(table)
-    with pytest.raises(DatasetError, match=r"^matrix 1 of the symmetries of object 5 is no rotation"):
-        filter_poses(true_poses(Motion()), symmetries={5: np.stack((np.eye(4), np.diag([1.0, 0.0, 0.0, 1.0])))})
-
-
-def test_tracks_that_do_not_fit_are_refused():
-    table = true_poses(Motion(images=3), Motion(object_id=2, images=3))
-    with pytest.raises(DatasetError, match="give one track index a row"):
-        filter_poses(table, tracks=np.zeros(2, int))
-    with pytest.raises(DatasetError, match="track 0 mixes scenes or objects"):
-        filter_poses(table, tracks=np.zeros(6, int))
-    with pytest.raises(DatasetError, match="shape"):
-        filter_poses(dataclasses.replace(table, image=table.image[:2]))
-    with pytest.raises(DatasetError, match="symmetries of object 2 have shape"):
-        filter_poses(table, symmetries={2: np.eye(4)})
 
 
 @given(noisy_tables(), st.floats(0.01, 1.0), st.integers(0, 2**31))
@@ -222,18 +294,42 @@ def test_fuzz_a_rigid_change_of_the_camera_frame_commutes_with_the_filter(table,
     np.testing.assert_allclose(after.rotation, turn @ straight.rotation, atol=1e-6)
 
 
-@given(st.lists(st.integers(0, 3), min_size=2, max_size=20), st.floats(0.3, 1.0), st.integers(0, 2**31))
-@settings(max_examples=fuzz_examples(50), deadline=None)
-def test_fuzz_with_symmetries_it_does_not_matter_which_equivalent_pose_came(choices, alpha, seed):
-    # Quarter turns about an axis beside the model's origin; motion and noise stay far below the 45° where two are as near.
-    quarter = np.eye(4)
-    quarter[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    quarter[:3, 3] = [0.03, -0.01, 0]
-    group = np.stack([np.linalg.matrix_power(quarter, power) for power in range(4)])
-    table = estimates(true_poses(Motion(spin=(0.2, 0.3, -0.4), images=len(choices))), seed, noise=0.01, angle=0.03)
-    chosen = group[[0, *choices[1:]]]
-    translation = table.translation + np.einsum("nij,nj->ni", table.rotation, chosen[:, :3, 3])
-    jumping = dataclasses.replace(table, rotation=table.rotation @ chosen[:, :3, :3], translation=translation)
-    smooth, filtered = filter_poses(table, alpha), filter_poses(jumping, alpha, symmetries={17: group})
-    np.testing.assert_allclose(filtered.translation, smooth.translation, atol=1e-9)
-    np.testing.assert_allclose(filtered.rotation, smooth.rotation, atol=1e-9)
+# ---- sweep ----
+
+
+def accuracy(truth: PoseTable, table: PoseTable) -> float:
+    """Minus the mean squared position error [m²], after the first 100 images."""
+    return -float(np.mean((table.translation - truth.translation)[truth.image >= 100] ** 2))
+
+
+def test_at_rest_the_smallest_alpha_is_best_and_in_motion_the_one_of_least_noise_and_lag():
+    noise, velocity = 0.01, 0.02
+    rest = true_poses(*(Motion(scene=scene, images=300) for scene in range(20)))
+    moving = true_poses(*(Motion(scene=scene, images=300, velocity=(velocity,) * 3) for scene in range(20)))
+    tables = {"pick": estimates(rest, noise=noise), "move": estimates(moving, noise=noise)}
+    alphas = np.array([0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0])
+    truths = {"pick": rest, "move": moving}
+    sweep = sweep_alpha(tables, lambda mode, table: accuracy(truths[mode], table), alphas.tolist())
+    expected = noise**2 * alphas / (2 - alphas) + (velocity * FRAME * (1 - alphas) / alphas) ** 2
+    np.testing.assert_allclose(-sweep.scores[1], expected, rtol=0.1)
+    assert sweep.best("pick")[0] == 0.02
+    assert sweep.best("move")[0] == alphas[np.argmin(expected)] == 0.3
+    np.testing.assert_allclose(sweep.scores[:, -1], sweep.unfiltered)
+
+
+def test_among_equal_scores_the_largest_alpha_is_best():
+    sweep = sweep_alpha({"pick": true_poses(Motion())}, lambda mode, table: 1.0)
+    assert sweep.alphas == SWEEP_ALPHAS
+    assert sweep.best("pick") == (1.0, 1.0)
+
+
+def test_estimates_are_split_by_the_mode_of_their_scenes():
+    table = true_poses(*(Motion(scene=scene, images=3) for scene in (4, 5, 6)))
+    parts = split_by_mode(table, {6: "pick", 5: "move", 4: "pick", 9: "target"})
+    assert list(parts) == ["pick", "move", "target"]
+    assert [np.unique(part.scene).tolist() for part in parts.values()] == [[4, 6], [5], []]
+
+
+def test_a_mode_without_estimates_is_scored_too():
+    empty = true_poses(Motion()).select(np.arange(0))
+    assert sweep_alpha({"move": empty}, lambda mode, table: len(table)).scores.tolist() == [[0.0] * len(SWEEP_ALPHAS)]

@@ -1,23 +1,28 @@
-"""Plausibility of an episode's number of frames: no more than the sizes of its files allow.
+"""Plausibility of a data set's own records: names in checksum lists, and numbers of frames.
+
+A list in a folder that somebody else made could name `.git/hooks/post-checkout` or `Makefile`; files are copied by lists, so a list is
+compared with the names in `format_table` first: only those that its formats write. They follow from the settings alone.
 
 A record states how many frames an episode has, and may be edited or damaged; arrays, loops and tasks follow from the number. So it is
-compared with what is there before anything is made of it.
+compared with the sizes of the files that are there before anything is made of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import functools
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.commit.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.formats import part_files
+from synpick_warp.exporters.formats import format_table, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.system.inputs.files import describe_bytes
-
-if TYPE_CHECKING:
-    from synpick_warp.configs.dataset.splits import DataLayout
 
 _HARMLESS = 1000
 """Number of frames up to which nothing is compared: reading finds what is missing, and says so better."""
@@ -25,6 +30,59 @@ _CAMERA, _MEMBERS = 40, 5 * 1024
 """Least bytes that a frame takes in scene_camera.json ("0": {"cam_K": nine numbers}), and in a shard (five members with headers)."""
 _TIME = 0.125
 """The same of the times in a trajectory: zstd's highest level makes one byte of five of these float64."""
+
+
+@functools.lru_cache(maxsize=4)
+def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
+    """Regular expression of the file names that the formats write in an entry: of an episode, or the constants."""
+    formats = [format_table()[name] for name in dict.fromkeys(layout.formats)]
+    names = (row.constants if entry == CONSTANTS else row.episode(layout, int(entry.name)) for row in formats)
+    return re.compile("|".join(dict.fromkeys(names)))
+
+
+def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: DataLayout) -> None:
+    """Check that a checksum list names only files that the formats of a data set write.
+
+    Args:
+        folder: The data set.
+        entry: Manifest entry of the list: of the constants, or of an episode.
+        names: Names in the list, relative to the data set.
+        layout: Layout of the data set.
+
+    Raises:
+        DatasetError: It names another file.
+    """
+    matches = _pattern(layout, entry).fullmatch
+    foreign = next((name for name in names if not matches(name)), None)
+    if foreign is not None:
+        raise DatasetError(
+            f'{folder / entry}.sha256 names "{foreign[:MAX_SHOWN]}", which none of its formats writes; {entry_advice(entry)}'
+        )
+
+
+def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -> str:
+    """Name what lies beside the parts that indices are joined from and belongs to no committed episode.
+
+    Args:
+        folder: The data set.
+        layout: Its layout.
+        episodes: Its committed episodes.
+
+    Returns:
+        A sentence; empty: there is nothing.
+    """
+    strays = []
+    known = set(episodes)
+    for name, row in format_table().items():
+        part = row.part
+        if part is not None and part.joined and name in layout.formats and (folder / part.folder).is_dir():
+            count = layout.cameras if part.per_scene else 1
+            parts = {f"{number:06d}{part.suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
+            strays += sorted(f"{part.folder}/{entry.name}" for entry in os.scandir(folder / part.folder) if entry.name not in parts)
+    if not strays:
+        return ""
+    more = f" and {len(strays) - 1} more" if len(strays) > 1 else ""
+    return f"left out: {folder}/{ascii(strays[0])[1:-1][:MAX_SHOWN]}{more}, of no committed episode"
 
 
 def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: int) -> None:

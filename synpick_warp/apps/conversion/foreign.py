@@ -10,23 +10,23 @@ import dataclasses
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from functools import cached_property
+from collections.abc import Sequence
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from synpick_warp.apps.conversion.rendered import REMARK, render_masks
 from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles
+from synpick_warp.apps.validation.comparison import MEASURED_DEPTH
+from synpick_warp.apps.validation.rendering import ObjectRenderer
 from synpick_warp.codes import Ending
+from synpick_warp.configs.calibration.lens import read_lens
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.dataset.bop.layout import TARGETS
-from synpick_warp.dataset.bop.measured import measure_info
-from synpick_warp.dataset.bop.models import models_folder
-from synpick_warp.dataset.bop.scenes import FoundScenes
-from synpick_warp.dataset.object_names import object_names
+from synpick_warp.dataset.bop.foreign import ForeignScenes, measure_info
+from synpick_warp.dataset.bop.layout import TARGETS, Layout
+from synpick_warp.dataset.bop.models import models_folder, object_names
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import ConfigError, DatasetError
@@ -48,6 +48,10 @@ from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
 from synpick_warp.system.progress import Report
 from synpick_warp.views.frames import EpisodeEnd
 
+REMARK = (
+    "Masks are rendered from models and poses, since the source has none: visible is where no annotated object and, by more than"
+    f" {MEASURED_DEPTH:.0f} mm, no measured depth is nearer."
+)
 _IMAGES = {"views", "masks"}
 """Kinds of `formats.Content` that these data sets have."""
 _NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
@@ -62,15 +66,23 @@ _JPEG_QUALITY = 95
 """JPEG quality of colour images that are encoded again: they are neither PNG nor JPEG, or differ in type from the first one."""
 
 
-class FoundViewFiles(StoredViewFiles):
-    """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, amodal masks may be missing."""
+class ForeignViewFiles(StoredViewFiles):
+    """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, missing masks are rendered."""
 
-    suffix, size, root = "", (0, 0), Path()
-    """Of all colour images; width and height [px]; folder of the data set."""
+    def __init__(self, files: SceneFiles, scene: int, frame: int, suffix: str, size: tuple[int, int], root: Path) -> None:
+        """
+        Args:
+            files, scene, frame: See `StoredViewFiles`.
+            suffix: Of all colour images.
+            size: Width and height of all images [px].
+            root: Folder of the data set.
+        """
+        super().__init__(files, scene, frame)
+        self.suffix, self.size, self.root = suffix, size, root
 
     @property
     def gt_info(self) -> list[dict[str, Any]]:
-        """See `EncodedView`; measured where masks are rendered."""
+        """Entries in scene_gt_info.json, measured where masks are rendered."""
         if self.files.has("mask_visib") or self.files.has("gt_info"):
             return super().gt_info
         return measure_info([visible for _, visible in self._rendered], [amodal for amodal, _ in self._rendered])
@@ -82,7 +94,6 @@ class FoundViewFiles(StoredViewFiles):
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """See `EncodedView`."""
         size = self.files.image_size(self.frame)
         if size != self.size:
             shown, first = (f"{width} x {height}" for width, height in (size, self.size))
@@ -94,12 +105,11 @@ class FoundViewFiles(StoredViewFiles):
         return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
 
     def layer(self, name: str) -> Buffer:
-        """See `StoredView`."""
         suffix, data = self.files.image_file(name, self.frame)
         return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
-        """See `EncodedView`; where there are no amodal masks, COCO's formats need none; without masks, they are rendered."""
+        """Run lengths of masks; where there are no amodal ones, COCO's formats need none; without masks, they are rendered."""
         if not self.files.has("mask_visib"):
             return [Masks(find_runs(amodal), find_runs(visible)) for amodal, visible in self._rendered]
         visible = self._runs("mask_visib")
@@ -109,20 +119,53 @@ class FoundViewFiles(StoredViewFiles):
         return [find_runs(mask) for mask in self.files.masks(name, self.frame, len(self.gt))]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FoundSceneFiles(StoredSceneFiles):
-    """`StoredScene` of any BOP scene."""
+@cache
+def _renderer(root: Path) -> ObjectRenderer:
+    """Renderer of a data set's models, one a process."""
+    return ObjectRenderer(Layout(root))
 
-    suffix: str
-    size: tuple[int, int]
-    root: Path
 
-    def views(self, frames: range) -> Iterator[StoredViewFiles]:
-        """See `StoredScene`."""
-        for frame in frames:
-            view = FoundViewFiles(self.files, self.scene, self.images[frame])
-            view.suffix, view.size, view.root = self.suffix, self.size, self.root
-            yield view
+def render_masks(
+    root: Path, files: SceneFiles, frame: int, camera: dict[str, Any], gt: list[dict[str, Any]]
+) -> list[tuple[np.ndarray, ...]]:
+    """Render the amodal and visible mask (H, W) bool of each instance of a view.
+
+    Args:
+        root: Folder of the data set, which has the models.
+        files: Files of the scene.
+        frame: BOP im_id.
+        camera: Entry in scene_camera.json.
+        gt: Entries in scene_gt.json.
+
+    Raises:
+        DatasetError: An object has no model, or the image no intrinsics.
+        CatalogError: A model cannot be read.
+    """
+    if "cam_K" not in camera:
+        raise DatasetError(f"{files.place}: the camera of image {frame} has no cam_K, by which masks are rendered")
+    size = files.image_size(frame)
+    matrix, lens = np.reshape(np.asarray(camera["cam_K"], np.float64), (3, 3)), read_lens(camera, size)
+    measured, nearest = None, np.full(size[::-1], np.inf, np.float32)
+    if files.has("depth") and "depth_scale" in camera:
+        measured = files.typed_image("depth", frame, None, "uint16") * np.float32(camera["depth_scale"])
+    found = []
+    for truth in gt:
+        rotation, translation = (np.asarray(truth[name], np.float64) for name in ("cam_R_m2c", "cam_t_m2c"))
+        patch = _renderer(root).render(int(truth["obj_id"]), rotation.reshape(3, 3), translation.reshape(3), matrix, size, lens)
+        window = np.s_[patch.top : patch.top + patch.depth.shape[0], patch.left : patch.left + patch.depth.shape[1]]
+        nearest[window] = np.minimum(nearest[window], patch.depth)
+        found.append((patch.depth, window))
+    return [_make_masks(depth, window, nearest, measured) for depth, window in found]
+
+
+def _make_masks(depth: np.ndarray, window: Any, nearest: np.ndarray, measured: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    """Amodal and visible mask (H, W) bool of an object by its depth in a window, the nearest of all, and that of the image (None: none)."""
+    amodal, visible = np.zeros((2, *nearest.shape), bool)
+    amodal[window] = np.isfinite(depth)
+    visible[window] = amodal[window] & (depth <= nearest[window])
+    if measured is not None:
+        visible[window] &= (measured[window] == 0) | (measured[window] >= depth - np.float32(MEASURED_DEPTH))
+    return amodal, visible
 
 
 class _Context(ExportContext):
@@ -134,18 +177,18 @@ class _Context(ExportContext):
 
     @property
     def names(self) -> dict[int, str]:
-        """See `ExportContext`."""
         return self._names
 
     @cached_property
     def _names(self) -> dict[int, str]:
+        """Names by obj_id, sorted."""
         folder = self._data.folder
         found = {int(index) for view in self._data.views() for index in view.object_ids} | set(_found(self._data).layout.model_files)
         named = object_names(folder, found) if (folder / models_folder(folder) / "models_info.json").is_file() else {}
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """See `ExportContext`: what there is of models."""
+        """Copy what there is of models."""
         layout = _found(self._data).layout
         for name in MODEL_FOLDERS:
             source = layout.models.get(name if name in layout.models else models_folder(layout.root))
@@ -156,13 +199,13 @@ class _Context(ExportContext):
         return True
 
 
-def _found(data: DataSet) -> FoundScenes:
+def _found(data: DataSet) -> ForeignScenes:
     """The scenes of a data set from another source."""
     assert data.found is not None
     return data.found
 
 
-def convert_found(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
+def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
     """Convert all scenes of a data set from another source; returns their number, and what was made that the source does not have.
 
     Args:
@@ -278,7 +321,12 @@ def _write(data: DataSet, work: Path, settings: ExportSettings, processes: int, 
             images = tuple(episode.image_ids)
             suffix, sizes = f".{settings.bop.color_format}", settings.rig.sizes
             stored = [
-                FoundSceneFiles(data.scene_files(index, camera), data.scene_id(index, camera), images, suffix, size, data.folder)
+                StoredSceneFiles(
+                    data.scene_files(index, camera),
+                    data.scene_id(index, camera),
+                    images,
+                    partial(ForeignViewFiles, suffix=suffix, size=size, root=data.folder),
+                )
                 for camera, size in enumerate(sizes)
             ]
             exporters.write_stored(scene, stored)

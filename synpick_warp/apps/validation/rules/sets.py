@@ -1,0 +1,179 @@
+"""Rules about what belongs together: target lists and scenes, scenes of cameras that recorded at the same time, shards and their keys."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET
+
+from synpick_warp.apps.validation.registry import Findings, rule
+from synpick_warp.apps.validation.scene_files import KeyedScene
+from synpick_warp.apps.validation.subjects import SceneSubject, TargetLists, ViewSubject
+from synpick_warp.dataset.bop.images import KEY, KeyedFolder
+from synpick_warp.dataset.bop.layout import KEYED, KEYS
+
+MIN_VISIBILITY = 0.1
+"""Visible fraction from which an instance is a target, in the toolkit's enumerate_test_targets.py."""
+FRACTION_SLACK = 1e-3
+"""Distance from that fraction within which an instance may be a target or not: files are often rounded."""
+
+
+@rule(TargetLists, "target-schema", "make it again with enumerate_test_targets.py")
+def check_schema(lists: TargetLists) -> Findings:
+    """A target list is a JSON list of records with scene_id and im_id; those of 2019 also with obj_id and inst_count."""
+    for name, found in lists.lists.items():
+        if found.fault:
+            yield name, found.fault
+
+
+@rule(TargetLists, "target-scenes", "remove its records, or restore the scene")
+def check_scenes(lists: TargetLists) -> Findings:
+    """Every scene of a target list exists."""
+    for name, found in lists.lists.items():
+        known = lists.scene_ids(name)
+        for scene in sorted(set(found.scenes) - known):
+            yield name, f"there is no scene {scene}"
+
+
+@rule(SceneSubject, "target-images", "remove the record, or restore the image")
+def check_images(scene: SceneSubject) -> Findings:
+    """Every image and object of a target list is in the scene's ground truth, and no record occurs twice."""
+    for name, by_image in scene.targets.items():
+        for image, records in by_image.items():
+            place = f"scene {scene.files.ref.scene}, image {image}"
+            if image not in scene.record("camera").raw:
+                yield name, f"{place}: there is no such image"
+                continue
+            counts = Counter(None if record.obj_id is UNSET else record.obj_id for record in records)
+            for obj_id in (obj_id for obj_id, count in counts.items() if count > 1):
+                yield name, f"{place}: {counts[obj_id]} records" + ("" if obj_id is None else f" of obj_id {obj_id}")
+            present = {item.obj_id for item in scene.truths.get(image, ())}
+            for obj_id in counts if scene.record("gt").present else ():
+                if obj_id is not None and obj_id not in present and image in scene.truths:
+                    yield name, f"{place}: obj_id {obj_id} is not in the image"
+
+
+@rule(SceneSubject, "target-counts", "make the list again with enumerate_test_targets.py")
+def check_counts(scene: SceneSubject) -> Findings:
+    """inst_count is the number of instances of the object whose visib_fract is at least 0.1."""
+    for name, by_image in scene.targets.items():
+        for image, records in by_image.items():
+            truths, infos = scene.truths.get(image), scene.infos.get(image)
+            if truths is None or infos is None or len(truths) != len(infos):
+                continue
+            fractions = [(item.obj_id, info.visib_fract) for item, info in zip(truths, infos, strict=True)]
+            for record in records:
+                if record.obj_id is UNSET or record.inst_count is UNSET:
+                    continue
+                own = [fraction for obj_id, fraction in fractions if obj_id == record.obj_id]
+                low, high = (sum(value >= MIN_VISIBILITY + slack for value in own) for slack in (FRACTION_SLACK, -FRACTION_SLACK))
+                if own and not low <= record.inst_count <= high:
+                    place = f"scene {scene.files.ref.scene}, image {image}, obj_id {record.obj_id}"
+                    yield name, f"{place}: inst_count is {record.inst_count}, but {high} are visible"
+
+
+DISTANCE_TOLERANCE, ANGLE_TOLERANCE = 0.1, 1e-3
+"""Largest difference of an instance's world poses from two cameras [mm], [rad]; ours differ by 1e-12 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigSubject:
+    """Scenes of the cameras of one episode, or of the sensors of one scene."""
+
+    place: str
+    scenes: tuple[SceneSubject, ...]
+    cameras: int
+    """Number of cameras that the rig has."""
+
+
+@rule(RigSubject, "rig-complete", "restore the scene, or bake again: the same command resumes")
+def check_complete(rig: RigSubject) -> Findings:
+    """Every camera of an episode has its scene."""
+    if len(rig.scenes) < rig.cameras:
+        yield rig.place, f"{len(rig.scenes)} scenes of {rig.cameras} cameras"
+
+
+@rule(RigSubject, "world-poses", "check the extrinsics' unit and direction (world to camera) and the pose of the instance")
+def check_world_poses(rig: RigSubject) -> Findings:
+    """cam_R_w2c and cam_t_w2c map an instance (instance_id) to the same world pose from every camera."""
+    known: dict[tuple[int, int], tuple[str, np.ndarray]] = {}
+    for scene in rig.scenes:
+        record = scene.record("gt")
+        for image, entries in scene.truths.items():
+            camera = scene.cameras.get(image)
+            if camera is None or not (isinstance(camera.cam_R_w2c, list) and isinstance(camera.cam_t_w2c, list)):
+                continue
+            to_world = _transform(camera.cam_R_w2c, camera.cam_t_w2c)
+            to_world[:3, 3] = -to_world[:3, :3].T @ to_world[:3, 3]
+            to_world[:3, :3] = to_world[:3, :3].T
+            for index, item in enumerate(entries):
+                if item.instance_id is UNSET:
+                    continue
+                pose = to_world @ _transform(item.cam_R_m2c, item.cam_t_m2c)
+                first, other = known.setdefault((image, int(item.instance_id)), (record.where(image), pose))
+                distance = float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+                angle = float(np.linalg.norm(pose[:3, :3] - other[:3, :3]) / np.sqrt(2.0))
+                if distance > DISTANCE_TOLERANCE or angle > ANGLE_TOLERANCE:
+                    off = f"{distance:.3g} mm and {np.degrees(min(angle, np.pi)):.2g}° off"
+                    yield record.where(image), f"image {image}, instance {index}: its world pose is {off} that in {first}"
+
+
+def _transform(rotation: Any, translation: Any) -> np.ndarray:
+    """Rigid transform (4, 4) from a rotation (9 values, row by row) and a translation."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = np.reshape(rotation, (3, 3)), translation
+    return matrix
+
+
+MAX_VIEWS = 1000
+"""Most views of a shard, as in BOP's webdataset layout."""
+
+
+@rule(KeyedFolder, "shard-index", "list the keys of each shard again, or restore the shard")
+def check_index(folder: KeyedFolder) -> Findings:
+    """key_to_shard.json maps every key SSSSSS_IIIIII to the index of the shard that contains it, and no others."""
+    keys, fault = folder.keys
+    if fault:
+        yield folder.listing.name(KEYS), fault
+    if keys is None:
+        return
+    places = {key: shard for shard, found in folder.members.items() if isinstance(found, set) for key in found}
+    damaged = {shard for shard, found in folder.members.items() if isinstance(found, str)}
+    for key, index in keys.items():
+        shard = f"shard-{index:06d}.tar"
+        if not KEY.fullmatch(key):
+            yield folder.listing.name(KEYS), f'key "{key[:40]}" is not SCENE_IMAGE of six digits each'
+        elif shard not in folder.members:
+            yield folder.listing.name(KEYS), f"key {key}: there is no {shard}"
+        elif shard not in damaged and places.get(key) != shard:
+            yield folder.listing.name(KEYS), f"key {key} is in {places.get(key, 'no shard')}, not in {shard}"
+    for key in sorted(places.keys() - keys.keys()):
+        yield folder.listing.name(KEYS), f"key {key} of {places[key]} is missing"
+
+
+@rule(KeyedFolder, "shard-files", "write the shard again, without links or other files")
+def check_shards(folder: KeyedFolder) -> Findings:
+    """Shards are tar files of regular members named KEY.CONTENT, with at most 1000 views each."""
+    for shard, found in folder.members.items():
+        if isinstance(found, str):
+            yield folder.listing.name(shard), found
+        elif len(found) > MAX_VIEWS:
+            yield folder.listing.name(shard), f"{len(found)} views"
+    for name in sorted(folder.listing.files) if not folder.shards else ():
+        if not KEYED.fullmatch(name) and name != KEYS:
+            yield folder.listing.name(name), "a file name that is not KEY.CONTENT"
+
+
+@rule(ViewSubject, "mask-entries", "write one entry for each ground-truth index")
+def check_entries(view: ViewSubject) -> Findings:
+    """KEY.mask.json and KEY.mask_visib.json have run lengths of every instance."""
+    if isinstance(view.scene.files, KeyedScene):
+        for kind, masks in view.masks.items():
+            faults = {file for file, _ in view.faults}
+            for index, mask in enumerate(masks):
+                file = view.scene.files.file(kind, view.image, index)
+                if mask is None and file not in faults:
+                    yield file, f"missing; there are {len(masks)} instances"
