@@ -28,7 +28,7 @@ from synpick_warp.dataset.bop.images import COLOR, KeyedImages
 from synpick_warp.dataset.bop.layout import Listing, SceneRef
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.files import read_file_if_present
-from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_picture, image_size
+from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
@@ -138,7 +138,7 @@ class SceneFiles(ABC):
     def image(self, name: str, frame: int) -> np.ndarray:
         """Decoded image "rgb", "depth" or a layer (H, W[, C]), as stored, blue first."""
         _, data, source = self._need(name, frame)
-        return decode_picture(data, source, DatasetError, self.image_size(frame))
+        return decode_image(data, source, DatasetError, size=self.image_size(frame))
 
     def typed_image(self, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
         """An `image`, with its channels and type checked; see `check_planes`."""
@@ -239,7 +239,7 @@ class SceneFolder(SceneFiles):
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
         _, data, source = self._need(name, frame, index)
-        return check_planes(decode_picture(data, source, DatasetError, self.image_size(frame)), None, source) > 0
+        return check_planes(decode_image(data, source, DatasetError, size=self.image_size(frame)), None, source) > 0
 
     def mask_crop(self, name: str, frame: int, index: int, rows: slice, columns: slice) -> np.ndarray:
         suffix, data, _ = self._need(name, frame, index)

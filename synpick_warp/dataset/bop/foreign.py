@@ -77,10 +77,10 @@ class ForeignScene(SceneFiles):
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """Decoded image (H, W[, C]), blue first; "rgb" is converted to (H, W, 3) uint8."""
-        if name != "rgb":
-            return super().image(name, frame)
         _, data, source = self._need(name, frame)
-        return to_color(decode_picture(data, source, DatasetError))
+        if name == "rgb":
+            return to_color(decode_picture(data, source, DatasetError))
+        return decode_picture(data, source, DatasetError, self.image_size(frame))
 
     def layers(self) -> set[str]:
         """None: folders of these names may have any content."""
