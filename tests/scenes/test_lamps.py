@@ -1,17 +1,274 @@
-"""Lamp extraction: which light of a map becomes a lamp, that none is lost or counts twice, and the sample points of lamps."""
+"""Sun and lamp extraction, and suns of sIBL sets: direction, irradiance, sample points, and that no light is lost or counts twice."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.scenes.environment import map_directions
+from synpick_warp.errors import LightError
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.lamps import LAMP_RADIUS, MIN_LAMP_SHARE, extract_lamps, sample_disc, stratify_light
+from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT, SOLAR_TANGENT, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.types import EnvironmentMap, Sun
+from synpick_warp.stages.render.light_tables import precompute_environment, sh_basis
+from tests.worlds import toy_scene
 
-ROWS = 128
-DIRECTIONS, SOLID_ANGLES = map_directions(ROWS)
+ROWS = 64
+
+
+def bright_picture(u: float, v: float, value: float = 200.0) -> np.ndarray:
+    """A dim map with a bright pixel at image coordinates u (right) and v (down) in 0..1."""
+    image = np.full((ROWS, 2 * ROWS, 3), 0.5, np.float32)
+    image[int(v * ROWS), int(u * 2 * ROWS)] = value
+    return image
+
+
+def loaded(folder, lines: str, image: np.ndarray) -> EnvironmentMap:
+    """Load a set with these lines in its section Sun."""
+    assert cv2.imwrite(str(folder / "ref.hdr"), image[..., ::-1].copy())
+    (folder / "room.ibl").write_text(f'[Reflection]\nREFfile = "ref.hdr"\n[Sun]\n{lines}')
+    (light,) = load_lights(str(folder))
+    return light
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "expected"),
+    [
+        (0.5, 0.25, (1, 0, 1)),  # the picture's middle is +x
+        (0.75, 0.25, (0, -1, 1)),  # right of it, as seen from inside, is -y
+        (0.25, 0.25, (0, 1, 1)),
+        (0.0, 0.25, (-1, 0, 1)),
+        (1.0, 0.25, (-1, 0, 1)),
+        (0.3, 0.0, (0, 0, 1)),  # v grows down from the zenith
+        (0.5, 0.4, (np.sin(0.4 * np.pi), 0, np.cos(0.4 * np.pi))),
+    ],
+)
+def test_u_and_v_grow_right_and_down(tmp_path, u, v, expected):
+    sun = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v}\n", np.ones((8, 16, 3), np.float32)).sun
+    assert sun is not None
+    np.testing.assert_allclose(sun.direction, np.array(expected) / np.linalg.norm(expected), atol=1e-12)
+
+
+@given(u=st.floats(0.0, 0.999), v=st.floats(0.03, 0.47))
+def test_the_sun_of_a_set_is_at_the_bright_pixel_of_its_map(u, v, tmp_path_factory):
+    light = loaded(tmp_path_factory.mktemp("set"), f"SUNu = {u}\nSUNv = {v}\n", bright_picture(u, v))
+    brightest = np.unravel_index(light.radiance.sum(axis=2).argmax(), light.radiance.shape[:2])
+    assert light.sun is not None
+    # Half a texel's diagonal.
+    assert map_directions(ROWS)[0][brightest] @ light.sun.direction >= np.cos(np.pi / ROWS / np.sqrt(2.0)) - 1e-6
+
+
+def test_colour_is_srgb_and_multi_is_the_radiance_of_a_white_surface(tmp_path):
+    even = np.ones((8, 16, 3), np.float32)
+    sun = loaded(tmp_path, "SUNcolor = 255,188,0\nSUNmulti = 1.5\nSUNu = 0.5\nSUNv = 0.2\n", even).sun
+    np.testing.assert_allclose(sun.irradiance / np.pi, (1.5, 1.5 * srgb_to_linear(188 / 255), 0.0))
+    plain = loaded(tmp_path, "SUNu = 0.5\nSUNv = 0.2\n", even).sun
+    np.testing.assert_allclose(plain.irradiance / np.pi, 1.0)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "",
+        "SUNcolor = 9,9,9\n",
+        "SUNu = 0.5\nSUNv = 0.5\n",
+        "SUNu = 0.5\nSUNv = 0.7\n",
+        "SUNu = 0.5\nSUNv = 0.2\nSUNmulti = 0\n",
+        "SUNu = 0.5\nSUNv = 0.2\nSUNcolor = 0, 0, 0\n",
+    ],
+)
+def test_sets_without_a_sun(tmp_path, lines):
+    assert loaded(tmp_path, lines, np.ones((8, 16, 3), np.float32)).sun is None
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("SUNu = 1.2", "a number from 0 to 1"),
+        ("SUNv = -0.1", "a number from 0 to 1"),
+        ("SUNu = 0,67", "a number from 0 to 1"),
+        ("SUNv = nan", "a number from 0 to 1"),
+        ("SUNu = left", "a number from 0 to 1"),
+        ("SUNmulti = inf", "a number from 0 to 1e+06"),
+        ("SUNmulti = -1", "a number from 0 to 1e+06"),
+        ("SUNcolor = 255,255", "3 numbers"),
+        ("SUNcolor = 1,2,256", "from 0 to 255"),
+        ("SUNcolor = 1,,2", "3 numbers"),
+        ("SUNcolor = white", "3 numbers"),
+    ],
+)
+def test_invalid_numbers_are_one_line(tmp_path, line, words):
+    with pytest.raises(LightError) as caught:
+        loaded(tmp_path, f"SUNu = 0.5\nSUNv = 0.2\n{line}\n", np.ones((8, 16, 3), np.float32))
+    message = str(caught.value)
+    assert "room.ibl" in message
+    assert line in message
+    assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(("there", "missing"), [("SUNu", "SUNv"), ("SUNv", "SUNu")])
+def test_a_position_with_one_coordinate_is_refused(tmp_path, there, missing):
+    with pytest.raises(LightError, match=f"room.ibl has {there} alone; a sun needs SUNu and SUNv, or neither"):
+        loaded(tmp_path, f"{there} = 0.2\n", np.ones((8, 16, 3), np.float32))
+
+
+@pytest.mark.parametrize(("degrees", "believed"), [(0.0, True), (7.0, True), (14.0, False), (90.0, False)])
+def test_a_sun_that_misses_the_maps_bright_place_is_ignored(tmp_path, degrees, believed):
+    u, v = 0.30 + 0.5 / (2 * ROWS), 0.4
+    light = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v - degrees / 180 if degrees < 45 else 1 - v}\n", bright_picture(u, v))
+    assert (light.sun is not None) == believed
+
+
+def test_any_bright_place_of_the_map_supports_a_sun(tmp_path):
+    image = bright_picture(0.2, 0.3, 4.0)
+    image[int(0.3 * ROWS), int(0.8 * 2 * ROWS)] = 3.0
+    assert loaded(tmp_path, "SUNu = 0.8\nSUNv = 0.3\n", image).sun is not None
+    assert loaded(tmp_path, "SUNu = 0.5\nSUNv = 0.3\n", image).sun is None
+
+
+def test_the_real_set(real_lights):
+    """Kiara's sun stands 2° from the brightest pixel of its map, and is brighter and yellower than what the camera clipped."""
+    light = next(light for light in load_lights(str(real_lights)) if light.sun is not None)
+    assert light.name == "Kiara_Dawn"
+    assert light.sun is not None
+    brightest = np.unravel_index((light.radiance @ LUMINANCE).argmax(), light.radiance.shape[:2])
+    assert light.sun.direction @ map_directions(512)[0][brightest] > np.cos(np.radians(3.0))
+    np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
+    table, alone = precompute_environment(light, None), precompute_environment(EnvironmentMap("kiara", light.radiance), None)
+    # The glow around it is wide: it is drawn into the map, of which its brightest part is a lamp. Facing it is as bright as the set says.
+    replaced = replace_sun(alone.radiance.astype(np.float64), light.sun)
+    assert replaced.radius_tangent > MAX_SUN_TANGENT
+    (glow,) = table.lamps
+    assert glow.direction @ light.sun.direction > np.cos(np.radians(10.0))
+    np.testing.assert_allclose(facing(table.lampless, glow.direction) + glow.irradiance, facing(table.radiance, glow.direction), rtol=3e-3)
+    rest = replaced.rest
+    gained = facing(table.radiance, light.sun.direction) - facing(rest, light.sun.direction)
+    np.testing.assert_allclose(gained, light.sun.irradiance, rtol=0.01)
+    assert facing(table.radiance, light.sun.direction) @ LUMINANCE > facing(alone.radiance, light.sun.direction) @ LUMINANCE
+
+
+def clipped(direction, radius: float = 3.0, value: float = 20.0, rows: int = 128) -> np.ndarray:
+    """A dim map with a white disc about a direction, as cameras clip suns; `radius` [°]."""
+    towards = map_directions(rows)[0] @ direction
+    return np.where(towards[..., None] > np.cos(np.radians(radius)), value, 0.5).astype(np.float32) * np.ones(3, np.float32)
+
+
+def facing(radiance: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Irradiance (3) from a map on a surface with this normal, texel by texel."""
+    towards, solid = map_directions(len(radiance))
+    return (radiance * (np.maximum(towards @ normal, 0.0) * solid)[..., None]).sum(axis=(0, 1))
+
+
+SUN = Sun(np.array([0.48, -0.64, 0.6]), np.array([30.0, 20.0, 10.0]))
+
+
+def test_a_plane_that_faces_the_sun_receives_the_sun_and_the_rest_once():
+    """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
+    table = precompute_environment(light, None)
+    (sun,) = table.lamps
+    np.testing.assert_allclose(sun.direction, SUN.direction, rtol=1e-6)
+    np.testing.assert_allclose(sun.irradiance, SUN.irradiance, rtol=1e-6)
+    assert (sun.points @ sun.direction).min() > 1.0 / np.sqrt(1.0 + sun.radius_tangent**2)
+    rest, _, taken, _ = extract_sun(light.radiance.astype(np.float64), SUN.direction)
+    assert taken.min() > 0.1
+    np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
+    total = sh_basis(SUN.direction) @ table.irradiance + sun.irradiance
+    np.testing.assert_allclose(total, facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
+    np.testing.assert_allclose(facing(table.radiance, SUN.direction), facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
+    assert table.prefiltered.max() < 3.0
+
+
+def test_exposure_and_table_include_the_sun():
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
+    upward = facing(precompute_environment(light, None).radiance, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(precompute_environment(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
+    # From below comes what the table sends back; a downward plane sees nothing else.
+    ground = np.array([0.2, 0.3, 0.4])
+    below = sh_basis(np.array([0.0, 0.0, -1.0])) @ precompute_environment(light, ground).irradiance
+    np.testing.assert_allclose(below, ground * upward, rtol=0.1)
+
+
+def test_a_map_with_an_unclipped_sun_keeps_its_luminance():
+    weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
+    light = EnvironmentMap("set", clipped(SUN.direction, value=4000.0), weak)
+    taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS), SUN.direction)[2]
+    (sun,) = precompute_environment(light, None).lamps
+    np.testing.assert_allclose(sun.irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
+    np.testing.assert_allclose(sun.irradiance / sun.irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
+
+
+def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
+    table = precompute_environment(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
+    assert table.lamps[0].radius_tangent == pytest.approx(SOLAR_TANGENT)
+    np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
+    assert 0.05 < precompute_environment(EnvironmentMap("set", clipped(SUN.direction), SUN), None).lamps[0].radius_tangent < 0.09
+
+
+@given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
+def test_a_sun_disc_has_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
+    across = np.sqrt(1.0 - z * z)
+    direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    disc = draw_sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
+    np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
+    assert not disc[ROWS // 2 :].any()
+    towards = map_directions(ROWS)[0][disc[..., 0] > 0.0] @ direction
+    assert towards.min() > np.cos(max(np.arctan(spread), np.pi / ROWS)) - 1e-9
+
+
+def test_hills_occlude_their_part_of_the_disc():
+    """The half of the map on the +y side is dark: all light comes from the other, and as much as before."""
+    direction = np.array([0.8, 0.0, 0.6])
+    bright = map_directions(ROWS)[0][..., 1] < 0.0
+    disc = draw_sun_disc(bright, direction, SUN.irradiance, 0.2)
+    np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
+    assert not disc[~bright].any()
+    whole = draw_sun_disc(np.ones_like(bright), direction, SUN.irradiance, 0.2)
+    assert (disc[..., 0] > 0.0).sum() == (whole[..., 0] > 0.0).sum() / 2
+    # A sun wholly behind them is believed all the same.
+    np.testing.assert_allclose(draw_sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
+
+
+def test_without_a_set_the_bright_place_of_the_map_is_a_lamp():
+    light = EnvironmentMap("map", clipped(SUN.direction))
+    table = precompute_environment(light, None)
+    (sun,) = table.lamps
+    assert sun.direction @ SUN.direction > np.cos(np.radians(2.0))
+    np.testing.assert_array_equal(table.radiance, resize_map(light.radiance, BACKGROUND_ROWS).astype(np.float32))
+    np.testing.assert_allclose(facing(table.lampless, sun.direction) + sun.irradiance, facing(table.radiance, sun.direction), rtol=1e-3)
+
+
+def test_a_set_without_lamps_keeps_its_sun_in_the_map():
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
+    table = precompute_environment(light, None, max_lamps=0)
+    assert table.lamps == []
+    np.testing.assert_array_equal(table.lampless, table.radiance)
+    np.testing.assert_array_equal(table.radiance, precompute_environment(light, None).radiance)
+
+
+def test_the_sun_of_a_set_casts_a_shadow_in_its_colour(device):
+    """A small sheet 0.1 m above a large one; the set's sun at 45° over +x, red, over an even map: light returns where it does not reach."""
+    view = toy_scene.camera(64, 48, 200.0, (0.0, 0.0, 2.0))
+    flat, above = (0.0, 0.0, 0.0, *toy_scene.UPRIGHT), (0.0, 0.0, 0.1, *toy_scene.UPRIGHT)
+    entries = [toy_scene.entry(toy_scene.sheet(0.6, 0.4)), toy_scene.entry(toy_scene.sheet(0.04, 0.04))]
+    sun = Sun(np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0), np.array([4.0, 0.0, 0.0]))
+    lights = (EnvironmentMap("set", np.ones((64, 128, 3), np.float32), sun),)
+    lit = toy_scene.render(toy_scene.ToyScene(entries, [[(0, flat), (1, above)]], (view,), lights=lights), device).radiance[0]
+    assert lit[24, 22, 0] < 0.7 * lit[24, 42, 0]
+    np.testing.assert_allclose(lit[24, 22, 1:], lit[24, 42, 1:], rtol=0.1)
+
+
+# ---- lamps ----
+
+
+LAMP_ROWS = 128
+DIRECTIONS, SOLID_ANGLES = map_directions(LAMP_ROWS)
 
 
 def toward(polar: float, azimuth: float = 0.0) -> np.ndarray:
@@ -22,7 +279,7 @@ def toward(polar: float, azimuth: float = 0.0) -> np.ndarray:
 
 def room(*discs: tuple[np.ndarray, float, float], wall: float = 0.2) -> np.ndarray:
     """A map of constant radiance `wall` with discs (direction, angular radius [°], radiance)."""
-    radiance = np.full((ROWS, 2 * ROWS, 3), wall)
+    radiance = np.full((LAMP_ROWS, 2 * LAMP_ROWS, 3), wall)
     for direction, radius, value in discs:
         radiance[np.cos(np.radians(radius)) < DIRECTIONS @ direction] = value
     return radiance
