@@ -27,8 +27,7 @@ from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.progress import ForwardingProgress, Progress
-from synpick_warp.system.stores.base import TransientError, persist
-from synpick_warp.system.stores.store import Store
+from synpick_warp.system.stores.store import Store, TransientError, persist
 
 FILES_AT_ONCE, EPISODES_AT_ONCE = 16, 4
 """Concurrent uploads, of files and of episodes: requests of small files wait for the store, not for a core."""

@@ -5,18 +5,15 @@ Ray places and restarts them, claims in the store deal the episodes out.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import os
 import pickle
 import re
 import secrets
-import shutil
 import socket
 import tempfile
 import textwrap
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -36,8 +33,8 @@ from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.system.stores.opening import open_store, probe
 
-VERSIONS = ((2, 52), (3,))
-"""Versions of Ray, from the first one, which has token authentication, to before the second one."""
+LEAST_VERSION = (2, 52)
+"""Version of Ray from which on it has token authentication."""
 RETRIES = 20
 """Deaths of a worker after which the bake ends with an error."""
 _POLL = 5.0
@@ -47,9 +44,7 @@ _ANSWER = 5.0
 _ENDING, _STOPPING = 30.0, 120.0
 """Longest wait for workers: once one has found that all is done, and once they are asked to stop, and upload what is finished [s]."""
 _SAID = 300
-"""Maximum length of an error message of Ray that is shown [characters]."""
-STORE_BYTES = 100 << 20
-"""Size of a local cluster's object store [B]: workers return counts."""
+"""Maximum length of an error message of Ray that is shown, which goes on for pages [characters]."""
 _PLACE = re.compile(r"([^/]+):([0-9]{1,5})$")
 _VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "RAY_DEDUP_LOGS": "0"}
 """Environment variables that disable usage statistics, a warning about GPUs and the grouping of log lines in Ray."""
@@ -78,16 +73,27 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress) -> Ba
     ray = import_ray(address)
     store = open_store(job.url)
     ledger = Ledger(store, job.config, probe(store))
-    claims = open_claims(ledger, job.lease)
+    chunks = plan_chunks(ledger, open_claims(ledger, job.lease), DataLayout.of(job.config).plan(job.splits))
     if ledger.finished():
         progress.note("all episodes are done")
         return BakeSummary()
-    progress.stage("starting Ray" if address is None else f"connecting to Ray at {address}")
-    with _cluster(ray, address, workers):
-        device, each, count = _resources(ray, job.config.bake.device, workers)
-        start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
-        calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
-        return _await(ray, calls, PlanProgress(progress, plan_chunks(ledger, claims, DataLayout.of(job.config).plan(job.splits))))
+    place = "this machine" if address is None else address
+    progress.stage(f"starting Ray on {place}" if address is None else f"connecting to Ray at {place}")
+    with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
+        own = {"_temp_dir": folder, "num_cpus": max(count_cores(), workers), "include_dashboard": False} if address is None else {}
+        try:
+            ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **own)
+            device, each, count = _resources(ray, job.config.bake.device, workers)
+            start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
+            calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
+            return _await(ray, calls, PlanProgress(progress, chunks))
+        except ray.exceptions.RayTaskError:  # A fault of ours, with its traceback.
+            raise
+        except (ray.exceptions.RayError, OSError, RuntimeError, ValueError) as error:  # It is not there, refuses, is lost, or workers died.
+            said = textwrap.shorten(str(error), _SAID, placeholder="…")
+            raise DeviceError(f"Ray failed on {place}: {said}; the same command resumes") from error
+        finally:
+            ray.shutdown()
 
 
 def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummary | str:
@@ -117,8 +123,7 @@ def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummar
 def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
     """Show how many episodes are done until the calls of `run_worker` have ended; a signal stops them. Returns the sum of their summaries.
 
-    Raises:
-        DeviceError: A worker reports an error that the user can correct, or has died too often.
+    Raises DeviceError: A worker reports an error that the user can correct.
     """
     summary, deadline, started = BakeSummary(), float("inf"), time.monotonic()
     with StopRequest() as stop:
@@ -127,12 +132,10 @@ def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
             for call in ended:
                 try:
                     found = ray.get(call)
-                except ray.exceptions.RayError as error:
+                except ray.exceptions.RayError:
                     if stop.number:  # It was cancelled.
                         continue
-                    if isinstance(error, ray.exceptions.RayTaskError):  # A fault of ours, with its traceback.
-                        raise
-                    raise DeviceError(f"a worker died {RETRIES + 1} times ({_describe(error)}); the same command resumes") from error
+                    raise
                 if isinstance(found, str):
                     raise DeviceError(found)
                 summary.total += found.total
@@ -150,21 +153,18 @@ def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
 def import_ray(address: str | None) -> Any:
     """Import Ray, with a token of this process for a cluster on this machine: otherwise Ray writes one into the home directory.
 
-    Raises:
-        DeviceError: It is not installed, or of another version.
+    Raises DeviceError: It is not installed, or too old.
     """
     given = _VARIABLES if address is not None else _VARIABLES | _LOCAL | {"RAY_AUTH_TOKEN": secrets.token_hex(32)}
     for name, value in given.items():
         os.environ.setdefault(name, value)  # Ray reads them when it is imported.
-    low, high = (".".join(map(str, each)) for each in VERSIONS)
-    wanted = f"Ray >= {low}, < {high}: pip install 'synpick-warp[ray]'"
+    wanted = f"--engine ray needs Ray >= {'.'.join(map(str, LEAST_VERSION))}: pip install 'synpick-warp[ray]'"
     try:
         ray = importlib.import_module("ray")
     except ImportError as error:
-        raise DeviceError(f"--engine ray needs {wanted} ({error})") from None
-    known = tuple(int(part) for part in re.findall(r"[0-9]+", ray.__version__)[:2])
-    if not VERSIONS[0] <= known < VERSIONS[1]:
-        raise DeviceError(f"--engine ray needs {wanted}; here is Ray {ray.__version__}")
+        raise DeviceError(f"{wanted} ({error})") from None
+    if tuple(int(part) for part in re.findall(r"[0-9]+", ray.__version__)[:2]) < LEAST_VERSION:
+        raise DeviceError(f"{wanted}; here is Ray {ray.__version__}")
     return ray
 
 
@@ -182,41 +182,6 @@ def find_address(engine: str) -> str | None:
         except (OSError, OverflowError, UnicodeError) as error:
             raise DeviceError(f"{address} does not answer ({error}); start the cluster, or name the address of its head") from None
     return address
-
-
-@contextlib.contextmanager
-def _cluster(ray: Any, address: str | None, workers: int) -> Iterator[None]:
-    """Connect to a cluster, or start one on this machine, with a token of its own and its files in a temporary folder.
-
-    Raises:
-        DeviceError: Ray cannot be started, or the cluster refuses the connection, or is lost.
-    """
-    folder, before = None, os.environ.get("TMPDIR")
-    given: dict[str, Any] = {"address": address or "local", "log_to_driver": False, "logging_level": "ERROR"}
-    try:
-        if address is None:
-            # Workers inherit it, and leave files in it when they are killed.
-            folder = os.environ["TMPDIR"] = tempfile.mkdtemp(prefix="ray-")
-            cores = max(count_cores(), workers)
-            given |= {"_temp_dir": folder, "num_cpus": cores, "include_dashboard": False, "object_store_memory": STORE_BYTES}
-        try:
-            ray.init(**given)
-        except Exception as error:  # ConnectionError, RuntimeError, ValueError and classes of Ray's, each for several reasons.
-            raise DeviceError(f"Ray cannot be used at {address or 'this machine'}: {_describe(error)}") from error
-        try:
-            yield
-        except (ray.exceptions.RaySystemError, ConnectionError) as error:
-            raise DeviceError(f"the Ray cluster was lost: {_describe(error)}; the same command resumes") from error
-    finally:
-        ray.shutdown()
-        if folder is not None:
-            os.environ.pop("TMPDIR") if before is None else os.environ.update(TMPDIR=before)
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _describe(error: Exception) -> str:
-    """What an error of Ray says, in one line: the beginning, since it goes on for pages."""
-    return textwrap.shorten(str(error), _SAID, placeholder="…")
 
 
 def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, int], int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import io
 import os
 import re
 import shutil
@@ -51,6 +52,8 @@ from synpick_warp.system.stores.store import SizeError
 
 CACHE_BYTES = 8 << 30
 """Default limit of an opened set's cache of episodes [B]; the least recently used are evicted."""
+STREAM_BYTES = 1 << 20
+"""Size of the buffer of a stream [B]."""
 FREE_PART = 0.5
 """Fraction of the temporary folder's free space that a copied set may take."""
 
@@ -346,33 +349,22 @@ def list_shards(url: str) -> list[str]:
     return [f"{store.url}/{name}" for name, _ in store.list("") if re.fullmatch(r"[^/]+_web/shard-[0-9]+\.tar", name)]
 
 
-class _Stream:
-    """File-like object that reads blocks sequentially: no seeking, no writing."""
+class _Blocks(io.RawIOBase):
+    """Raw stream of an object's blocks, read one after the other."""
 
     def __init__(self, blocks: Iterator[bytes]) -> None:
-        self._blocks, self._held = blocks, bytearray()
+        self._blocks, self._held = blocks, memoryview(b"")
 
-    def read(self, size: int = -1) -> bytes:
-        """Read `size` bytes, fewer only at the end; -1: all."""
-        while size < 0 or len(self._held) < size:
-            block = next(self._blocks, None)
-            if block is None:
-                break
-            self._held += block
-        count = len(self._held) if size < 0 else size
-        data = bytes(self._held[:count])
-        del self._held[:count]
-        return data
+    def readable(self) -> bool:
+        """See `io.RawIOBase`."""
+        return True
 
-    def close(self) -> None:
-        """Discard the rest: further reads return what is buffered, then nothing."""
-        self._blocks = iter(())
-
-    def __enter__(self) -> _Stream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def readinto(self, buffer: Any) -> int:
+        """See `io.RawIOBase`."""
+        self._held = self._held or memoryview(next(self._blocks, b""))
+        count = min(len(buffer), len(self._held))
+        buffer[:count], self._held = self._held[:count], self._held[count:]
+        return count
 
 
 def open_stream(url: str, mode: str = "rb", *_: object, **__: object) -> IO[bytes]:
@@ -380,7 +372,7 @@ def open_stream(url: str, mode: str = "rb", *_: object, **__: object) -> IO[byte
     if "r" not in mode:
         raise StoreError(f"{url} can be streamed for reading only; write to a local file")
     place, _slash, name = url.rpartition("/")
-    return _Stream(open_store(place).blocks(name, sys.maxsize))  # type: ignore[return-value]
+    return io.BufferedReader(_Blocks(open_store(place).blocks(name, sys.maxsize)), STREAM_BYTES)
 
 
 def stream_shards() -> None:

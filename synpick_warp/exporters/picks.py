@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -55,9 +54,9 @@ class PicksExporter(EpisodeExporter[_Tables]):
             self._staged(end.episode, _make_content)
         super().end_episode(end, on_committed)
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: both tables."""
-        return [place for place in pick_files(episode) if os.path.lexists(self._context.out / place)]
+    def places(self, episode: int) -> tuple[Path, Path]:
+        """Both tables. See `EpisodeExporter`."""
+        return pick_files(episode)
 
     def _commit(self, episode: StagedEpisode[_Tables], end: EpisodeEnd) -> WriteTask:
         out, places = self._context.out, pick_files(end.episode)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,8 +50,8 @@ class StagedEpisode(Generic[_Content]):
 class EpisodeExporter(Exporter, Generic[_Content]):
     """`Exporter` that stages: each arrangement of an episode has a staging folder, which one task commits after all others are done.
 
-    A format makes its content of an episode (`_staged`), counts the tasks that write to its folder (`_task`), and names the task that
-    commits it (`_commit`).
+    A format makes its content of an episode (`_staged`), counts the tasks that write to its folder (`_task`), names the task that commits
+    it (`_commit`), and the places of its files (`places`).
     """
 
     staging: ClassVar[str]
@@ -82,6 +83,14 @@ class EpisodeExporter(Exporter, Generic[_Content]):
                 self._finish(episode, end)
             self._task_done((episode,), None)
         self._context.pool.poll()
+
+    @abstractmethod
+    def places(self, episode: int) -> Iterable[Path]:
+        """Files and folders that hold an episode and nothing else, relative to the data set, whether they are there or not."""
+
+    def files(self, episode: int) -> list[Path]:
+        """Those of `places` that exist. See `Exporter`."""
+        return sorted(place for place in set(self.places(episode)) if os.path.lexists(self._context.out / place))
 
     def close(self) -> None:
         """Forget all episodes in progress. See `Exporter`."""

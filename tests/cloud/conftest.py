@@ -1,4 +1,6 @@
-"""An S3 server in this process, on 127.0.0.1, that fails on request; settings of a tiny set, and what a local bake makes of them."""
+"""An S3 server in this process, on 127.0.0.1, that fails on request; a store whose worker dies at a chosen request; settings of a tiny set,
+and what a local bake makes of them.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,10 @@ from uuid import uuid4
 
 import pytest
 
-from synpick_warp.system.stores import base, opening
+from synpick_warp.system.stores import opening
+from synpick_warp.system.stores import store as store_module
+from synpick_warp.system.stores.opening import CONTROL, open_store
+from synpick_warp.system.stores.store import Store
 from tests.builders import once
 from tests.harness import scripted_bake
 
@@ -85,7 +90,7 @@ def server(one_server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[Serv
     given = {"ACCESS_KEY_ID": "key", "SECRET_ACCESS_KEY": "secret", "REGION": "us-east-1", "ENDPOINT_URL": one_server.address}
     for name, value in given.items():
         monkeypatch.setenv(f"AWS_{name}", value)
-    monkeypatch.setattr(base, "FIRST_PAUSE", 0.01)
+    monkeypatch.setattr(store_module, "FIRST_PAUSE", 0.01)
     yield one_server
     one_server.fault = lambda method, path: None
 
@@ -123,3 +128,45 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+class Killed(BaseException):
+    """What no code handles."""
+
+
+class MortalStore:
+    """`Store` that passes `lives` requests on, then raises at each one; every second death comes after its request was carried out."""
+
+    def __init__(self, store: Store, lives: int) -> None:
+        self._store, self.lives, self.url = store, lives, store.url
+        self._late, self._lock = lives % 2 == 1, threading.Lock()
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._store, name)
+
+        def request(*arguments: Any) -> Any:
+            with self._lock:
+                self.lives -= 1
+                lives = self.lives
+            if lives == 0 and self._late:
+                method(*arguments)
+            if lives <= 0:
+                raise Killed
+            return method(*arguments)
+
+        return request
+
+
+def stored(url: str) -> dict[str, bytes]:
+    """Files of the data set in a store."""
+    store = open_store(url)
+    return {key: store.get(key, 1 << 30) for key, _ in store.list("") if not key.startswith(f"{CONTROL}/")}
+
+
+def together(*calls: Callable[[], object]) -> None:
+    """Make calls at once, in a thread each, and wait for them."""
+    threads = [threading.Thread(target=call) for call in calls]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join()

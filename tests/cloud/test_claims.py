@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 
 import msgspec
 import pytest
@@ -23,8 +24,7 @@ from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import EPISODES, files, tiny
-from tests.cloud.mortal import Killed, MortalStore, stored
+from tests.cloud.conftest import EPISODES, Killed, MortalStore, files, stored, tiny, together
 from tests.harness import scripted_bake
 
 
@@ -154,11 +154,7 @@ def test_the_winner_of_a_lost_lease_is_one(memory):
     store, won = open_store(memory), []
     store.put("k", b"damaged")
     workers = [Claims(store, 0.0) for _ in range(8)]
-    threads = [threading.Thread(target=lambda each=each: won.append(each.take("k"))) for each in workers]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
+    together(*(lambda each=each: won.append(each.take("k")) for each in workers))
     (claim,) = filter(None, won)
     claim.stop()
 
@@ -258,11 +254,7 @@ def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypat
     monkeypatch.setattr(finish, "finalize_data_set", meet)
     for each in places:
         each.mkdir()
-    threads = [threading.Thread(target=finish.finalize_store, args=(ledger, each)) for each in places]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
+    together(*(partial(finish.finalize_store, ledger, each) for each in places))
     assert stored(memory) == local
 
 

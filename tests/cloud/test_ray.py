@@ -12,8 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from tests.builders import mistake
-from tests.cloud.conftest import files, tiny
-from tests.cloud.mortal import stored
+from tests.cloud.conftest import files, stored, tiny
 from tests.harness import scripted_bake
 
 S3 = ("bake", "--config", "smoke", "--device", "cpu", "--out", "s3://bucket/set")
@@ -29,7 +28,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
         command = [sys.executable, "-m", "tests.cloud.ray_driver", prefix, "12", "2", str(tmp_path / "died")]
         ran = subprocess.run(command, env=os.environ | places, capture_output=True, text=True, timeout=300)
         assert ran.returncode == 0, ran.stdout + ran.stderr
-        assert list(Path(short).iterdir()) == []
+        assert not list(Path(short).glob("ray-*"))
     assert list((tmp_path / "home").iterdir()) == []
     assert (tmp_path / "died").exists()
     assert "A worker died" in ran.stdout  # Ray's own notice.
@@ -54,8 +53,8 @@ def test_options_that_cannot_be_used(given, said):
     assert said in mistake(*S3[: -2 if "--out" in given else None], *given)
 
 
-@pytest.mark.parametrize(("ray", "said"), [(None, "needs Ray >= 2.52, < 3: pip"), ("1.13.0", "here is Ray 1.13.0"), ("3.0", "is Ray 3.0")])
-def test_ray_is_missing_or_of_another_version(ray, said, monkeypatch):
+@pytest.mark.parametrize(("ray", "said"), [(None, "needs Ray >= 2.52: pip"), ("1.13.0", "here is Ray 1.13.0")])
+def test_ray_is_missing_or_too_old(ray, said, monkeypatch):
     for name in ("RAY_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"):
         monkeypatch.setenv(name, "")
     monkeypatch.setitem(sys.modules, "ray", ray and SimpleNamespace(__version__=ray))

@@ -16,12 +16,11 @@ from synpick_warp.cloud import run
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.inputs.urls import parse_place, resolve_word
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores import base, opening
+from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import Probe, open_store, probe
 from tests.builders import mistake
-from tests.cloud.conftest import tiny
-from tests.cloud.mortal import stored
+from tests.cloud.conftest import stored, tiny, together
 from tests.harness import scripted_bake
 
 
@@ -91,11 +90,7 @@ def test_a_second_server_without_compare_and_swap_is_told_and_takes_shares(tmp_p
 
 def test_of_many_that_create_one_wins(memory):
     store, won = open_store(memory), []
-    threads = [threading.Thread(target=lambda me=me: won.append(store.create("claim", b"%d" % me))) for me in range(16)]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()
+    together(*(lambda me=me: won.append(store.create("claim", b"%d" % me)) for me in range(16)))
     assert sum(tag is not None for tag in won) == 1
 
 
@@ -120,7 +115,7 @@ def test_a_store_that_does_not_answer_in_time_is_asked_again(server, prefix, mon
 
 
 def test_a_transient_error_that_mentions_credentials_is_repeated(memory, monkeypatch):
-    monkeypatch.setattr("synpick_warp.system.stores.base.FIRST_PAUSE", 0.0)
+    monkeypatch.setattr("synpick_warp.system.stores.store.FIRST_PAUSE", 0.0)
     store, faults = open_store(memory), ["status code: 503: token credentials", "error sending request for url (s3/credentials/a)"]
     real = store._obs.put
 
@@ -134,9 +129,9 @@ def test_a_transient_error_that_mentions_credentials_is_repeated(memory, monkeyp
     assert faults == []
 
 
-@pytest.mark.parametrize("failures", [2, base.TRIES])
+@pytest.mark.parametrize("failures", [2, store_module.TRIES])
 def test_a_listing_that_fails_is_repeated_or_an_error_and_never_short(memory, monkeypatch, failures):
-    monkeypatch.setattr(base, "FIRST_PAUSE", 0.0)
+    monkeypatch.setattr(store_module, "FIRST_PAUSE", 0.0)
     store = open_store(memory)
     real = store._obs.list
     keys = [f"many/{number:04d}" for number in range(1_001)]
@@ -151,7 +146,7 @@ def test_a_listing_that_fails_is_repeated_or_an_error_and_never_short(memory, mo
         yield from real(*arguments, **given)
 
     monkeypatch.setattr(store, "_obs", SimpleNamespace(list=listing))
-    if failures < base.TRIES:
+    if failures < store_module.TRIES:
         assert [key for key, _ in store.list("many")] == keys
     else:
         with pytest.raises(StoreError, match="6 attempts failed"):

@@ -17,8 +17,7 @@ from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import EPISODES, files, tiny
-from tests.cloud.mortal import Killed, MortalStore, stored
+from tests.cloud.conftest import EPISODES, Killed, MortalStore, files, stored, tiny
 from tests.harness import scripted_bake
 
 QUIET = SilentProgress()

@@ -8,7 +8,6 @@ import pytest
 
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
-from synpick_warp.errors import ConfigError
 from synpick_warp.exporters import registry
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.formats import FORMAT_TABLE
@@ -19,10 +18,6 @@ from synpick_warp.views.frames import EpisodeEnd
 class Fake:
     """Exporter that records its calls and keeps `on_committed` callbacks pending."""
 
-    needs_physics = False
-    needs_views = False
-    needs_images = False
-    writes_depth = False
     paths: tuple[str, ...] = ()
 
     def __init__(self, _: ExportContext | None) -> None:
@@ -53,10 +48,6 @@ class Fake:
 
 
 class Other(Fake):
-    needs_physics = True
-    needs_views = True
-    needs_images = False
-    writes_depth = False
     paths = ("b", "a")
 
     @staticmethod
@@ -69,12 +60,6 @@ def test_every_format_has_one_class_in_a_fixed_order():
     classes = load_exporter_classes(("zarr", "bop", "zarr"))
     assert [one.__name__ for one in classes] == ["BopExporter", "TrajectoryExporter"]
     assert load_exporter_classes(FORMATS) == load_exporter_classes(FORMATS[::-1])
-
-
-def test_missing_package_of_a_format_is_a_configuration_error(monkeypatch):
-    monkeypatch.setitem(FORMAT_TABLE, "usd", FORMAT_TABLE["usd"]._replace(module="none"))
-    with pytest.raises(ConfigError, match=r"bake\.formats names usd, but its writer cannot be loaded: No module named .*none"):
-        load_exporter_classes(("bop", "usd"))
 
 
 def test_episode_is_committed_when_the_last_exporter_has_committed_it():
@@ -101,16 +86,6 @@ def test_files_and_slot_size_combine_all_exporters():
     assert sorted(both.write_constants()) == [Path("a"), Path("b")]
     assert registry.slot_bytes((Fake, Other), None) == 9  # type: ignore[arg-type]
     assert registry.finalize((Fake, Other), None, None, None, ()) == [Path("a"), Path("b")]  # type: ignore[arg-type]
-
-
-def test_views_and_physics_are_needed_if_one_exporter_needs_them():
-    assert [(needs.physics, needs.views) for needs in (Needs((Fake,), 0), Needs((Fake, Other), 0))] == [  # type: ignore[arg-type]
-        (False, False),
-        (True, True),
-    ]
-    assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
-        name in ("bop", "shards", "lerobot", "coco", "yolo") for name in FORMAT_TABLE
-    ]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -108,10 +107,9 @@ class BopExporter(SceneExporter):
         with output_errors(scenes[0]):
             spool_picks(batch, scenes)
 
-    def files(self, episode: int) -> list[Path]:
-        """Existing scene folders of an episode, relative to the data set. See `Exporter`."""
-        places = dict.fromkeys(self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
-        return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
+    def places(self, episode: int) -> Iterator[Path]:
+        """Folders of its scenes. See `EpisodeExporter`."""
+        return (self._place(scene).relative_to(self._out) for scene in self.scene_ids(episode))
 
     def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         """Create the staging folder of a scene, with a folder for each kind of images."""

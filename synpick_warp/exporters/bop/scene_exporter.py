@@ -119,10 +119,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         """Task that completes scenes of these images, given as (staging folder, scene_id), and moves them to their places."""
 
-    @abstractmethod
-    def files(self, episode: int) -> list[Path]:
-        """Existing paths of an episode, relative to the data set. See `Exporter`."""
-
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
         """Bytes of a view's images in shared memory. See `Exporter`."""
@@ -173,7 +169,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             index, camera = int(batch.episode[view]), int(batch.camera[view])
             episode = self._staged(index, partial(self._create_scenes, index))
             scene = episode.content[camera]
-            images, truth = make_view_task(batch, view, self.scene_id(index, camera), self._views[camera])
+            images, truth = make_view_task(batch, view, self.scene_ids(index)[camera], self._views[camera])
             place = self._folder(truth.scene) / scene.name
             arguments = (type(self).write_view, scene, self._views[camera], truth)
             yield self._task((episode,), write_rendered_view, images, arguments, place)
@@ -188,21 +184,21 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             arguments = (stored, type(self).write_view, type(self).write_layer, settings.layers, scene, settings)
             self._pool.submit_all((self._task((staged,), write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),))
 
-    def scene_id(self, episode: int, camera: int) -> int:
-        """BOP scene_id of an episode as seen by a camera."""
-        return len(self._cameras) * episode + camera
+    def scene_ids(self, episode: int) -> range:
+        """BOP scene_id of an episode as seen by each camera."""
+        return range(len(self._cameras) * episode, len(self._cameras) * (episode + 1))
 
     def _create_scenes(self, index: int, folder: Path) -> tuple[Path, ...]:
         """Create the staging folders of an episode's scenes, one per camera, in this folder; returns them."""
-        scenes = tuple(folder / f"{self.scene_id(index, camera):06d}" for camera in range(len(self._cameras)))
+        scenes = tuple(folder / f"{scene:06d}" for scene in self.scene_ids(index))
         for scene, settings in zip(scenes, self._views, strict=True):
             self._stage_scene(scene, settings)
         return scenes
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
         """Task that moves an episode's scenes to their places."""
-        first = self.scene_id(end.episode, 0)
+        numbers = self.scene_ids(end.episode)
         images = tuple(end.images[:: self._context.layout.every[camera]] for camera in range(len(self._cameras)))
-        scenes = tuple(zip(episode.content, range(first, first + len(self._cameras)), strict=True))
+        scenes = tuple(zip(episode.content, numbers, strict=True))
         function, arguments = self._commit_task(scenes, images)
-        return WriteTask(function, (), arguments, self._folder(first) / f"{first:06d}")
+        return WriteTask(function, (), arguments, self._folder(numbers[0]) / f"{numbers[0]:06d}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -130,10 +129,9 @@ class LerobotExporter(EpisodeExporter[_Content]):
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
             self._staged(index, _make_content).content.ticks += row.tobytes()
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: part and videos."""
-        places = [part_path(episode), *(video_path(camera, episode) for camera in self._settings.cameras)]
-        return sorted(place for place in places if os.path.lexists(self._context.out / place))
+    def places(self, episode: int) -> list[Path]:
+        """Part and videos. See `EpisodeExporter`."""
+        return [part_path(episode), *(video_path(camera, episode) for camera in self._settings.cameras)]
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
         for camera, group in list(episode.content.spooled):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -92,10 +91,9 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         episodes = [self._staged(index, partial(self._make_content, batch, world)) for world, index in enumerate(indices)]
         self._context.pool.submit_all(self._spool(batch, episodes))
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the group."""
-        place = self._place(episode)
-        return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
+    def places(self, episode: int) -> tuple[Path]:
+        """The group. See `EpisodeExporter`."""
+        return (STORE / EPISODES / f"{episode:06d}",)
 
     def _make_content(self, batch: TickBatch, world: int, _: Path) -> _Content:
         """What the first tick of an episode tells, that of a world of a batch."""
@@ -158,8 +156,5 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             **kept.initial,
         }
         content = EpisodeContent(attributes, kept.object_id, kept.drop_pose, end.attempts)
-        place = self._place(end.episode)
+        place = self._context.out / self.places(end.episode)[0]
         return WriteTask(write_episode, (), (episode.folder, kept.row, kept.count, place, content, self._settings), place)
-
-    def _place(self, episode: int) -> Path:
-        return self._context.out / STORE / EPISODES / f"{episode:06d}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -62,18 +61,14 @@ class UsdExporter(EpisodeExporter[TickSpool]):
                 spool.add(row)
 
     def _commit(self, episode: StagedEpisode[TickSpool], end: EpisodeEnd) -> WriteTask:
-        spool, place = episode.content, self._place(end.episode)
+        spool, place = episode.content, self._context.out / self.places(end.episode)[0]
         with output_errors(spool.path):
             spool.flush()
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the one file."""
-        place = self._place(episode)
-        return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
-
-    def _place(self, episode: int) -> Path:
-        return self._context.out / FOLDER / f"{episode:06d}.usdc"
+    def places(self, episode: int) -> tuple[Path]:
+        """The one file. See `EpisodeExporter`."""
+        return (FOLDER / f"{episode:06d}.usdc",)
 
     @cached_property
     def _settings(self) -> EpisodeSettings:

@@ -1,4 +1,7 @@
-"""LeRobot data sets written by the real pool: contract, tables by pyarrow against the simulation, videos by PyAV against the views."""
+"""LeRobot data sets written by the real pool: contract, tables by pyarrow against the simulation, videos by PyAV against the views.
+
+Bytes of videos depend neither on freed memory nor on the CPU.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from fractions import Fraction
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -22,10 +26,9 @@ from synpick_warp.configs.schema import Config, Split
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from synpick_warp.exporters.lerobot import layout
+from synpick_warp.exporters.lerobot import layout, video
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
 from synpick_warp.exporters.lerobot.part import describe_tasks
-from synpick_warp.exporters.lerobot.video import GROUP
 from synpick_warp.exporters.registry import load_exporter_classes
 from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
 from tests.worlds import box_views, trajectories
@@ -167,7 +170,7 @@ def test_videos_show_the_views_at_exact_times(dataset, episodes):
             assert [frame.pts * frame.time_base for frame in shown] == [
                 frame / video_rate(trajectories.config().physics) for frame in range(FRAMES)
             ]
-            assert [frame.key_frame for frame in shown] == [index % GROUP == 0 for index in range(FRAMES)]
+            assert [frame.key_frame for frame in shown] == [index % video.GROUP == 0 for index in range(FRAMES)]
             errors = [
                 np.abs(frame.to_ndarray(format="rgb24").astype(int) - color).mean() for frame, color in zip(shown, truth, strict=True)
             ]
@@ -267,3 +270,46 @@ def test_chunks_hold_a_thousand_videos():
     assert str(layout.video_path("camera_1", 2345)).endswith("camera_1/chunk-002/file-345.mp4")
     assert len(layout.video_folders(("camera_0", "camera_1"))) == 2 + 2 + 1
     assert dataclasses.replace(Config()).bake.formats == ("bop",)
+
+
+CHUNK = 100_000
+"""Allocation size [bytes], below glibc's mmap threshold of 128 KiB: larger blocks are newly mapped, zero-filled pages."""
+
+
+def moving_noise(width: int, height: int) -> list[np.ndarray]:
+    """Synthetic video: YUV planes of a group of pictures, from a crop window that moves across a blurred noise image."""
+    noise = np.random.default_rng(0).integers(0, 256, (height + 40, width + 40, 3), dtype=np.uint8)
+    picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 4), None, 0, 255, cv2.NORM_MINMAX)
+    windows = [picture[2 * step : 2 * step + height, 3 * step : 3 * step + width] for step in range(video.GROUP)]
+    return [video.split_planes(np.ascontiguousarray(window)) for window in windows]
+
+
+def encode(planes: list[np.ndarray], path: Path) -> bytes:
+    video.write_group(planes, np.zeros((3, video.LEVELS), np.int64), Fraction(15), path)
+    return path.read_bytes()
+
+
+def fill_free_memory(value: int) -> bytes:
+    """Fill 10 MB of the heap with a byte value and free it, except the last chunk, which prevents the heap from shrinking."""
+    chunks = [bytes([value]) * CHUNK for _ in range(100)]
+    return chunks.pop()
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 72), (224, 224), (320, 240), (480, 270)])
+def test_bytes_do_not_depend_on_freed_memory(tmp_path, width, height):
+    """Regression test: at these sizes x264's macroblock tree with AVX-512 reads out of bounds, unless `cpu-independent` is set."""
+    planes = moving_noise(width, height)
+    found = set()
+    for value in (0, 255, 128):
+        last_chunk = fill_free_memory(value)
+        found.add(encode(planes, tmp_path / "group"))
+        del last_chunk
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize(("width", "height"), [(96, 72), (320, 240)])
+def test_bytes_do_not_depend_on_the_instruction_set(tmp_path, monkeypatch, width, height):
+    planes = moving_noise(width, height)
+    fastest = encode(planes, tmp_path / "group")
+    monkeypatch.setitem(video._OPTIONS, "x264-params", video._OPTIONS["x264-params"] + ":asm=0")
+    assert encode(planes, tmp_path / "group") == fastest

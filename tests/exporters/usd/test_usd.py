@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, UsdUtils, UsdValidation
 
+from synpick_warp.configs.cell.bins import BinRow, Bins
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.usd.lights import write_light_maps
@@ -126,16 +129,6 @@ def test_references_are_relative_and_resolve(folder):
     assert {path.resolve() for path in folder.rglob("*") if path.is_file()} - referenced == {folder / "assets/lights/light_000.exr"}
 
 
-def test_a_data_set_can_be_moved(tmp_path, folder):
-    place = tmp_path / "elsewhere"
-    place.mkdir()
-    for path in folder.rglob("*"):
-        target = place / path.relative_to(folder)
-        target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
-    stage = Usd.Stage.Open(str(place / "000000.usdc"))
-    assert len(UsdGeom.Mesh(stage.GetPrimAtPath("/Episode/Tote/Visual")).GetPointsAttr().Get()) > 100
-
-
 def test_validators_find_nothing(folder):
     for path in layers(folder):
         assert list(validation_errors(path)) == []
@@ -238,3 +231,27 @@ def test_dome_light_has_name_and_file_of_its_map(folder):
     dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
     assert dome.GetPrim().GetDisplayName() == "mixed_lamps"
     assert dome.GetTextureFileAttr().Get().path == "./assets/lights/light_001.exr"
+
+
+@pytest.mark.parametrize(
+    ("kind", "rows", "assets", "prim"),
+    [
+        ("tote", (), {"tote"}, "Tote"),
+        ("own", (BinRow(name="kanban", compartments=(2, 1)), BinRow(name="2nd")), {"bin_kanban", "bin_2nd"}, "Bin"),
+        ("pallet", (), {"pallet"}, "Bin"),
+        ("none", (), set(), ""),
+    ],
+)
+def test_an_episode_references_its_bin(tmp_path, kind, rows, assets, prim):
+    config = replace(Config(), bins=Bins(kind=kind), bin=rows)
+    folder = usd_sets.write_set(tmp_path / "set", config, CATALOG, frames=4)
+    names = {path.stem for path in (folder / "assets").glob("*.usdc")}
+    assert names - {"finger", "cup", "table"} - {name for name in names if name.startswith("obj_")} == assets
+    stage = Usd.Stage.Open(str(folder / "000000.usdc"))
+    for name in ("Tote", "Bin"):
+        found = stage.GetPrimAtPath(f"/Episode/{name}")
+        assert found.IsValid() == (name == prim)
+        if name == prim:
+            assert stage.GetPrimAtPath(f"/Episode/{name}/Visual").IsValid()
+            pieces = stage.GetPrimAtPath(f"/Episode/{name}/Collision").GetChildren()
+            assert len(pieces) == {"tote": 9, "own": 10, "pallet": 1}[kind]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -59,9 +58,8 @@ class BoxesExporter(SceneExporter):
         (self._out / FOLDER).mkdir(exist_ok=True)
         return []
 
-    def files(self, episode: int) -> list[Path]:
-        places = [FOLDER / f"{self.scene_id(episode, camera):06d}" for camera in range(len(self._cameras))]
-        return [place for place in places if os.path.lexists(self._out / place)]
+    def places(self, episode: int) -> list[Path]:
+        return [FOLDER / f"{scene:06d}" for scene in self.scene_ids(episode)]
 
     def _stage_scene(self, scene: Path, settings) -> None:
         scene.mkdir()

@@ -65,12 +65,6 @@ def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
 
 
-def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
-    """Committed files and folders of scenes, relative to the data set, sorted."""
-    places = [place for scene in scenes for place in (IMAGES / f"{scene:06d}", PARTS / f"{scene:06d}.jsonl")]
-    return sorted(place for place in places if os.path.lexists(out / place))
-
-
 def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """Write a view's image to the staging folder of its scene, and append its annotations there."""
     suffix, color = view.color

@@ -5,7 +5,7 @@ Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     PARTS,
     annotation_file,
     commit_scenes,
-    scene_files,
     write_annotation_files,
     write_categories,
     write_view,
@@ -68,9 +67,9 @@ class CocoExporter(SceneExporter):
         with output_errors(self._out):
             return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: folders of images, and parts."""
-        return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
+    def places(self, episode: int) -> Iterator[Path]:
+        """Folders of images, and parts. See `EpisodeExporter`."""
+        return (place for scene in self.scene_ids(episode) for place in (IMAGES / f"{scene:06d}", PARTS / f"{scene:06d}.jsonl"))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_scenes, (scenes, self._out, images)

@@ -79,10 +79,9 @@ class ShardsExporter(SceneExporter):
             yield f"{shard.parent / KEYS_FILE}/{shard_index(shard) // MAX_SHARD_SCENES}", lines
             yield f"{shard.parent}/{_SIZES}/0", f"{size} {views}\n".encode()
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the shards of its scenes."""
-        scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
-        return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
+    def places(self, episode: int) -> Iterator[Path]:
+        """The shards of its scenes that are there. See `EpisodeExporter`."""
+        return (path.relative_to(self._out) for scene in self.scene_ids(episode) for path in find_shards(scene, self._folder(scene)))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, tuple(view.layers for view in self._views))

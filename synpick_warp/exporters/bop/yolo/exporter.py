@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,13 +51,10 @@ class YoloExporter(SceneExporter):
             write_data_file(self._out, context.names, context.layout.folders)
             return [DATA, *write_notes(self._out, context.settings, context.names, self._cameras)]
 
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: lists of images, and folders of images and labels."""
-        split = self._context.layout.folder(episode)
-        scenes = [self.scene_id(episode, camera) for camera in range(len(self._cameras))]
-        folders = [FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS]
-        places = [*map(image_list, scenes), *folders]
-        return sorted(place for place in places if os.path.lexists(self._out / place))
+    def places(self, episode: int) -> list[Path]:
+        """Lists of images, and folders of images and labels. See `EpisodeExporter`."""
+        split, scenes = self._context.layout.folder(episode), self.scene_ids(episode)
+        return [*map(image_list, scenes), *(FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS)]
 
     def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         scene.mkdir()
