@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import fields
 from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
 import pytest
 
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.builders import FEW_STEPS, assignments
@@ -102,8 +104,9 @@ def test_kept_snapshots_are_copies(measured):
     simulated = [frame for _, frame in measured.ticks[-KEPT_TICKS:]]
     assert [snapshot.frame.numpy().tolist() for snapshot in snapshots] == [frame.tolist() for frame in simulated]
     simulation = measured.ticks[0][0]
-    taken = {array.ptr for array in vars(simulation.record.snapshot).values()}
-    kept = [getattr(snapshot, name).ptr for snapshot in snapshots for name in vars(snapshot)]
+    names = [item.name for item in fields(Snapshot)]
+    taken = {getattr(simulation.record.snapshot, name).ptr for name in names}
+    kept = [getattr(snapshot, name).ptr for snapshot in snapshots for name in names]
     assert len(set(kept)) == len(kept)
     assert not taken & set(kept)
 
