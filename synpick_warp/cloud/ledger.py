@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import itertools
+import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -18,9 +19,11 @@ from synpick_warp.dataset.commit.manifest import (
     INPUTS,
     MANIFEST_FILE,
     describe_differences,
+    describe_inputs,
     episode_entry,
     make_manifest,
 )
+from synpick_warp.dataset.records import Manifest
 from synpick_warp.errors import ConfigError, OutputError, StoreError
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.system.inputs.toml import MAX_TOML
@@ -70,11 +73,15 @@ class Ledger:
                 ) from None
             self._check_outside()
             return None
-        known = decode_json(data, dict[str, Any], f"{url}/{MANIFEST_FILE}", OutputError, "restore it, or name another prefix with --out")
-        said = describe_differences(make_manifest(self.config), {name: known[name] for name in known if name != INPUTS})
-        if said:
+        if said := describe_differences(make_manifest(self.config), self._decode(data)):
             raise ConfigError(f"{url} was started with other settings: {said}; {_ADVICE}")
         return data
+
+    def _decode(self, manifest: bytes) -> dict[str, Any]:
+        """Parse the manifest of the store; raises OutputError if it is damaged."""
+        place, advice = f"{self.store.url}/{MANIFEST_FILE}", "restore it, or name another prefix with --out"
+        decode_json(manifest, Manifest, place, OutputError, advice)
+        return decode_json(manifest, dict[str, Any], place, OutputError, advice)
 
     def _check_outside(self) -> None:
         """Check that no outer prefix is a data set, as far as it may be read; raises OutputError."""
@@ -118,8 +125,9 @@ class Ledger:
             elif self.store.stat(MANIFEST_FILE) is None:  # Another worker may have started meanwhile.
                 self.store.put(MANIFEST_FILE, data)
             self.manifest = self.store.get(MANIFEST_FILE, MAX_JSON)
-        if self.manifest != data:
-            raise ConfigError(f"{self.store.url} was started with other settings, objects or lights by another worker; {_ADVICE}")
+        ours, theirs = json.loads(data), self._decode(self.manifest)
+        if said := describe_differences(ours, theirs) or describe_inputs(ours.get(INPUTS, {}), theirs.get(INPUTS, {})):
+            raise ConfigError(f"{self.store.url} was started by another worker with other settings, objects or lights: {said}; {_ADVICE}")
 
     def put_settings(self) -> None:
         """Write the settings of this bake, unless the same are there; those of an earlier bake are replaced."""

@@ -12,6 +12,7 @@ import pytest
 from synpick_warp.cloud import finish, run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
+from synpick_warp.dataset.commit.manifest import INPUTS, OBJECT, encode_manifest, make_manifest
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
@@ -147,14 +148,30 @@ def test_other_objects_are_refused(memory, monkeypatch):
         bake(memory)
 
 
+@pytest.mark.parametrize("known", [{}, {f"{OBJECT}5: bowl": 64 * "5", f"{OBJECT}6: cup": 64 * "6"}])
+def test_objects_that_differ_are_named(memory, known):
+    """Also by workers that start at the same time; a manifest with one digest of all objects is compared as far as it goes."""
+    ours = make_manifest(tiny()) | {INPUTS: scripted_bake.INPUTS | {f"{OBJECT}5: bowl": 64 * "7", f"{OBJECT}6: cup": 64 * "6"}}
+    store = open_store(memory)
+    ledger = Ledger(store, tiny(), Probe(0.0, False))
+    objects = {"objects": 64 * "1"} if known else {}
+    store.put("manifest.json", encode_manifest(ours | {INPUTS: scripted_bake.INPUTS | known | objects}))
+    if known:
+        with pytest.raises(ConfigError, match=r"by another worker with other settings, objects or lights: objects \(5: bowl\);"):
+            ledger.put_manifest(encode_manifest(ours))
+    else:
+        ledger.put_manifest(encode_manifest(ours))
+
+
 def test_a_manifest_that_another_worker_wrote_meanwhile_is_compared(memory):
     """Also by a store without conditional writes."""
     store = open_store(memory)
     ledger = Ledger(store, tiny(), Probe(0.0, False))
-    store.put("manifest.json", b"theirs")
-    with pytest.raises(ConfigError, match="by another worker"):
-        ledger.put_manifest(b"ours")
-    assert store.get("manifest.json", 1 << 30) == b"theirs"
+    theirs = encode_manifest(make_manifest(tiny().with_values({"bake.seed": 8})))
+    store.put("manifest.json", theirs)
+    with pytest.raises(ConfigError, match=r"by another worker.*bake\.seed is 0, there 8"):
+        ledger.put_manifest(encode_manifest(make_manifest(tiny())))
+    assert store.get("manifest.json", 1 << 30) == theirs
 
 
 def test_a_damaged_or_deleted_index_file_is_named(memory, monkeypatch):

@@ -18,14 +18,16 @@ from synpick_warp.configs.files.load import load_config, sections
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest
+from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.writing import commit_episode, digest_inputs
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
 from synpick_warp.views.frames import EpisodeEnd
+from tests.harness import scripted_bake
 from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import catalog, settings
 
@@ -117,6 +119,32 @@ def test_inputs_are_known_by_their_content():
     brighter = (dataclasses.replace(skies()[0], radiance=skies()[0].radiance * np.float32(2)), *skies()[1:])
     digests = digest_inputs(catalog(), brighter)
     assert (digests["objects"], digests["lights"] != known["lights"]) == (known["objects"], True)
+
+
+def test_inputs_that_differ_are_named_with_their_objects():
+    """Those of older manifests, which have one digest of all objects, by their kind."""
+    known = digest_inputs(catalog(), skies())
+    first, *others = catalog().entries
+    hull = dataclasses.replace(first, pieces=(dataclasses.replace(first.pieces[0], vertices=first.pieces[0].vertices + np.float32(1e-6)),))
+    other = digest_inputs(dataclasses.replace(catalog(), entries=(hull, *others[1:])), skies()[:1])
+    assert manifest.describe_inputs(known, other) == "objects and lights (1: boxes_1, 2: boxes_2)"
+    older = {name: digest for name, digest in known.items() if not name.startswith(manifest.OBJECT)}
+    assert set(older) == {"objects", "lights"}
+    assert manifest.describe_inputs(other, older) == manifest.describe_inputs(older, other) == "objects and lights"
+    assert manifest.describe_inputs(older, known) == manifest.describe_inputs(known, known) == ""
+
+
+def test_merge_and_resume_name_the_objects_that_differ(tmp_path, monkeypatch):
+    config, parts = scripted_bake.small_settings(), [tmp_path / "a", tmp_path / "b"]
+    for number, part in enumerate(parts):
+        digests = {"objects": 64 * f"{number}", f"{manifest.OBJECT}7: box 7": 64 * f"{number}"}
+        monkeypatch.setattr(scripted_bake, "INPUTS", scripted_bake.INPUTS | digests | {f"{manifest.OBJECT}3: box 3": 64 * "3"})
+        scripted_bake.bake(part, config, shard=(number, 2))
+    with pytest.raises(DatasetError, match=rf"{parts[1]} was made with other objects \(7: box 7\) than {parts[0]}; only parts"):
+        merge(parts, tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+    with pytest.raises(ConfigError, match=rf"{parts[0]} was started with other objects \(7: box 7\); "):
+        scripted_bake.bake(parts[0], config)
 
 
 def test_field_names_that_every_manifest_depends_on():

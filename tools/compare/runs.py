@@ -19,19 +19,20 @@ import tarfile
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import cv2
 import numpy as np
 
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, FREE_SETTINGS, INPUTS, MANIFEST_FILE, OBJECT
 from tools.options import fail
 
 IMAGES = (".png", ".jpg")
 USD = (".usd", ".usdc", ".usda")
-IGNORED = {CONFIG_FILE: FREE_SETTINGS, MANIFEST_FILE: ("versions.synpick-warp",)}
-"""Keys of files that may differ."""
+IGNORED = {CONFIG_FILE: FREE_SETTINGS, MANIFEST_FILE: ("versions.synpick-warp", f"{INPUTS}.{OBJECT}*")}
+"""Keys of files that may differ, as patterns. The digest of all objects covers those of single objects, which older versions lack."""
 SAME_CONTENT = "different bytes, equal content"
 CHUNK = 1 << 20
 """Bytes of a file compared at once."""
@@ -190,7 +191,7 @@ def compare_values(first: Any, second: Any, path: str = "") -> Iterator[tuple[st
 
 def _without_ignored(name: str, pairs: Iterator[tuple[str, Any, Any]]) -> Iterator[tuple[str, Any, Any]]:
     """Drop the differing pairs whose key is ignored in files of this name."""
-    return (pair for pair in pairs if pair[0].lstrip(".") not in IGNORED.get(name, ()))
+    return (pair for pair in pairs if not any(fnmatchcase(pair[0].lstrip("."), key) for key in IGNORED.get(name, ())))
 
 
 def _from_pairs(pairs: Iterator[tuple[str, Any, Any]]) -> Difference | None:

@@ -22,6 +22,7 @@ from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,
     INPUTS,
     committed_episodes,
+    describe_inputs,
     episode_entry,
     read_checksums,
     read_entry,
@@ -193,8 +194,8 @@ class StoredContext(ExportContext):
         catalog = load_catalog(config)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, lambda line: None)
         looks = load_looks(config.randomize, lambda line: None)
-        if any(source.inputs.get(name) != digest for name, digest in digest_inputs(catalog, lights, looks).items()):
-            raise DatasetError(f"objects, lights or textures of {source.folder} have changed since its bake, but are needed; restore them")
+        if said := describe_inputs(digest_inputs(catalog, lights, looks), source.inputs):
+            raise DatasetError(f"{said} of {source.folder} have changed since its bake, but are needed; restore them")
         return catalog, lights, looks
 
     @property

@@ -55,6 +55,8 @@ ATTEMPTS_FILE = "attempts.jsonl"
 """List of all pick attempts, ordered by episode and index; absent from bakes without picking."""
 INPUTS = "inputs"
 """Key in the manifest: content digests of objects and lights."""
+OBJECT = "object "
+"""Start of the keys of single objects in INPUTS, before obj_id and name; older manifests have only the digest of all objects."""
 FORMAT = 1
 """Version of the manifest's file format."""
 FREE_SETTINGS = (
@@ -261,13 +263,26 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
 
 
 def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
-    """Describe the differences of two manifests in a sentence: "physics.step is 0.004, there 0.002"."""
+    """Describe the differences of two manifests in a sentence, but for their inputs: "physics.step is 0.004, there 0.002"."""
     parts = []
+    here, there = ({name: value for name, value in each.items() if name != INPUTS} for each in (here, there))
     for key, first, second in differences(here, there):
         if key not in ("settings_checksum", "seed"):
             parts.append(f"{_show_key(key.removeprefix('settings.'))} is {_show(first)}, there {_show(second)}")
     more = len(parts) - MAX_DIFFERENCES
     return "; ".join(parts[:MAX_DIFFERENCES] + ([f"and {more} more"] if more > 0 else []))
+
+
+def describe_inputs(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """Name the inputs whose digests differ, and the objects among them if both manifests have their digests: "objects and lights (24:
+    bowl)"; empty: none."""
+    differing = [name for name in {**here, **there} if here.get(name) != there.get(name)]
+    kinds = " and ".join(_show_key(name) for name in differing if not name.startswith(OBJECT))
+    objects = [_show_key(name.removeprefix(OBJECT)) for name in differing if name.startswith(OBJECT)]
+    if not kinds or not all(any(name.startswith(OBJECT) for name in each) for each in (here, there)) or not objects:
+        return kinds
+    more = [f"and {len(objects) - MAX_DIFFERENCES} more"] if len(objects) > MAX_DIFFERENCES else []
+    return f"{kinds} ({', '.join(objects[:MAX_DIFFERENCES] + more)})"
 
 
 def _show(value: object) -> str:

@@ -22,8 +22,10 @@ from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
     CONSTANTS,
     ENTRIES,
+    INPUTS,
     committed_episodes,
     describe_differences,
+    describe_inputs,
     encode_manifest,
     episode_entry,
     read_checksums,
@@ -73,9 +75,11 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         raise DatasetError(f"{url} is in an object store, where all of --shard fill one prefix; merge takes folders of this machine")
     manifest = read_manifest(parts[0])
     for part in parts[1:]:
-        said = describe_differences(read_manifest(part), manifest)
-        if said:
+        other = read_manifest(part)
+        if said := describe_differences(other, manifest):
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
+        if said := describe_inputs(other.get(INPUTS, {}), manifest.get(INPUTS, {})):
+            raise DatasetError(f"{part} was made with other {said} than {parts[0]}; only parts of one data set can be merged")
     _check_folders(parts, out)
     config = _config(parts, manifest)
     layout = DataLayout.of(config)

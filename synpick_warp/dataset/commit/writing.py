@@ -38,8 +38,10 @@ from synpick_warp.dataset.commit.manifest import (
     INDICES,
     INPUTS,
     MANIFEST_FILE,
+    OBJECT,
     committed_episodes,
     describe_differences,
+    describe_inputs,
     encode_manifest,
     episode_entry,
     is_complete,
@@ -135,8 +137,7 @@ class OutputFolder:
         self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
         self._is_ours = self._known is not None
         if self._known:
-            said = describe_differences(self._manifest, {name: self._known[name] for name in self._known if name != INPUTS})
-            if said:
+            if said := describe_differences(self._manifest, self._known):
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
             _check_kinds(out, self._shared)
         entries = committed_episodes(out)
@@ -166,10 +167,8 @@ class OutputFolder:
             ConfigError: The data set was started with other objects or lights.
             OutputError: The folder cannot be written.
         """
-        known = self._known.get(INPUTS, {}) if self._known else inputs
-        differing = [name for name in {**inputs, **known} if known.get(name) != inputs.get(name)]
-        if differing:
-            raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
+        if self._known and (said := describe_inputs(inputs, self._known.get(INPUTS, {}))):
+            raise ConfigError(f"{self.out} was started with other {said}; {_ADVICE}")
         self._exporters = exporters
         with output_errors(self.out):
             if self._known:
@@ -422,12 +421,14 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors and textures, without the names of their files. Names and order of the dataclasses' fields are
+    SHA-256 over objects, lights, distractors and textures, without the names of their files, and over each object: its mesh, material,
+    collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are
     hashed, too: renaming a field of `Catalog` or `EnvironmentMap` changes every manifest.
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
-    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures
+    each = {f"{OBJECT}{body.obj_id}: {body.name}": _digest_data(body) for body in catalog.bodies}
+    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 
 
 def _digest_data(value: object) -> str:
