@@ -58,7 +58,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 
     `bake.models` is a BOP model folder (obj_NNNNNN.ply in millimetres, models_info.json), a folder of meshes in metres, which get obj_ids
     from 1 in the order of their file names, or a folder of such folders. If it is empty: the embedded objects. Objects that cannot be used
-    are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes.
+    are left out, with a line each; with `objects.strict`, the first of them is an error. Files are read in isolated processes; one for
+    which time or memory of this machine does not suffice is an error, as elsewhere the same settings would give another catalog.
 
     Args:
         config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
@@ -67,7 +68,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 
     Raises:
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
-            invalid mass.
+            invalid mass. Or time or memory does not suffice for a file.
     """
     rules = _Rules(config.objects, config.object_rows, config.cell.bins, config.randomize.surfaces)
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
@@ -208,7 +209,10 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
             sizes.append(result.size if isinstance(result, _SizeError) else result[0].hull.diameter)
             faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.bins[0])
         if isinstance(result, Failure):
-            faults.add(CatalogError(f"{model.path}: the process that reads it {result.reason}; repair or simplify the file"))
+            fault = f"{model.path}: the process that reads it {result.reason}"
+            if result.by_machine:
+                raise CatalogError(f"{fault}; decimate its mesh and scale down its textures, or remove the file")
+            faults.add(CatalogError(f"{fault}; repair or simplify the file"))
         elif isinstance(result, SynpickError):
             faults.add(CatalogError(str(result)))
         else:

@@ -75,7 +75,8 @@ def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bo
         strict: Whether the first map that cannot be used is an error.
 
     Raises:
-        LightError: The folder does not exist or contains no map that can be used, or two have the same name.
+        LightError: The folder does not exist or contains no map that can be used, two have the same name, or time or memory of this
+            machine does not suffice for one.
     """
     if not folder:
         return skies()
@@ -116,6 +117,8 @@ def _load_all(files: list[Path], report: Callable[[str], None], strict: bool) ->
     maps, faults = [], []
     results = run_isolated(_load_map, [(path, strict, MAX_HEIGHT) for path in files], READ_LIMITS)
     for path, result in zip(files, results, strict=True):
+        if isinstance(result, Failure) and result.by_machine:
+            raise LightError(f"{path}: the process that reads it {result.reason}; scale the map down, or remove it")
         if isinstance(result, Failure | SynpickError):
             reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
             faults.append(LightError(reason))

@@ -75,7 +75,8 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
         strict: Whether the first image that cannot be used is an error.
 
     Raises:
-        CatalogError: The folder does not exist, or has no image that can be used, or too many.
+        CatalogError: The folder does not exist, or has no image that can be used, or too many, or time or memory of this machine does not
+            suffice for one.
     """
     if not folder:
         return ()
@@ -87,6 +88,8 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
         raise CatalogError(f"{key}: the folder {folder} has {len(files)} images ({', '.join(SUFFIXES)}); allowed: 1 to {MAX_TEXTURES}")
     textures, faults = [], []
     for path, result in zip(files, run_isolated(_read, [(path,) for path in files], LIMITS), strict=True):
+        if isinstance(result, Failure) and result.by_machine:
+            raise CatalogError(f"{path}: the process that reads it {result.reason}; scale the image down, or remove it")
         if isinstance(result, Failure | SynpickError):
             reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
             faults.append(CatalogError(reason))

@@ -13,7 +13,12 @@ import trimesh
 
 from synpick_warp.errors import CatalogError, LightError, SynpickError
 from synpick_warp.exporters.bop.shared.models import write_models
+from synpick_warp.scenes import catalog as catalog_reader
+from synpick_warp.scenes import lights as lights_reader
+from synpick_warp.scenes import looks as looks_reader
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.system.processes.isolation import Failure
+from tests.builders import mistake
 from tests.scenes.test_fuzz_assets import OBJ, picture
 from tests.worlds.model_files import box, exported, load_models, put
 
@@ -43,6 +48,37 @@ def test_where_coacd_crashes_the_hull_stands(tmp_path, monkeypatch, case, names)
     assert [(entry.name, len(entry.pieces)) for entry in catalog.entries] == [(name, 1) for name in names]
     said = [f"{name}: its convex decomposition crashed (SIGSEGV); its convex hull is used instead" for name in names]
     assert [line.partition(":")[0] + ":" + line.split(":")[1] for line in lines[1:]] == said
+
+
+LIGHT = cv2.imencode(".hdr", np.full((8, 16, 3), 0.5, np.float32))[1].tobytes()
+
+
+@pytest.mark.parametrize("reason", ["took longer than 600 s of processor time and was stopped", "was killed, probably for lack of memory"])
+@pytest.mark.parametrize(
+    ("reader", "option", "suffix", "content", "remedy"),
+    [
+        (catalog_reader, "bake.models", "ply", box(0.1, 0.1, 0.1), "decimate its mesh and scale down its textures, or remove the file"),
+        (lights_reader, "bake.lights", "hdr", LIGHT, "scale the map down, or remove it"),
+        (looks_reader, "randomize.table_textures", "png", picture(), "scale the image down, or remove it"),
+    ],
+)
+def test_a_file_for_which_the_machine_does_not_suffice_is_not_left_out(
+    tmp_path, monkeypatch, reader, option, suffix, content, remedy, reason
+):
+    """Elsewhere the same command would make another data set. What is damaged stays left out."""
+    for name, data in (("damaged", b"none"), ("good", content), ("slow", content)):
+        put(tmp_path / "given" / f"{name}.{suffix}", data)
+    real = reader.run_isolated
+
+    def too_slow(function, calls, limits):
+        for call, result in zip(calls, real(function, calls, limits), strict=True):
+            yield Failure(reason, by_machine=True) if f"slow.{suffix}" in str(call) else result
+
+    monkeypatch.setattr(reader, "run_isolated", too_slow)
+    folder = tmp_path / "given"
+    said = mistake("bake", "--config", "smoke", "--device", "cpu", "--out", tmp_path / "set", "--set", f"{option}={folder}")
+    assert said == f"{folder / f'slow.{suffix}'}: the process that reads it {reason}; {remedy}"
+    assert not (tmp_path / "set").exists()
 
 
 def restart_server() -> None:
