@@ -404,7 +404,7 @@ def _default_out() -> Path:
 def _forecast(config: Config, out: Path | None, shard: tuple[int, int], splits: Sequence[str]) -> int:
     """Print the forecast of a bake; arguments as of `_bake`."""
     _check_inputs(config.bake.models, config.bake.lights)
-    from synpick_warp.cli.commands.doctor import print_forecast
+    from synpick_warp.cli.commands.forecast import print_forecast
 
     return print_forecast(config, out, [episode for split in DataLayout.of(config).plan_shard(splits, shard) for episode in split])
 

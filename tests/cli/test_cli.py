@@ -17,14 +17,13 @@ import trimesh
 import warp as wp
 
 from synpick_warp import __version__
-from synpick_warp.cli.commands import doctor
+from synpick_warp.cli.commands import doctor, forecast
 from synpick_warp.cli.main import app, main
 from synpick_warp.cli.options import EXAMPLES
 from synpick_warp.codes import Ending
 from synpick_warp.configs.files.load import load_config, preset_names
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory import forecast
 from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
 from synpick_warp.factory.memory_plan import Term
 from synpick_warp.stages import timing
@@ -300,8 +299,9 @@ def plans(monkeypatch):
         rows = [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
         return [Term("poses", tuple(rows), ("bake.worlds",), (config.bake.worlds,), on_device=False)]
 
-    monkeypatch.setattr(doctor, "plan_memory", plan_memory)
-    monkeypatch.setattr(doctor, "fit_to_device", lambda config, *_: config)
+    for command in (doctor, forecast):
+        monkeypatch.setattr(command, "plan_memory", plan_memory)
+        monkeypatch.setattr(command, "fit_to_device", lambda config, *_: config)
 
 
 def test_doctor(capsys, plans, monkeypatch):
