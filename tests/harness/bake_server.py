@@ -81,7 +81,7 @@ class BakeServer:
         assert self._process.stdout
         self._process.stdin.close()
         self._process.stdout.close()
-        self._process.wait(30)
+        self._process.wait(300)
 
     def start(self, out: Path, **options: object) -> int:
         """Start a bake; returns its process id. Options: settings, arguments, and the fault injections of `_prepare`."""
