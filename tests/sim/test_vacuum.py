@@ -113,6 +113,18 @@ def test_a_cup_seals_on_what_its_bellows_follow_and_nowhere_else(device, cup, me
     assert share - 0.01 <= force / full(cup) <= share + 0.04
 
 
+@pytest.mark.parametrize("radius", [0.012, 0.030])
+@pytest.mark.parametrize("width", [0.9, 0.99, 1.01, 1.05, 1.2])
+def test_a_ball_about_as_wide_as_the_cup_is_not_held(device, radius, width):
+    """Air enters through a truncated cone between lip and ball, of which the lip has sunk by a tenth of the cup below the pole."""
+    lip = width * radius
+    centre = radius - 0.2 * lip
+    far = math.hypot(lip, centre)
+    closed = held(2 * lip, math.pi * (far - radius) * (lip + radius * lip / far))
+    (force,) = forces(device, [icosphere(5, radius)], 2 * lip)
+    assert 0.2 <= force / closed <= 3.0
+
+
 def test_beside_an_edge_and_across_two_boxes_air_enters(device):
     """Two boxes that touch each cover a half, or one a twentieth more: one is engaged, and neither is held."""
     cup, side = 0.022, 0.1

@@ -1,7 +1,8 @@
 """Vacuum of suction cups: rays over a cup's mouth find where air enters, and the flow balance of leak and ejector gives the break force.
 
-Air enters where the mouth is not covered by the object that the cup seals with, and below the lip where the surface falls away faster than
-the lip follows. The ejector's characteristic is linear, p = p₀ (1 - Q / Q₀), and a leak of area A is an orifice, Q = C_d A sqrt(2 p / ρ).
+Air enters where the mouth is not covered by the object that the cup seals with, and below or beside the lip where the surface falls away
+faster than the lip follows. The ejector's characteristic is linear, p = p₀ (1 - Q / Q₀), and a leak of area A is an orifice,
+Q = C_d A sqrt(2 p / ρ).
 With s = sqrt(p / p₀) and k = A C_d sqrt(2 p₀ / ρ) / Q₀ that is s² + k s = 1. A cup holds p times the covered area of its mouth.
 """
 
@@ -17,6 +18,8 @@ wp.set_module_options({"enable_backward": False})
 
 BACK = wp.constant(0.01)
 """Rays start this far above the lip [m]: a mesh can stand out of the collision shape on which the cup rests."""
+NOWHERE = wp.constant(1.0e3)
+"""Beyond any surface [m]."""
 GOOD = wp.constant(0.5)
 """A seal is good if at least this fraction of the vacuum is left, as a vacuum switch confirms a part."""
 
@@ -144,6 +147,24 @@ def gap_below_lip(
     return drop_below(ray, world, cup, slope, mouth, rays) - top - lowest
 
 
+@wp.func
+def gap_beside_lip(ray: int, instance: int, world: int, cup: int, top: float, slope: wp.vec2, mouth: MouthData, rays: MouthRays) -> float:
+    """Distance from a ray of the lip that misses the object to its surface, less that in the plane of the lip [m].
+
+    The open area of the mouth counts the latter. A ball that is hardly narrower than the cup leaves none, and falls away below the lip.
+    """
+    across = float(NOWHERE)
+    way = float(NOWHERE)
+    place = mouth.ray[ray]
+    for other in range(rays.owner.shape[2]):
+        if rays.owner[world, cup, other] == instance:
+            apart = wp.length(wp.vec2(place[0] - mouth.ray[other][0], place[1] - mouth.ray[other][1]))
+            drop = wp.max(drop_below(other, world, cup, slope, mouth, rays) - top - mouth.compliance, 0.0)
+            across = wp.min(across, apart)
+            way = wp.min(way, wp.length(wp.vec2(apart, drop)))
+    return way - across
+
+
 @wp.kernel
 def measure_leaks_kernel(pick: PickData, suction: SuctionData, mouth: MouthData, state: Worlds, attempts: Attempts, rays_inout: MouthRays):
     """Measure where air enters below each cup where suction is switched on.
@@ -176,6 +197,8 @@ def measure_leaks_kernel(pick: PickData, suction: SuctionData, mouth: MouthData,
     for ray in range(mouth.lip):
         if leak.instance >= 0 and rays_inout.owner[world, cup, ray] == leak.instance and rays_inout.depth[world, cup, ray] <= suction.reach:
             leak.open += arc * gap_below_lip(ray, leak.instance, world, cup, top, slope, mouth, suction.reach, rays_inout)
+        elif leak.instance >= 0:
+            leak.open += arc * gap_beside_lip(ray, leak.instance, world, cup, top, slope, mouth, rays_inout)
     rays_inout.leak[world, cup] = leak
 
 
