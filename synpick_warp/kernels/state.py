@@ -197,6 +197,22 @@ class Snapshots:
 
 
 @wp.struct
+class Frames:
+    """Episode, frame and light of each world: what shading reads of `Snapshots`, in few bytes of a kernel's parameters."""
+
+    episode: wp.array[int]
+    """(world)"""
+    frame: wp.array[int]
+    """(world)"""
+    light: wp.array[int]
+    """(world)"""
+    light_yaw: wp.array[float]
+    """(world): [rad]"""
+    light_exposure: wp.array[float]
+    """(world): [EV]"""
+
+
+@wp.struct
 class FramePoses:
     """State of each world in one snapshot: whether the tick is a frame, episode and frame index, objects (-1: none) and poses to the world
     of instances and fixtures; the next snapshot repeats these as its previous frame.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, make_dataclass
+from functools import cached_property
 from typing import Any
 
 import warp as wp
 
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.visibility.masks import InstanceMasks
-from synpick_warp.kernels.state import FramePoses, Snapshots
-from synpick_warp.stages.arrays import allocate, array_group, device_array
+from synpick_warp.kernels.state import FramePoses, Frames, Snapshots
+from synpick_warp.stages.arrays import allocate, array_group, bundle, device_array
 from synpick_warp.views.layers import LAYER_TABLE, Layer
 from synpick_warp.views.masks import most_words
 
@@ -26,6 +27,11 @@ _UNITS = _METRES | {"light_yaw": "rad", "light_exposure": "EV"}
 
 class Snapshot(array_group(Snapshots, "world", "instance", units=_UNITS, **_WORLD, **_FIXTURES)):
     """Snapshot of every world at the end of a tick: input of renderer and exporters."""
+
+    @cached_property
+    def frames(self) -> Any:
+        """The struct `Frames` of these arrays."""
+        return bundle(Frames, self)
 
 
 _WORLD = dict.fromkeys(("live", "episode", "frame"), ("world",))

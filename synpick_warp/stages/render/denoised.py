@@ -301,7 +301,7 @@ class DenoisedRenderer:
         if self.history.max_paths == 0:
             return
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
-        inputs = [snapshot.bundle, views]
+        inputs = [snapshot.frames, views]
         wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving], **options)
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
@@ -314,10 +314,10 @@ class DenoisedRenderer:
         scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            inputs = [scene.paths, self.coarse, snapshot.bundle, bodies, gbuffer, views, self.moving]
+            inputs = [scene.paths, self.coarse, snapshot.frames, bodies, gbuffer, views, self.moving]
             outputs = [self.history, self.path_lists, self.guide, self.coarse_light]
             launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
-        inputs = [scene.paths, self.coarse, snapshot.bundle, bodies, gbuffer, views, self.path_lists, self.rules]
+        inputs = [scene.paths, self.coarse, snapshot.frames, bodies, gbuffer, views, self.path_lists, self.rules]
         outputs = [self.queues, self.history, self.guide, self.coarse_light]
         if self.queues.count.shape[1] == 0:
             launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
@@ -335,7 +335,7 @@ class DenoisedRenderer:
         threads = self.queues.count.shape[1] * int(QUEUE_CAPACITY)
         outputs = [self.queues, self.history, self.coarse_light]
         for stage in range(self.rules.bounces - 1):
-            inputs = [self.scene.paths, self.coarse, snapshot.bundle, bodies, views, self.rules, stage]
+            inputs = [self.scene.paths, self.coarse, snapshot.frames, bodies, views, self.rules, stage]
             launch_views(extend_queued_paths_kernel, count, threads, inputs, outputs, self.scene.device, first_view)
 
     def denoise(self, views: Any) -> None:
@@ -348,9 +348,9 @@ class DenoisedRenderer:
     def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
         scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
-        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.bundle, bodies, gbuffer]
+        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.frames, bodies, gbuffer]
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
-        inputs = [scene.meshes, coarse, scene.lights, snapshot.bundle, bodies, gbuffer, rays, views]
+        inputs = [scene.meshes, coarse, scene.lights, snapshot.frames, bodies, gbuffer, rays, views]
         self._launch(filter_shadows_kernel, coarse.grid, views, inputs, [self.shadows])
         self._launch(measure_steepness_kernel, coarse.grid, views, inputs, [self.shadows])
         self.trace_shadow_edges(snapshot, bodies, gbuffer, views, radiance)
@@ -367,17 +367,17 @@ class DenoisedRenderer:
         sharing = lists.count.shape[1] * threads
         inputs = [scene.meshes, coarse, bodies, gbuffer, views, threads]
         launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, outputs, device)
-        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.bundle, bodies, gbuffer]
+        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.frames, bodies, gbuffer]
         inputs += [lists, views, threads]
         launch_pixels(trace_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
-        inputs = [scene.meshes, coarse, scene.lights, snapshot.bundle, bodies, gbuffer, lists, self.shadows]
+        inputs = [scene.meshes, coarse, scene.lights, snapshot.frames, bodies, gbuffer, lists, self.shadows]
         inputs += [views, threads]
         launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [radiance], device)
 
     def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
         """Deferred shading: radiance of each pixel."""
         scene = self.scene
-        inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.bundle, bodies, gbuffer]
+        inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.frames, bodies, gbuffer]
         inputs += [self.ratios, self.shadows, views]
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
         shade_floor(scene, snapshot, bodies, gbuffer, views, radiance)

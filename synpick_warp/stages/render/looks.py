@@ -153,7 +153,7 @@ class Dresser:
     def dress(self, snapshot: Snapshot, views: Any, bodies: Any) -> None:
         """Make the materials of the bodies of all views, of their tables and backgrounds; `bodies` must be set up."""
         scene = self.scene
-        inputs = [self._seed, scene.meshes, self._table, snapshot.bundle, views, bodies, self._first]
+        inputs = [self._seed, scene.meshes, self._table, snapshot.frames, views, bodies, self._first]
         wp.launch(
             kernel_for(dress_bodies_kernel, views),
             dim=(views.count, self._materials),
@@ -166,7 +166,7 @@ class Dresser:
 def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
     """Shade what the views show beyond the scene as a floor, if episodes draw a background."""
     if scene.looks is not None and scene.looks.background_textures:
-        inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.bundle, bodies, gbuffer, views]
+        inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.frames, bodies, gbuffer, views]
         launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
 
 

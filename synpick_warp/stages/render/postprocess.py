@@ -87,10 +87,10 @@ class PostProcessor:
         """
         scene = self.scene
         if self.effects is None:
-            inputs = [scene.grid, scene.lights, snapshot.bundle, views, image, self.settings.tone]
+            inputs = [scene.grid, scene.lights, snapshot.frames, views, image, self.settings.tone]
             self._launch(postprocess_kernel, views.count, inputs, out.color)
             return
-        inputs = [snapshot.bundle, self.effects, views]
+        inputs = [snapshot.frames, self.effects, views]
         wp.launch(kernel_for(sample_effects_kernel, views), dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.filtered is not None:
             inputs = [scene.grid, out.effects, views, image]
@@ -98,7 +98,7 @@ class PostProcessor:
             filtered = ShadedImage()
             filtered.radiance, filtered.resolve, filtered.samples = self.filtered, image.resolve, image.samples
             image = filtered
-        inputs = [scene.grid, scene.lights, snapshot.bundle, self.settings, out.effects, views, image]
+        inputs = [scene.grid, scene.lights, snapshot.frames, self.settings, out.effects, views, image]
         self._launch(postprocess_effects_kernel, views.count, inputs, out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:

@@ -51,6 +51,6 @@ class ReferenceRenderer:
             image: The struct `ShadedImage`; its `radiance` is written, which is anti-aliased.
         """
         scene = self.scene
-        inputs = [scene.paths, scene.grid, snapshot.bundle, bodies, views, self.rules]
+        inputs = [scene.paths, scene.grid, snapshot.frames, bodies, views, self.rules]
         launch_pixels(trace_paths_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [image.radiance], scene.device)
         shade_floor(scene, snapshot, bodies, gbuffer, views, image.radiance)

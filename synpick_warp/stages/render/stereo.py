@@ -89,7 +89,7 @@ class StereoRenderer:
         own = [getattr(self.images, eye) for eye in self.eyes]
         images = {eye: getattr(out, eye) if image is None else image for eye, image in zip(self.eyes, own, strict=True)}
         for eye, image in images.items():
-            inputs = [scene.paths, scene.grid, snapshot.bundle, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
+            inputs = [scene.paths, scene.grid, snapshot.frames, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
             launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
         if self.scratch is not None:
             for first in range(0, views.count, self.slots):

@@ -6,7 +6,7 @@ from synpick_warp.codes import Effect, Stream
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +36,7 @@ class EffectRanges:
 @kernel_of_views
 def sample_effects_kernel(
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     ranges: EffectRanges,
     views: AnyViews,

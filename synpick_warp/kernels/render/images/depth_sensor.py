@@ -9,7 +9,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, c
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -207,7 +207,7 @@ def render_depth_sensor_kernel(
     surfaces: AnySurfaces,
     grid: ImageGrid,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     sensor: SensorParameters,
     bodies: ViewBodies,

@@ -25,7 +25,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, body_of, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False})
@@ -112,7 +112,7 @@ def render_infrared_kernel(
     scene: AnyScene,
     grid: ImageGrid,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     sensor: SensorParameters,
     bodies: ViewBodies,

@@ -20,7 +20,7 @@ from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import view_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -60,7 +60,7 @@ def postprocess_kernel(
     grid: ImageGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     views: AnyViews,
     image: ShadedImage,
@@ -185,7 +185,7 @@ def postprocess_effects_kernel(
     grid: ImageGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     settings: PostProcessSettings,
     effects: wp.array[EffectParameters],  # (view)

@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def shade_floor_kernel(
     grid: ImageGrid,
     drop: float,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,

@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, Movin
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,7 +68,7 @@ class LightHistory:
 
 
 @kernel_of_views
-def advance_history_kernel(snapshot: Snapshots, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies):
+def advance_history_kernel(snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies):
     """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
     frame's.
 

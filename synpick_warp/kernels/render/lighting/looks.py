@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import TAU
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,7 +106,7 @@ def dress_bodies_kernel(
     seed: wp.uint64,
     meshes: Meshes,
     table: LookTable,
-    snapshot: Snapshots,
+    snapshot: Frames,
     views: AnyViews,
     bodies: ViewBodies,
     first_row: int,

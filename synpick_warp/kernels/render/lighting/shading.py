@@ -37,7 +37,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -257,7 +257,7 @@ def shade_kernel(
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -288,7 +288,7 @@ def shade_samples_kernel(
     coarse: CoarseGrid,
     shadow_grid: CoarseGrid,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,

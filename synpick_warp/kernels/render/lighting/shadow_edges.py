@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_dire
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -166,7 +166,7 @@ def trace_shadow_edges_kernel(
     table: Table,
     coarse: CoarseGrid,
     lights: Lights,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     lists: EdgeLists,
@@ -203,7 +203,7 @@ def filter_shadow_edges_kernel(
     coarse: CoarseGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,

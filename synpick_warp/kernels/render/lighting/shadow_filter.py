@@ -21,7 +21,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, 
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -176,7 +176,7 @@ def filter_shadows_kernel(
     coarse: CoarseGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -317,7 +317,7 @@ def measure_steepness_kernel(
     coarse: CoarseGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,

@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_block
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, AnyViews, camera_ray, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -240,7 +240,7 @@ def trace_shadow_rays_kernel(
     coarse: CoarseGrid,
     lights: Lights,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,

@@ -19,7 +19,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, AnySc
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -29,7 +29,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def extend_queued_paths_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     views: AnyViews,
     rules: PathRules,

@@ -45,7 +45,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -217,7 +217,7 @@ def make_path_pixel(
 def trace_pixel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
@@ -279,7 +279,7 @@ def trace_pixel(
 def trace_coarse_paths_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,
@@ -319,7 +319,7 @@ def trace_coarse_paths_kernel(
 def start_paths_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,

@@ -21,7 +21,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -31,7 +31,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def reuse_histories_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Snapshots,
+    snapshot: Frames,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: AnyViews,

@@ -34,7 +34,7 @@ from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, c
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
 from synpick_warp.kernels.rng import mix, stream_key
-from synpick_warp.kernels.state import Snapshots
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -353,7 +353,7 @@ def trace_paths_kernel(
     scene: AnyScene,
     grid: ImageGrid,
     # State:
-    snapshot: Snapshots,
+    snapshot: Frames,
     # In:
     bodies: ViewBodies,
     views: AnyViews,
