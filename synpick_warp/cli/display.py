@@ -36,15 +36,16 @@ def make_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
 
 
-def make_progress(console: Console) -> Progress:
-    """Choose the display: live on a terminal, plain lines elsewhere."""
-    return LiveProgress(console) if console.is_terminal else PlainProgress(console)
+def make_progress(console: Console, remark: object = "") -> Progress:
+    """Choose the display: live on a terminal, plain lines elsewhere. `remark`: its text, at any time, ends the line of counts."""
+    return LiveProgress(console, remark) if console.is_terminal else PlainProgress(console, remark)
 
 
 class LiveProgress:
     """Live progress bar: stage, episodes, worlds, views, rate, remaining time."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, remark: object = "") -> None:
+        self._remark = remark
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
         columns = (stage, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
         self._bar = Bar(*columns, console=console, transient=True)
@@ -63,7 +64,7 @@ class LiveProgress:
 
     def update(self, *, episodes_done: int, episodes: int, views: int, **counts: Any) -> None:
         """Set the bar to the episodes done, with worlds, views and time left [s] beside it; it is named so from the first view on."""
-        detail = _detail(views=views, **counts)
+        detail = _detail(self._remark, views=views, **counts)
         name = "episodes" if views or episodes_done else None
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail, description=name)
 
@@ -75,8 +76,8 @@ class LiveProgress:
 class PlainProgress:
     """Plain progress lines: one per stage and note, and rate-limited ones for counts, also for those of a stage ("name: 3 of 9")."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, console: Console, remark: object = "") -> None:
+        self._console, self._remark = console, remark
         self._started = time.monotonic()
         self._printed_at = float("-inf")
         self._counted_at: dict[str, float] = {}
@@ -101,7 +102,7 @@ class PlainProgress:
         now = time.monotonic()
         if now - self._printed_at >= PLAIN_INTERVAL:
             self._printed_at = now
-            self.note(f"episodes {episodes_done}/{episodes} · {_detail(**counts)}")
+            self.note(f"episodes {episodes_done}/{episodes} · {_detail(self._remark, **counts)}")
 
     def note(self, text: str) -> None:
         """Print a line with the time since the start."""
@@ -248,10 +249,10 @@ def _words(code: Ending | Outcome) -> str:
     return code.name.lower().replace("_", " ")
 
 
-def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
-    """Worlds, views, rate and remaining time in one line."""
+def _detail(remark: object, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
+    """Worlds, views, rate, remaining time and a remark in one line."""
     left = "" if seconds_left is None else f" · {format_duration(seconds_left)} left"
-    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}"
+    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}{f' · {remark}' if str(remark) else ''}"
 
 
 def format_duration(seconds: float) -> str:

@@ -136,6 +136,9 @@ EngineOption = Annotated[
     ),
 ]
 WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
+PriceOption = Annotated[
+    float, Parameter(help="Price an hour of a worker of --engine or --claim --devices: the progress shows the cost so far.")
+]
 DryRunOption = Annotated[bool, Parameter(negative=(), help="Bake nothing: print the expected views, size on disk, memory and time.")]
 SplitOption = Annotated[
     str | None,
@@ -164,6 +167,7 @@ def bake(
     claim: ClaimOption = False,
     engine: EngineOption = None,
     workers: WorkersOption = 0,
+    price: PriceOption = 0.0,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -196,11 +200,11 @@ def bake(
     part = parse_shard(shard) if shard is not None else (0, 1)
     DataLayout.of(resolved).plan_shard(names, part, "--shard")
     _check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    check_engine_options(engine, workers, out, devices or shard)
+    check_engine_options(engine, workers, price, out, devices or shard, claim)
     if dry_run:
         return _forecast(resolved, out, part, names)
     out = out or _default_out()
-    run = partial(_bake, resolved, out, part, names, several, claim, engine or "", workers)
+    run = partial(_bake, resolved, out, part, names, several, claim, engine or "", workers, price)
     return _profiled(run, profile_out, out) if profiles else run()
 
 
@@ -434,6 +438,7 @@ def _bake(
     claim: bool,
     engine: str,
     workers: int,
+    price: float,
 ) -> int:
     """Check device and folders, which is cheap, then bake: in this process and its children, or by the workers of an engine."""
     with collection_paused():
@@ -450,18 +455,21 @@ def _bake(
     if url is None:
         check_output_folder(out)
     bake: Callable[..., BakeSummary]
+    remark: object = ""
     with collection_paused():
         if url is None:
             from synpick_warp.factory.pipeline import run_bake
 
             bake = partial(run_bake, config, out)
         else:
-            from synpick_warp.cloud.workers import Job, start_bake
+            from synpick_warp.cloud.workers import Crew, Job, start_bake
 
-            bake = partial(start_bake, Job(config, url), claim=claim, engine=engine, workers=workers)
+            crew = Crew(price)
+            remark = crew if engine or price else ""
+            bake = partial(start_bake, Job(config, url), claim=claim, engine=engine, workers=workers, crew=crew)
 
     console = make_console()
-    with make_progress(console) as progress:
+    with make_progress(console, remark) as progress:
         summary = bake(progress, shard, splits, devices)
     print_summary(console, summary, url or out)
     if summary.stopped:

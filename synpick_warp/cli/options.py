@@ -19,8 +19,8 @@ MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
 MAX_THREADS = 1024
 """Upper bound of options such as --threads, in processes or threads."""
-MAX_WORKERS = 100_000
-"""Upper bound of --workers."""
+MAX_WORKERS, MAX_PRICE = 100_000, 1e6
+"""Upper bounds of --workers and --price."""
 MAX_LINE = 2000
 """Longest message [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
@@ -121,18 +121,20 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
     return tuple(name.strip() for name in devices.split(","))
 
 
-def check_engine_options(engine: str | None, workers: int, out: Path | None, beside: str | None) -> None:
-    """Check --engine and --workers. `beside`: value of an option that an engine excludes.
+def check_engine_options(engine: str | None, workers: int, price: float, out: Path | None, beside: str | None, claims: bool) -> None:
+    """Check --engine, --workers and --price. `beside`: value of an option that an engine excludes; `claims`: --claim is given, so
+    that workers on --devices have a price, too.
 
     Raises:
         ConfigError: An option is out of range, or does not go with the others.
         DeviceError: There is no such engine.
     """
-    if engine is None:
-        if workers:
-            raise ConfigError("--workers goes with --engine; name one, such as ray")
-        return
+    if engine is None and (workers or (price and not (claims and beside))):
+        raise ConfigError("--workers and --price go with --engine; name one, such as ray. --price also goes with --claim --devices")
     check_range("--workers", workers, 0, MAX_WORKERS)
+    check_range("--price", price, 0.0, MAX_PRICE)
+    if engine is None:
+        return
     check_engine(engine)
     if store_url(out) is None:
         raise ConfigError("--engine has workers claim episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")

@@ -20,7 +20,7 @@ from typing import Any
 from synpick_warp._version import __version__
 from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.run import Job, PlanProgress, bake_into_store
+from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError, SynpickError
@@ -53,7 +53,7 @@ _LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
 15 starves them beside other CPU-bound programs."""
 
 
-def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress) -> BakeSummary:
+def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew: Crew) -> BakeSummary:
     """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part.
 
     Args:
@@ -61,6 +61,7 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress) -> Ba
         engine: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
         workers: Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu.
         progress: Observer.
+        crew: Receives the number of workers and their time.
 
     Returns:
         Summary of the workers that ended.
@@ -86,7 +87,7 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress) -> Ba
             device, each, count = _resources(ray, job.config.bake.device, workers)
             start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
             calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
-            return _await(ray, calls, PlanProgress(progress, chunks))
+            return _await(ray, calls, PlanProgress(progress, chunks, crew))
         except ray.exceptions.RayTaskError:  # A fault of ours, with its traceback.
             raise
         except (ray.exceptions.RayError, OSError, RuntimeError, ValueError) as error:  # It is not there, refuses, is lost, or workers died.
@@ -145,7 +146,7 @@ def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
                 summary.stopped, deadline = stop.number, time.monotonic() + _STOPPING
                 for call in calls:
                     ray.cancel(call)  # An interrupt, which `StopRequest` of the running bake takes.
-            progress.count()
+            progress.count(len(calls))
     summary.wall_seconds = time.monotonic() - started
     return summary
 

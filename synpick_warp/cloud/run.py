@@ -51,25 +51,45 @@ class Job:
     lease: float = LEASE
 
 
+@dataclass
+class Crew:
+    """Claiming workers of a command, with what they have cost."""
+
+    price: float = 0.0
+    """Price of a worker an hour."""
+    alive: int = 0
+    """Number of running workers."""
+    seconds: float = 0.0
+    """Accumulated running time of all workers [s]."""
+
+    def __str__(self) -> str:
+        cost = f" · cost {self.price * self.seconds / 3600.0:,.2f}" if self.price else ""
+        return f"{self.alive} worker{'s' * (self.alive != 1)}{cost}"
+
+
 class PlanProgress(ForwardingProgress):
     """Observer of all of a command's claiming workers: passes on their counts as part of the plan, with the remaining time by their mean
-    rate."""
+    rate, and adds the time of its `alive` workers to their `Crew`."""
 
-    def __init__(self, progress: Progress, chunks: Chunks) -> None:
+    def __init__(self, progress: Progress, chunks: Chunks, crew: Crew) -> None:
         super().__init__(progress)
         self._chunks, self._planned, self._before = chunks, chunks.sizes.episodes, chunks.count_over()
-        self._started = time.monotonic()
+        self._crew, self._started = crew, time.monotonic()
+        self._now = self._started
 
     def update(self, *, episodes_done: int, episodes: int, worlds_active: int, seconds_left: float | None, **views: Any) -> None:
         """Pass on counts since the workers' start; running episodes count as half done. See `Progress`."""
         del episodes, seconds_left
+        before, self._now = self._now, time.monotonic()
+        self._crew.seconds += self._crew.alive * (self._now - before)
         done, begun = self._before + episodes_done, episodes_done + 0.5 * worlds_active
-        left = max(0.0, self._planned - self._before - begun) * (time.monotonic() - self._started) / begun if episodes_done else None
+        left = max(0.0, self._planned - self._before - begun) * (self._now - self._started) / begun if episodes_done else None
         shown = {"episodes_done": min(self._planned, done), "episodes": self._planned, "worlds_active": worlds_active}
         super().update(**shown, **views, seconds_left=left)
 
-    def count(self) -> None:
-        """Report the episodes of the chunks that have ended, for workers that report nothing themselves."""
+    def count(self, alive: int) -> None:
+        """Report the episodes of the chunks that have ended, for workers that report nothing themselves, `alive` of which run."""
+        self._crew.alive = alive
         done = self._chunks.count_over() - self._before
         self.update(episodes_done=done, episodes=0, worlds_active=0, views=0, views_per_s=0.0, seconds_left=None)
 

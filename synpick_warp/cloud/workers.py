@@ -17,7 +17,7 @@ from typing import Any
 from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_engine import bake_with_ray
-from synpick_warp.cloud.run import Job, PlanProgress, bake_into_store
+from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
@@ -46,6 +46,7 @@ def start_bake(
     claim: bool = False,
     engine: str = "",
     workers: int = 0,
+    crew: Crew | None = None,
 ) -> BakeSummary:
     """Bake a data set into an object store; arguments as of `run.bake_into_store`.
 
@@ -53,20 +54,21 @@ def start_bake(
         job: What to bake; `splits` take the place of its own.
         engine: Cluster of claiming workers, as of `ray_engine.bake_with_ray`; empty: none.
         workers: Number of the engine's workers.
+        crew: Receives number and time of the workers of an engine, or of claiming ones on these devices, for a display.
 
     Raises:
         ConfigError: Claims share out the episodes, and so does `shard`; a cluster's devices are its own.
         SynpickError: As `run.bake_into_store`.
     """
-    job = replace(job, splits=tuple(splits))
+    job, crew = replace(job, splits=tuple(splits)), crew or Crew()
     if (claim or engine) and shard != (0, 1):
         raise ConfigError("workers that claim share out the episodes among them; drop the shard")
     if engine and devices:
         raise ConfigError("an engine places one worker a GPU or core of its cluster; drop the devices")
     if engine:
-        return bake_with_ray(job, engine, workers, progress)
+        return bake_with_ray(job, engine, workers, progress, crew)
     if claim and devices:
-        return bake_with_devices(job, devices, progress)
+        return bake_with_devices(job, devices, progress, crew)
     return bake_into_store(job.config, job.url, progress, shard, splits, devices, claim=claim)
 
 
@@ -82,13 +84,14 @@ class _Share(Job):
     """Full key -> value of settings of the worker alone: device, writers."""
 
 
-def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> BakeSummary:
+def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew: Crew) -> BakeSummary:
     """Bake a data set into an object store by a claiming worker on each device; other claiming workers may take part.
 
     Args:
         job: What to bake.
         devices: As in `pipeline.run_bake`.
         progress: Observer.
+        crew: Receives the number of workers and their time.
 
     Returns:
         Summary of the chunks of these workers.
@@ -114,7 +117,8 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress) -> B
                     return BakeSummary()
                 common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
-                shown = PlanProgress(progress, plan_chunks(ledger, claims, ranges))
+                crew.alive = len(names)
+                shown = PlanProgress(progress, plan_chunks(ledger, claims, ranges), crew)
                 lost = processes.run([_Share(**common, own=each) for each in own], summary, shown)
         finally:
             os.close(handle)

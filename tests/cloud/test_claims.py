@@ -18,7 +18,7 @@ import synpick_warp
 from synpick_warp.cloud import claims, finish, run
 from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.run import Job, PlanProgress
+from synpick_warp.cloud.run import Crew, Job, PlanProgress
 from synpick_warp.cloud.workers import bake_with_devices
 from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.system.progress import SilentProgress
@@ -283,20 +283,25 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
 
 
 def test_the_progress_of_workers_is_that_of_the_plan(memory, monkeypatch):
-    """A quarter of 100 episodes was done before; then 8 are done and 4 run for 20 s, so 65 are left for 130 s."""
-    now, shown, observer = [100.0], {}, SilentProgress()
+    """A quarter of 100 episodes was done before; then 8 are done and 4 run for 20 s, so 65 are left for 130 s.
+
+    One of two workers runs for 300 s more."""
+    now, shown, observer, crew = [100.0], {}, SilentProgress(), Crew(price=3.0, alive=2)
     observer.update = shown.update
     monkeypatch.setattr(run.time, "monotonic", lambda: now[0])
     chunks = Chunks(Ledger(open_store(memory), tiny(100), Probe(0.0, True)), Claims(open_store(memory), 0.0), [range(100)], 25)
     chunks.done(Chunk(0, [], None))
-    progress = PlanProgress(observer, chunks)
+    progress = PlanProgress(observer, chunks, crew)
     now[0] += 20.0
     progress.update(episodes_done=8, episodes=0, worlds_active=4, views=300, views_per_s=15.0, seconds_left=None)
     expected = {"episodes_done": 33, "episodes": 100, "worlds_active": 4, "views": 300, "views_per_s": 15.0, "seconds_left": 130.0}
     assert shown == expected
+    assert str(crew) == "2 workers · cost 0.03"
     chunks.done(Chunk(1, [], None))
-    progress.count()
-    assert shown == dict.fromkeys(expected, 0) | {"episodes_done": 50, "episodes": 100, "seconds_left": 40.0}
+    now[0] += 300.0
+    progress.count(1)
+    assert shown == dict.fromkeys(expected, 0) | {"episodes_done": 50, "episodes": 100, "seconds_left": 640.0}
+    assert (str(crew), crew.seconds) == ("1 worker · cost 0.28", 340.0)
 
 
 def test_claims_need_a_store(tmp_path):
@@ -341,11 +346,12 @@ def test_workers_killed_fifty_times_leave_the_set_of_one_bake(prefix, tmp_path):
 def test_workers_of_several_devices_share_a_set(prefix, tmp_path):
     """Each device has one process for all of its chunks; the settings in the store are those of the command."""
     job = Job(tiny(), prefix, bake=scripted_bake.bake_episodes, lease=60.0)
-    summary = bake_with_devices(job, ("cpu", "cpu"), SilentProgress())
-    assert (summary.total, summary.stopped) == (EPISODES, 0)
+    crew = Crew(price=3600.0)
+    summary = bake_with_devices(job, ("cpu", "cpu"), SilentProgress(), crew)
+    assert (summary.total, summary.stopped, crew.alive) == (EPISODES, 0, 2)
     scripted_bake.bake(tmp_path / "local", tiny().with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
-    assert bake_with_devices(job, ("cpu", "cpu"), SilentProgress()).total == 0
+    assert bake_with_devices(job, ("cpu", "cpu"), SilentProgress(), crew).total == 0
 
 
 @pytest.mark.parametrize(
