@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,7 @@ import pytest
 
 from synpick_warp.codes import Segment
 from synpick_warp.scenes.types import Catalog, Fixture
-from tests.builders import FEW_STEPS
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
-from tools.bench import __main__ as bench
-from tools.bench import run, worlds
 from tools.bench import sensor as bench_sensor
 
 OBLIQUE = np.array([[1.0, 0.0, 0.0], [0.0, -0.6, -0.8], [0.0, 0.8, -0.6]])
@@ -41,9 +37,8 @@ def views(device):
     scene = bench_sensor.build_sensor_scene(
         config.render, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, -config.tote.wall, snapshot(toy, device), 4, device
     )
-    images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
-    scene.render(bench_sensor.SensorCamera.RenderConfig(), images)
-    return scene, *(image.numpy() for image in images.values()), render(toy, device)
+    scene.prepare(color=False)[0]()
+    return scene, *scene.read_hits(4), render(toy, device)
 
 
 def test_an_independent_renderer_agrees(views):
@@ -73,16 +68,3 @@ def test_textures_with_the_same_border_stay_distinct():
     framed[:, 1:] = 200
     first, second = (bench_sensor.newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
     assert first.texture_hash != second.texture_hash
-
-
-def test_both_renderers_are_timed_on_settled_piles(tmp_path, monkeypatch):
-    for module, names in ((worlds, ("FALL_TICKS", "SETTLE_TICKS")), (run, ("BURST", "MIN_REPEATS"))):
-        for name in names:
-            monkeypatch.setattr(module, name, 1)
-    file = tmp_path / "bench.json"
-    small = ("--worlds", "2", "--resolution", "32x18", "--seconds", "0", *FEW_STEPS)
-    assert bench.main(["--parts", "sensor", "--json", str(file), *small]) == 0
-    rows = json.loads(file.read_text())["rows"]
-    assert {row["part"] for row in rows} == {"sensor"}
-    assert {row["unit"] for row in rows} == {"s", "", "%", "mm", "ms", "1/s", "Mpx/s"}
-    assert min(row["value"] for row in rows if "pixels with the same instance" in row["name"]) >= 99.0

@@ -3,7 +3,7 @@
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Files are written to the
 system's temporary folder (TMPDIR) and removed. The part render renders one tick repeatedly; the part pictures renders successive ticks,
-with light histories as in a bake; the part sensor renders piles by Newton's SensorCamera, too.
+with light histories as in a bake. `--compare` measures other simulators and renderers on the same piles.
 
     python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
@@ -25,10 +25,10 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.system.hardware.device import pick_device
 from tools.bench.bakes import measure_steady, measure_trajectories
 from tools.bench.online import measure_environment, measure_picks
+from tools.bench.peers import PEERS, check_installed, measure_peers
 from tools.bench.pictures import measure_pictures
 from tools.bench.run import Bench
 from tools.bench.scaling import measure_growth, measure_heaps, measure_patches
-from tools.bench.sensor import measure_sensor
 from tools.bench.worlds import measure_worlds
 from tools.figures import describe_run, write_run
 from tools.options import INTERRUPTED, Row, configure, counts, fail, make_names_parser, make_parser, number_in, of_part, positive_count
@@ -44,7 +44,6 @@ OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
     "heaps": measure_heaps,
     "environment": measure_environment,
     "picks": measure_picks,
-    "sensor": measure_sensor,
 }
 """Parts that build worlds of their own, in the order in which they are measured."""
 DEFAULT_PARTS = (*SHARED_PARTS, "steady")
@@ -64,6 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
     code = 0
     try:
         config = _config(options)
+        check_installed(options.compare)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
         width, height = config.cameras.resolution
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{name:20} {value}")
         given = {name: getattr(options, name) for name in ("seconds", "devices", "after", "instances")}
         bench = Bench(config, **given)
-        for row in measure(bench, options.parts):
+        for row in measure(bench, options.parts, options.compare):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
     except SynpickError as error:
@@ -93,7 +93,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
-    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), default=DEFAULT_PARTS, help=parts_help)
+    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), help=parts_help)
+    peers_help = f"peers to measure beside ours, comma-separated, of {', '.join(PEERS)}; then no parts unless --parts names some"
+    parser.add_argument("--compare", type=make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
     after_help = "ticks simulated before the part pictures, in which little moves just after the drop (default: 0)"
     parser.add_argument("--after", type=positive_count, default=0, metavar="TICKS", help=after_help)
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
@@ -102,6 +104,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--instances", type=counts, default=(), metavar="NUMBERS", help=instances_help)
     parser.add_argument("--seconds", type=number_in(0.0), default=2.0, help="minimum time of a measurement [s] (default: 2)")
     options = parser.parse_args(arguments)
+    if options.parts is None:
+        options.parts = () if options.compare else DEFAULT_PARTS
     options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
     for name, part, use in OWNERS:
         if getattr(options, name) and part not in options.parts:
@@ -116,10 +120,11 @@ def _config(options: argparse.Namespace) -> Config:
     return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 
 
-def measure(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
-    """Measure the parts, which may be in any order; yields rows as they arrive, and keeps their values in `bench`."""
+def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[Row]:
+    """Measure the parts, which may be in any order, then the peers; yields rows as they arrive, and keeps their values in `bench`."""
     runs: list[Iterator[Row]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
     runs += [of_part(part, make(bench)) for part, make in OWN_PARTS.items() if part in parts]
+    runs += [measure_peers(bench, peers)] if peers else []
     for row in itertools.chain.from_iterable(runs):
         bench.values[row.name] = row.value
         yield row

@@ -1,10 +1,9 @@
-"""Part `sensor`: newton.sensors.SensorCamera beside our renderer, time and agreement for the same scene, views and outputs."""
+"""Scene of newton.sensors.SensorCamera: the bins, objects and cameras of our worlds; agreement of another renderer with ours."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,31 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Render
-from synpick_warp.factory.assembly import build_factory
-from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
-from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
-from synpick_warp.stages.render.view_setup import first_views
-from synpick_warp.system.progress import SilentProgress
-from tools.bench import worlds
-from tools.bench.run import FOREVER, Bench
+from synpick_warp.stages.buffers import Snapshot
 from tools.options import Row
 
-ORDERS = {
-    "in default order": SensorCamera.RenderConfig(),
-    "in tiles of 8 x 4": SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder.TILED, tile_width=8, tile_height=4),
-}
-"""Pixel orders of the sensor; the faster one is compared."""
+ORDERS = (
+    SensorCamera.RenderConfig(),
+    SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder.TILED, tile_width=8, tile_height=4),
+)
+"""Pixel orders of the sensor: row by row, and in tiles; the faster one is compared."""
 OPENGL = np.diag([1.0, -1.0, -1.0])
 """Rotation from OpenGL camera axes (looking along -z, y up) to OpenCV camera axes (looking along +z, y down)."""
 DEPTH_TOLERANCE = 1.0
 """Tolerance of depths [counts]: ours is rounded to half a count, the sensor's is computed in world space in single precision."""
-MAX_WORLDS, CHECKED_VIEWS = 64, 6
-"""Worlds that are settled, at most, and views in which the outputs are compared: two worlds."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SensorScene:
     """Newton model of the worlds of a snapshot's first views, and the inputs with which the sensor renders them."""
 
@@ -56,15 +46,25 @@ class SensorScene:
     segment: np.ndarray
     """Segmentation id of each shape (shape + 1) int64; the last one is of pixels without a shape."""
 
-    def allocate_outputs(self, **allocators: str) -> dict[str, Any]:
-        """Allocate images for `render`: sensor argument -> suffix of the sensor's `allocate_image_...` method."""
-        size = (len(self.worlds), self.rays.shape[1], self.rays.shape[0])
-        return {name: getattr(self.sensor, f"allocate_image_{suffix}")(*size) for name, suffix in allocators.items()}
+    images: dict[str, Any] = field(default_factory=dict)
+    """Outputs of the passes that were prepared last, by argument of the sensor."""
 
-    def render(self, render_config: Any, images: dict[str, Any]) -> None:
+    def prepare(self, color: bool) -> tuple[Callable[[], None], ...]:
+        """Passes that render all views, one for each of `ORDERS`: depth and shapes, and with `color` textured color by one light with
+        shadows."""
+        outputs = {"shape_index_image": "shape_index", "forward_depth_image": "depth_forward"} | ({"color_image": "color"} if color else {})
+        size = (len(self.worlds), self.rays.shape[1], self.rays.shape[0])
+        self.images = {name: getattr(self.sensor, f"allocate_image_{suffix}")(*size) for name, suffix in outputs.items()}
+        return tuple(partial(self._render, replace(order, enable_textures=color, enable_shadows=color)) for order in ORDERS)
+
+    def _render(self, render_config: Any) -> None:
         """Update the BVH from the state and render all views."""
         self.model.bvh_refit_shapes(self.state)
-        self.sensor.update(self.state, self.transforms, self.rays, world_indices=self.worlds, render_config=render_config, **images)
+        self.sensor.update(self.state, self.transforms, self.rays, world_indices=self.worlds, render_config=render_config, **self.images)
+
+    def read_hits(self, views: int) -> tuple[np.ndarray, np.ndarray]:
+        """Shape of each pixel uint32, the maximum value without one, and planar depth [m] (view, row, column) of the first views."""
+        return self.images["shape_index_image"][:views].numpy(), self.images["forward_depth_image"][:views].numpy()
 
 
 def build_sensor_scene(
@@ -96,7 +96,7 @@ def build_sensor_scene(
     intrinsics = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     rays = SensorCamera.compute_camera_rays_pinhole_opencv(width, height, *intrinsics, device=device)
     view = np.arange(count)
-    transforms = np.array([_camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
+    transforms = np.array([camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
     return SensorScene(
         model,
         model.state(),
@@ -108,7 +108,7 @@ def build_sensor_scene(
     )
 
 
-def _camera_to_world(camera: Camera) -> np.ndarray:
+def camera_to_world(camera: Camera) -> np.ndarray:
     """Pose x, y, z [m], quaternion x, y, z, w (7) of the camera in OpenGL axes."""
     rotation = camera.rotation.T
     return np.concatenate([-rotation @ camera.translation, Rotation.from_matrix(rotation @ OPENGL).as_quat()])
@@ -118,7 +118,7 @@ def _build_model(
     render: Render, catalog: Catalog, fixtures: tuple[Fixture, ...], table: float, snapshot: Snapshot, count: int, device: Any
 ) -> tuple[newton.Model, list[int]]:
     """Build the Newton model of the first `count` worlds; returns it with the segmentation id of each shape."""
-    objects = [(newton_mesh(entry.mesh, entry.material), entry.material) for entry in catalog.entries]
+    objects = [(newton_mesh(entry.mesh, entry.material), entry.material) for entry in catalog.bodies]
     others = [(newton_mesh(fixture.mesh, fixture.material), fixture.material) for fixture in fixtures]
     builder = newton.ModelBuilder()
     # SAH builds, as for our meshes: slower to build, faster to trace.
@@ -178,42 +178,3 @@ def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment:
         Row(f"pixels with the same instance and depth within {DEPTH_TOLERANCE * scale:g} mm", 100.0 * float(close.mean()), "%"),
         Row("largest difference of depths of the same instance", largest, "mm"),
     ]
-
-
-def measure_sensor(bench: Bench) -> Iterator[Row]:
-    """Benchmark of both renderers for depth and ids, which both have, on piles at rest.
-
-    Both update poses and render a batch of views; ours makes amodal masks, too. On CUDA both launch without waiting, so that launch
-    overhead is hidden.
-    """
-    config = bench.config.with_values({"bake.worlds": min(bench.config.bake.worlds, MAX_WORLDS)})
-    factory = build_factory(config, SilentProgress())
-    simulation, renderer, cameras = factory.simulation, factory.stream.rings[0].renderer, factory.cameras
-    simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
-    for _ in range(worlds.FALL_TICKS + worlds.SETTLE_TICKS):
-        simulation.tick()
-    device, snapshot, pixels = simulation.device, simulation.record.snapshot, renderer.scene.width * renderer.scene.height
-    count = min(factory.stream.rings[0].batch, simulation.layout.worlds * len(cameras))
-    started = time.perf_counter()
-    fixtures, table = make_fixtures(make_bins(config.cell.bins), config.gripper), float(renderer.scene.table.height)
-    scene = build_sensor_scene(config.render, factory.catalog, fixtures, cameras, table, snapshot, count, device)
-    wp.synchronize_device(device)
-    yield Row("build a Newton model of the batch's worlds", time.perf_counter() - started, "s")
-    yield Row("views in a batch", count, "")
-    out = allocate_view_buffers(count, renderer.scene.width, renderer.scene.height, renderer.instances, device)
-    views = first_views(count, len(cameras), renderer.instances, device)
-    images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
-    ours = bench.seconds_per_call(partial(renderer.render_gbuffer, snapshot, views, out), 0.25) / count
-    orders = {name: bench.seconds_per_call(partial(scene.render, order, images), 0.25) / count for name, order in ORDERS.items()}
-    checked = (array[: min(count, CHECKED_VIEWS)].numpy() for array in (*images.values(), out.instance, out.depth))
-    index, depth, segment, counts = checked
-    yield from compare_hits(scene.segment, index, depth, segment, counts, config.bop.depth_scale)
-    for name, seconds in orders.items():
-        yield Row(f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
-        yield Row(f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / ours, "")
-    theirs = min(orders.values())
-    for name, seconds in (("ours: depth, index, amodal masks", ours), ("SensorCamera: depth, index", theirs)):
-        yield Row(name, 1e3 * seconds, "ms")
-        yield Row(f"{name}: views", 1.0 / seconds, "1/s")
-        yield Row(f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")
-    yield Row("SensorCamera's time over ours: depth, index", theirs / ours, "")
