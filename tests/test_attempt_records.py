@@ -10,7 +10,7 @@ import pytest
 
 from synpick_warp.apps.viz.explain_record import read_attempts
 from synpick_warp.codes import Ending, Mode, Outcome
-from synpick_warp.factory.attempts import AttemptRecord, EpisodeRecord, InstanceObservation, ObservationRecord
+from synpick_warp.factory.attempts import AttemptRecord, EpisodeRecord, ObservationRecord, ObservedInstance
 from tests.worlds.scripted_worlds import RAYS, ROOM, Ticks, World, bits, new_world, run
 
 
@@ -40,10 +40,10 @@ def see_a_pair(world: World) -> None:
 PAIR = ObservationRecord(
     (64, 48),
     (
-        InstanceObservation(
+        ObservedInstance(
             1, 21, 120, 0.333333, (10.0, 20.0), (12.3457, 21.0), (11.1728, 20.5), (5.0, 4.47214, 0.0), (11, 21), 1.98765, (3,), (0, 3)
         ),
-        InstanceObservation(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
+        ObservedInstance(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
     ),
     ((1, 3, 12.3), (3, 1, 0.1)),
 )

@@ -12,7 +12,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.records import Row
-from synpick_warp.factory.episodes import EpisodeRow, remedy
+from synpick_warp.factory.episodes import EpisodeOutcome, remedy
 from synpick_warp.views.bins import bin_record
 
 CONFIG = Config()
@@ -48,9 +48,9 @@ def test_each_capacity_of_physics_is_named_after_one_overflow():
 def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, place):
     record = bin_record(name, np.array([0.1, -0.2, 0.0, 0.0, 0.0, -0.5, np.sqrt(0.75)], np.float32)) if name else None
     assert record is None or record == {"name": name, "position": [0.1, -0.2, 0.0], "yaw": pytest.approx(-np.pi / 3, abs=1e-6)}
-    row = EpisodeRow(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", bin=record)
+    row = EpisodeOutcome(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", bin=record)
     line = row.as_json()
     assert ("bin" in line) == bool(name)
     assert line["sentence"] == f"no object is left {place}"
-    assert EpisodeRow.from_json(line) == row
+    assert EpisodeOutcome.from_json(line) == row
     assert check_content(json.loads(json.dumps(line)), Row, "a line").split == "val"

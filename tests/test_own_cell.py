@@ -9,7 +9,7 @@ from pxr import Usd, UsdGeom
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.apps.viz.explain import write_explanation
 from synpick_warp.apps.viz.preview import write_contact_sheet
 from synpick_warp.configs.files.load import load_config
@@ -92,7 +92,7 @@ def test_parts_stay_within_the_mesh_in_every_step(baked):
 @pytest.mark.slow
 def test_all_formats_are_valid_explained_and_have_the_mesh(baked):
     summary = Summary()
-    assert list(validate(baked / "set", Options(sample=50, threads=1), summary)) == []
+    assert list(validate(baked / "set", ValidationOptions(sample=50, threads=1), summary)) == []
     assert summary.views > 0
     stage = Usd.Stage.Open(str(baked / "set" / "usd" / "000000.usdc"))
     visual = next(UsdGeom.Mesh(prim) for prim in Usd.PrimRange(stage.GetPrimAtPath("/Episode/Bin")) if prim.IsA(UsdGeom.Mesh))

@@ -19,7 +19,7 @@ import msgspec
 from rich.console import Console
 
 from synpick_warp.cli.commands.doctor import describe_machine
-from tools.options import Row, print_machine, print_rows
+from tools.options import MeasuredRow, print_machine, print_rows
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "tools" / "results"
@@ -50,10 +50,10 @@ class Run(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Versions, cores and memory, as `doctor` prints them."""
     more: dict[str, Any] = msgspec.field(default_factory=dict)
     """What a tool records besides rows."""
-    rows: list[Row]
+    rows: list[MeasuredRow]
 
 
-def describe_run(tool: str, machine: Iterable[tuple[str, str]], rows: Iterable[Row], **more: object) -> dict[str, Any]:
+def describe_run(tool: str, machine: Iterable[tuple[str, str]], rows: Iterable[MeasuredRow], **more: object) -> dict[str, Any]:
     """Run of the module `tool` as JSON, by the command line of this process. Absolute paths are written by their last names alone."""
     versions = dict(machine)
     words = [Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:]]
@@ -119,7 +119,7 @@ def _table(runs: Mapping[str, Run]) -> str:
     return "\n".join([*lines, *([f"\n{'; '.join(f'({number}) {note}' for note, number in notes.items())}."] if notes else [])])
 
 
-def _show(row: Row) -> str:
+def _show(row: MeasuredRow) -> str:
     """Name and value of a row in Markdown."""
     unit = {"1/s": "/s", "1/h": "/h", "%": " %", "": ""}.get(row.unit, f" {row.unit}")
     return f"{row.name} **{row.value:,.10g}{unit}**".strip()
@@ -133,7 +133,7 @@ def write_run(path: Path | None, run: Mapping[str, Any]) -> None:
         path.write_text(f'{head[:-2]},\n "rows": [\n{rows}\n ]\n}}\n', encoding="utf-8")
 
 
-def finish_report(tool: str, json_file: Path | None, device: Any, heading: str, title: str, rows: list[Row], **more: object) -> int:
+def finish_report(tool: str, json_file: Path | None, device: Any, heading: str, title: str, rows: list[MeasuredRow], **more: object) -> int:
     """Print the machine and the rows of a report and write its run; returns the exit code, 1 if a bound is violated."""
     console, machine = Console(highlight=False), describe_machine(device)
     print_machine(console, machine)

@@ -89,7 +89,7 @@ SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.li
 
 
 @dataclass(frozen=True)
-class Row:
+class MeasuredRow:
     """Row of a report: measured value with unit, its bound (empty: none) and whether that holds."""
 
     name: str
@@ -110,7 +110,7 @@ class Row:
         return asdict(self) | {"value": self.value if math.isfinite(self.value) else None}
 
 
-def of_part(part: str, rows: Iterable[Row]) -> Iterator[Row]:
+def of_part(part: str, rows: Iterable[MeasuredRow]) -> Iterator[MeasuredRow]:
     """Rows with `part` as the group of those that belong to none."""
     return (row if row.part else replace(row, part=part) for row in rows)
 
@@ -175,7 +175,7 @@ def print_machine(console: Console, machine: Iterable[tuple[str, str]]) -> None:
     console.print(table)
 
 
-def print_rows(console: Console, heading: str, title: str, rows: Iterable[Row]) -> None:
+def print_rows(console: Console, heading: str, title: str, rows: Iterable[MeasuredRow]) -> None:
     """Print a table of rows with bounds and verdicts; whole numbers without a unit are printed as counts."""
     table = Table(heading, "", "unit", "bound", "", title=title)
     table.columns[1].justify = "right"

@@ -17,7 +17,7 @@ from synpick_warp.system.progress import Progress
 
 if TYPE_CHECKING:
     from synpick_warp.codes import Ending, Outcome
-    from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+    from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
     from synpick_warp.stages.timing import Recorder
 
 PLAIN_WIDTH = 120
@@ -201,7 +201,7 @@ def print_profile(console: Console, recorder: Recorder) -> None:
     )
 
 
-def _listing(rows: Sequence[EpisodeRow]) -> Table:
+def _listing(rows: Sequence[EpisodeOutcome]) -> Table:
     """Table of episodes, one line each: mode, ending, resamples, frames, simulated time, and attempts if there are any."""
     columns = ["episode", "mode", "ending", "resampled", "frames", "time"]
     cells = [

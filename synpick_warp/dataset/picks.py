@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from synpick_warp.dataset.reading import Episode
     from synpick_warp.dataset.view import View
-    from synpick_warp.views.picks import Column
+    from synpick_warp.views.picks import PickColumn
 
 MAX_ROWS = 2**22
 """Maximum number of rows of a table that the reader accepts: 1 GB of trials."""
@@ -93,7 +93,7 @@ class PickTables:
         return trials, states
 
 
-def _read(path: Path, columns: Sequence[Column]) -> np.recarray:
+def _read(path: Path, columns: Sequence[PickColumn]) -> np.recarray:
     """Read a table, and check it against its columns."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -123,7 +123,7 @@ def _refuse(path: Path, rows: np.recarray, faults: Iterator[_Fault]) -> None:
             raise DatasetError(f"{path}, column {column}, row {row} is {rows[column][row].tolist()}; allowed: {allowed}; {ADVICE}")
 
 
-def _check_columns(columns: Sequence[Column], rows: np.recarray) -> Iterator[_Fault]:
+def _check_columns(columns: Sequence[PickColumn], rows: np.recarray) -> Iterator[_Fault]:
     """Yield a fault per column: values that its domain does not have."""
     import numpy as np
 

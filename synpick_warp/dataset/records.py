@@ -128,7 +128,7 @@ class InstanceObservation(msgspec.Struct):
         return self.pole, self.centroid, self.midpoint
 
 
-class Observation(msgspec.Struct):
+class RecordedObservation(msgspec.Struct):
     """Schema of the perception result of an attempt: instances and votes (lower, upper, votes); see
     `factory.attempts.ObservationRecord`.
     """
@@ -165,7 +165,7 @@ class Attempt(AttemptKey):
     engaged: Instances
     picked: Instances
     peak_force: Annotated[list[Amount], msgspec.Meta(max_length=100_000)]
-    observation: Observation
+    observation: RecordedObservation
     sealed: Annotated[list[Index], msgspec.Meta(max_length=MAX_CUPS)] | None = None
     break_force: Amount | None = None
 
@@ -173,7 +173,7 @@ class Attempt(AttemptKey):
         _check_name("outcome", self.outcome, names(Outcome)[1:])
 
 
-class EpisodeEntry(Entry):
+class RecordedEpisode(Entry):
     """Schema of the manifest entry of a committed episode: its line of episodes.jsonl, and its attempts."""
 
     episode: Index

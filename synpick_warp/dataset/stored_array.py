@@ -28,7 +28,7 @@ from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.trajectory import GROUP_FILE, MAX_METADATA, MAX_STEPS_PER_TICK, GroupContext
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.trajectory.arrays import LABELS, ArraySpec
+from synpick_warp.exporters.trajectory.arrays import LABELS, TrajectoryArray
 from synpick_warp.system.inputs.files import check_regular_file, describe_bytes, read_file
 from synpick_warp.system.inputs.json import decode_json
 from synpick_warp.system.processes.threads import ZARR_THREADS
@@ -105,7 +105,7 @@ class ArrayMetadata(Struct):
     codecs: list[_Codec]
 
 
-def open_array(folder: Path, spec: ArraySpec | None, context: GroupContext) -> StoredArray:
+def open_array(folder: Path, spec: TrajectoryArray | None, context: GroupContext) -> StoredArray:
     """Open an array.
 
     Args:
@@ -139,7 +139,7 @@ def _check_files(folder: Path, largest: int, listed: Collection[Path]) -> None:
         check_regular_file(path, max(largest, MAX_METADATA) if path.name == GROUP_FILE else largest, DatasetError)
 
 
-def check_layout(folder: Path, metadata: ArrayMetadata, spec: ArraySpec | None, sizes: Mapping[str, int]) -> int:
+def check_layout(folder: Path, metadata: ArrayMetadata, spec: TrajectoryArray | None, sizes: Mapping[str, int]) -> int:
     """Check an array's type, shape, chunks and codecs against its schema (None: any) and the known `sizes` of dimensions.
 
     Returns:
@@ -164,7 +164,9 @@ def check_layout(folder: Path, metadata: ArrayMetadata, spec: ArraySpec | None, 
     return chunk * dtype.itemsize * 101 // 100 + 1024 * (inner + 1)
 
 
-def _check_shape(folder: Path, shape: tuple[int, ...], dtype: np.dtype, spec: ArraySpec | None, sizes: Mapping[str, int]) -> dict[str, int]:
+def _check_shape(
+    folder: Path, shape: tuple[int, ...], dtype: np.dtype, spec: TrajectoryArray | None, sizes: Mapping[str, int]
+) -> dict[str, int]:
     """Compare type and shape with the schema; returns name and size of the dimensions whose sizes nothing determines."""
     if spec is None:
         return {f"dimension {axis}": size for axis, size in enumerate(shape)}

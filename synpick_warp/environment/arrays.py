@@ -28,7 +28,7 @@ def to_host(values: Any) -> np.ndarray:
     return array
 
 
-class Exporter:
+class ArrayExporter:
     """Converter of arrays to the caller's library (`backend`); results own their memory, so that a later step does not change them."""
 
     def __init__(self, backend: str, device: wp.Device) -> None:

@@ -21,7 +21,7 @@ from synpick_warp.environment.settings import (
     TORCH,
     TRIAL,
     TWIST,
-    Choice,
+    EnvironmentChoice,
     action_bounds,
     fixed_settings,
 )
@@ -54,7 +54,7 @@ def require_libraries(backend: str) -> None:
 
 
 def make_picking(
-    choice: Choice,
+    choice: EnvironmentChoice,
     source: Config | Path | str | None = None,
     settings: Mapping[str, object] = MappingProxyType({}),
     device_name: str | None = None,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from synpick_warp.codes import Ending, Outcome, Phase
-from synpick_warp.environment.arrays import Exporter, to_host
+from synpick_warp.environment.arrays import ArrayExporter, to_host
 from synpick_warp.environment.episodes import Episodes, check_mask, choose_environments, choose_indices, make_seeds
 from synpick_warp.environment.settings import (
     MOVE,
@@ -22,7 +22,7 @@ from synpick_warp.environment.settings import (
     POINT,
     SAME_STEP,
     TARGET,
-    Choice,
+    EnvironmentChoice,
 )
 from synpick_warp.errors import ActionError, StateError
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
@@ -44,7 +44,7 @@ class EnvironmentState:
     episodes: Episodes
 
 
-class Step(NamedTuple):
+class EnvironmentStep(NamedTuple):
     """Result of a step as Gymnasium defines it; arrays (environment, ...) of the caller's library."""
 
     obs: dict[str, Any]
@@ -64,10 +64,10 @@ class PickingEnvironment:
         bounds: Lowest and highest point that an action may name, each (3) float32 [m].
     """
 
-    def __init__(self, choice: Choice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+    def __init__(self, choice: EnvironmentChoice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
         self.choice, self.worlds, self.bounds = choice, worlds, bounds
         self.count = choice.num_envs
-        self.exporter = Exporter(choice.backend, worlds.device)
+        self.exporter = ArrayExporter(choice.backend, worlds.device)
         self.episodes = Episodes.of(self.count)
         self.episodes.reseed(make_seeds(choice.seed, self.count), np.arange(self.count))
         self._is_new = True
@@ -101,7 +101,7 @@ class PickingEnvironment:
         self._is_new = False
         return self.observe(), self._describe()
 
-    def step(self, actions: Any) -> Step:
+    def step(self, actions: Any) -> EnvironmentStep:
         """Carry out an action in each environment, a whole pick or a tick, and reset episodes that have ended, as `autoreset` says.
 
         Raises:
@@ -133,7 +133,7 @@ class PickingEnvironment:
             info |= {"final_info": final, "_final_info": mask}
             obs = self.observe()
         reward, terminated, truncated = (self.exporter.from_host(values) for values in (reward, terminated, truncated))
-        return Step(obs, reward, terminated, truncated, info)
+        return EnvironmentStep(obs, reward, terminated, truncated, info)
 
     def observe(self) -> dict[str, Any]:
         """Render the observation of all environments: arrays (environment, ...) by name."""

@@ -41,7 +41,7 @@ HEADROOM = 0.3
 
 
 @dataclass(frozen=True)
-class Choice:
+class EnvironmentChoice:
     """Arguments of `make_env`, checked."""
 
     task: str
@@ -71,7 +71,7 @@ def make_choice(
     max_steps: int | None,
     piles: int | None,
     course: str,
-) -> Choice:
+) -> EnvironmentChoice:
     """Check arguments of `make_env`.
 
     Raises:
@@ -107,10 +107,10 @@ def make_choice(
     if number is None or number < 0:
         raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number from 0 on")
     images = tuple(dict.fromkeys(names)), (sides[0], sides[1])
-    return Choice(task, int(num_envs), *images, action, autoreset, backend, number, *_rest(limits), course)
+    return EnvironmentChoice(task, int(num_envs), *images, action, autoreset, backend, number, *_rest(limits), course)
 
 
-def fixed_settings(choice: Choice) -> dict[str, object]:
+def fixed_settings(choice: EnvironmentChoice) -> dict[str, object]:
     """Settings that follow from the arguments of `make_env`: full key -> value; they override the caller's."""
     fixed: dict[str, object] = {
         "bake.worlds": choice.num_envs,

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space  # pyright: ignore[reportMissingI
 from synpick_warp.codes import Segment
 from synpick_warp.environment.episodes import make_seeds
 from synpick_warp.environment.picking import ACTION_SIZES, COMMAND, EnvironmentState, PickingEnvironment
-from synpick_warp.environment.settings import OBSERVATIONS, PIXEL, POINT, Choice
+from synpick_warp.environment.settings import OBSERVATIONS, PIXEL, POINT, EnvironmentChoice
 
 Box = gymnasium.spaces.Box
 
@@ -67,7 +67,7 @@ class PickingVectorEnv(VectorEnv):
         return self.environment.branch(environment, into)
 
 
-def observation_space(choice: Choice, environment: PickingEnvironment) -> Any:
+def observation_space(choice: EnvironmentChoice, environment: PickingEnvironment) -> Any:
     """Observation space of a single environment (`Dict` of boxes)."""
     width, height = choice.resolution
     limits: Mapping[str, tuple[float, float, tuple[int, ...], Any]] = {
@@ -85,7 +85,7 @@ def observation_space(choice: Choice, environment: PickingEnvironment) -> Any:
     return gymnasium.spaces.Dict({name: spaces[name] for name in choice.obs})
 
 
-def action_space(choice: Choice, low: np.ndarray, high: np.ndarray) -> Any:
+def action_space(choice: EnvironmentChoice, low: np.ndarray, high: np.ndarray) -> Any:
     """Action space of a single environment."""
     if choice.action == PIXEL:
         return gymnasium.spaces.MultiDiscrete(list(choice.resolution))

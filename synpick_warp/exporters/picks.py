@@ -16,7 +16,7 @@ from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors, sync_file, sync_folder
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd
-from synpick_warp.views.picks import COLUMNS, STATES, Column, PickBatch, make_rows, row_type, sort_rows
+from synpick_warp.views.picks import COLUMNS, STATES, PickBatch, PickColumn, make_rows, row_type, sort_rows
 
 FOLDER = Path("picks")
 """Folder in the data set, with the tables of trials."""
@@ -84,7 +84,7 @@ def write_tables(folder: Path, batches: _Tables, out: Path, places: tuple[Path, 
         sync_folder((out / place).parent)
 
 
-def make_table(columns: Sequence[Column], rows: np.ndarray) -> pa.Table:
+def make_table(columns: Sequence[PickColumn], rows: np.ndarray) -> pa.Table:
     """Convert rows to an Arrow table; field metadata hold units, meanings and names of codes."""
     arrays = []
     for column in columns:
@@ -94,7 +94,7 @@ def make_table(columns: Sequence[Column], rows: np.ndarray) -> pa.Table:
     return pa.table(arrays, schema=table_schema(columns, rows.dtype))
 
 
-def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
+def table_schema(columns: Sequence[PickColumn], kind: np.dtype) -> pa.Schema:
     """Arrow schema of a table with rows of structured dtype `kind`."""
     fields = []
     for column in columns:
@@ -106,7 +106,7 @@ def table_schema(columns: Sequence[Column], kind: np.dtype) -> pa.Schema:
     return pa.schema(fields)
 
 
-def check_schema(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype:
+def check_schema(schema: pa.Schema, columns: Sequence[PickColumn]) -> np.dtype:
     """Structured dtype of a stored table's rows.
 
     Raises:
@@ -123,7 +123,7 @@ def check_schema(schema: pa.Schema, columns: Sequence[Column]) -> np.dtype:
     return kind
 
 
-def from_table(table: pa.Table, columns: Sequence[Column], kind: np.dtype) -> np.recarray:
+def from_table(table: pa.Table, columns: Sequence[PickColumn], kind: np.dtype) -> np.recarray:
     """Rows of an Arrow table; the inverse of `make_table`.
 
     Raises:

@@ -27,7 +27,7 @@ Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class InstanceObservation:
+class ObservedInstance:
     """Perception result of one instance, with the JSON keys as names; see `stages.perception.arrays` for units and meaning. Pixels are
     (column, row)."""
 
@@ -53,7 +53,7 @@ class ObservationRecord:
 
     resolution: tuple[int, int]
     """Width and height of the perception image [px]."""
-    instances: tuple[InstanceObservation, ...]
+    instances: tuple[ObservedInstance, ...]
     """Instances in the scene, visible or not."""
     votes: tuple[tuple[int, int, float], ...]
     """(i, j, votes): occlusion votes of the contour of i for j lying above it; only nonzero ones."""
@@ -161,8 +161,8 @@ class _Running:
     """Peak seal force of each tick of the running lift [N]."""
 
 
-_OBSERVED = tuple(item.name for item in fields(InstanceObservation) if item.name not in ("instance", "object_id"))
-"""Arrays of `Observation` that an `InstanceObservation` holds a row of."""
+_OBSERVED = tuple(item.name for item in fields(ObservedInstance) if item.name not in ("instance", "object_id"))
+"""Arrays of `Observation` that an `ObservedInstance` holds a row of."""
 
 
 class AttemptLog:
@@ -311,9 +311,9 @@ class AttemptLog:
         return int(self.object_ids[report.catalog_index[world, instance]])
 
 
-def _instance(row: Mapping[str, Any]) -> InstanceObservation:
-    """Record of an instance from its values, as Python numbers and lists, by the names of `InstanceObservation`."""
-    return InstanceObservation(
+def _instance(row: Mapping[str, Any]) -> ObservedInstance:
+    """Record of an instance from its values, as Python numbers and lists, by the names of `ObservedInstance`."""
+    return ObservedInstance(
         instance=row["instance"],
         object_id=row["object_id"],
         visible=row["visible"],

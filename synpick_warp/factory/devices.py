@@ -56,7 +56,7 @@ _NONE = {"episodes_done": 0, "worlds_active": 0, "views": 0, "views_per_s": 0.0,
 
 
 @dataclass(frozen=True)
-class Share:
+class DeviceShare:
     """Part of a bake that a device's process receives first: output folder, settings, episodes in the order of their start."""
 
     out: Path
@@ -122,7 +122,7 @@ class DeviceProcesses:
         """Hand out the shares, and wait until all processes have ended; if a device is lost, the others go on.
 
         Args:
-            shares: What each device's process is sent: its `Share`, or what its program takes.
+            shares: What each device's process is sent: its `DeviceShare`, or what its program takes.
             summary: Receives the processes' summaries; its `resumed` episodes count as done.
 
         Returns:
@@ -275,7 +275,7 @@ def bake_on_devices(
         dealt = deal_episodes(order_longest_first(filled, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config.bake.writers, needs.slot_bytes), len(names))
         shares = [
-            Share(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
+            DeviceShare(output.out, config.with_values({"bake.device": name, "bake.writers": count}), episodes, len(names))
             for name, episodes, count in zip(names, dealt, writers, strict=True)
         ]
         lost = processes.run(shares, summary, progress)

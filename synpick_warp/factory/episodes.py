@@ -26,7 +26,7 @@ Draws = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
 """Type of `Stages.draws`."""
 
 
-class EpisodeRow(NamedTuple):
+class EpisodeOutcome(NamedTuple):
     """Line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode is not part of the data set."""
 
     episode: int
@@ -67,14 +67,14 @@ class EpisodeRow(NamedTuple):
         return {**row, "sentence": self.sentence}
 
     @classmethod
-    def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
+    def from_json(cls, row: Mapping[str, Any]) -> EpisodeOutcome:
         """Row from the dictionary of a line of episodes.jsonl."""
         values: dict[str, Any] = {name: row[name] for name in cls._fields if name not in _OPTIONAL or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
 
 
-_OPTIONAL = EpisodeRow._field_defaults
+_OPTIONAL = EpisodeOutcome._field_defaults
 """Fields that rows lack where they have these values."""
 
 
@@ -86,7 +86,7 @@ class BakeSummary:
 
     total: int = 0
     """Episodes of the complete data set."""
-    episodes: list[EpisodeRow] = field(default_factory=list)
+    episodes: list[EpisodeOutcome] = field(default_factory=list)
     views: int = 0
     """Views written by this run."""
     wall_seconds: float = 0.0
@@ -106,7 +106,7 @@ class BakeSummary:
 
     def take_record(self, record: Mapping[str, Any]) -> None:
         """Count an episode that an earlier run committed."""
-        self.episodes.append(EpisodeRow.from_json(record["row"]))
+        self.episodes.append(EpisodeOutcome.from_json(record["row"]))
         self.outcomes.update(Outcome[attempt["outcome"].upper()] for attempt in record["attempts"])
         self.resumed += 1
 
@@ -128,7 +128,7 @@ class BakeSummary:
         self.resampled += 1
         self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + 1
 
-    def take_episode(self, row: EpisodeRow, record: EpisodeRecord) -> None:
+    def take_episode(self, row: EpisodeOutcome, record: EpisodeRecord) -> None:
         """Count an episode that has ended in this run."""
         self.episodes.append(row)
         self.episodes.sort()
@@ -143,14 +143,14 @@ def episode_row(
     report: TickReport,
     world: int,
     record: EpisodeRecord,
-) -> EpisodeRow:
+) -> EpisodeOutcome:
     """Build the row of the episode that ended in a world.
 
     `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `draws`: see `Stages.draws`.
     """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
-    return EpisodeRow(
+    return EpisodeOutcome(
         episode,
         arrangement,
         Ending(ending),
@@ -168,7 +168,7 @@ def episode_row(
     )
 
 
-def is_resampled(row: EpisodeRow, tries: int) -> bool:
+def is_resampled(row: EpisodeOutcome, tries: int) -> bool:
     """True if the episode will run again with a resampled arrangement; `tries`: `settle.tries`."""
     return not row.ending.delivers and row.arrangement + 1 < tries
 
@@ -195,7 +195,7 @@ def remedy(ending: Ending, physics: Physics, perception: Perception, arrangement
     return ""
 
 
-def episode_end(row: EpisodeRow, record: EpisodeRecord, tries: int) -> EpisodeEnd:
+def episode_end(row: EpisodeOutcome, record: EpisodeRecord, tries: int) -> EpisodeEnd:
     """Build the end-of-episode message for exporters; a resampled episode (`is_resampled`) has neither row nor attempts."""
     if is_resampled(row, tries):
         return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending))

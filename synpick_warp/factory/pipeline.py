@@ -25,7 +25,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.factory.compilation import make_compiler
-from synpick_warp.factory.devices import Share, bake_on_devices, prepare_folder
+from synpick_warp.factory.devices import DeviceShare, bake_on_devices, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
@@ -184,7 +184,7 @@ def _fill(
         summary.wall_seconds += time.perf_counter() - started
 
 
-def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> BakeSummary:
+def generate_share(share: DeviceShare, handles: Sequence[int], link: BakeLink) -> BakeSummary:
     """Generate and commit the episodes of one device, in its process; the folder is prepared already.
 
     Args:

@@ -38,7 +38,7 @@ FREE_COORDS = 7
 FREE_DOFS = 6
 
 
-class Part(NamedTuple):
+class WorldPart(NamedTuple):
     """Collision shape of a bin, or guide wall on its rim: index among a world's shapes, index of the bin, whether it is a guide wall."""
 
     shape: int
@@ -47,7 +47,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Layout:
+class WorldLayout:
     """Counts and offsets of bodies, joints and shapes in the arrays of the model. World w starts at w times the count per world."""
 
     worlds: int
@@ -58,7 +58,7 @@ class Layout:
     compound_slots: int
     """Body slots for objects with a convex decomposition."""
     shapes_per_world: int
-    parts: tuple[Part, ...]
+    parts: tuple[WorldPart, ...]
     """Collision shapes and guide walls of all bins, of which each world has one in place."""
     finger_shape: int
     """Shape index of the gripper shaft within a world."""
@@ -91,7 +91,7 @@ class BuiltModel:
     """Finalized Newton model with its layout, and the body variant (shape and mass) that a slot selects for each catalog entry."""
 
     model: newton.Model
-    layout: Layout
+    layout: WorldLayout
     head: Head
     variant: np.ndarray
     """Variant index of each catalog entry in slots of its type (entry) int32."""
@@ -224,8 +224,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, mu=config.physics.friction, gap=config.physics.gap, restitution=0.0)
     bins = make_bins(config.cell.bins)
 
-    def add(index: int, pieces: Sequence[ConvexPiece], guide: bool) -> list[Part]:
-        return [Part(world.add_shape_convex_hull(-1, mesh=hull_mesh(piece), cfg=shape), index, guide) for piece in pieces]
+    def add(index: int, pieces: Sequence[ConvexPiece], guide: bool) -> list[WorldPart]:
+        return [WorldPart(world.add_shape_convex_hull(-1, mesh=hull_mesh(piece), cfg=shape), index, guide) for piece in pieces]
 
     parts = add(0, bins[0].pieces, False)
     table = wp.transform(wp.vec3(0.0, 0.0, bins[0].sizes.ground - TABLE_SIZE[2]), wp.quat_identity())
@@ -243,7 +243,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         # Newton raises the inertia of bodies of a few millimetres to its threshold, and says so for every slot.
         warnings.filterwarnings("ignore", "Eigenvalues below threshold")
         model = scene.finalize(device=device)
-    layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
+    layout = WorldLayout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, tuple(parts), *gripper)
     return BuiltModel(model, layout, head, variant, empty, tuple(one.limits for one in bins))
 
 

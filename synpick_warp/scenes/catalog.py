@@ -17,7 +17,7 @@ from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope
 from synpick_warp.scenes.assets.meshes import MeshOptions, connected_parts, merge_positions, read_mesh_file, solid_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
-from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh, read_models_info
+from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.depth import is_concave
@@ -193,7 +193,7 @@ class _Rules:
 def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], faults: _Faults) -> list[RawObject]:
     """Read all models of a folder, ordered by obj_id."""
     models = list_models(folder, report, faults.add)
-    infos: dict[int, ModelInfo] = {}
+    infos: dict[int, FileModelInfo] = {}
     if models and models[0].is_bop:
 
         def without(error: CatalogError) -> None:
@@ -202,7 +202,7 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
             report(f"{error}; until then it has no symmetries")
 
         infos = read_models_info(folder / "models_info.json", [model.obj_id for model in models], without)
-    calls = [(model, infos.get(model.obj_id, ModelInfo()), rules) for model in models]
+    calls = [(model, infos.get(model.obj_id, FileModelInfo()), rules) for model in models]
     raws, sizes = [], []
     for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
         if isinstance(result, _SizeError | tuple) and model.path.suffix.lower() not in STEP_SUFFIXES:
@@ -243,7 +243,7 @@ def _embedded_objects(rules: _Rules, faults: _Faults, distractors: bool) -> list
     return raws
 
 
-def _read_model(model: ModelFile, info: ModelInfo, rules: _Rules) -> tuple[RawObject, list[str]]:
+def _read_model(model: ModelFile, info: FileModelInfo, rules: _Rules) -> tuple[RawObject, list[str]]:
     """Read and check a model; returns it with lines on what was corrected. Runs in an isolated process.
 
     A BOP model has the row of the object table with its obj_id, others the row with their name, if the diameter agrees.
@@ -291,7 +291,7 @@ def _advise_unit(sizes: list[float], unit: str, place: BinSizes) -> str:
     return f'{"median " if len(sizes) > 1 else ""}size {shown}: did you mean objects.unit = "{likely}"?'
 
 
-def _check_info(info: ModelInfo, mesh: TriangleMesh, hull: HullSize, model: ModelFile, strict: bool) -> tuple[ModelInfo, list[str]]:
+def _check_info(info: FileModelInfo, mesh: TriangleMesh, hull: HullSize, model: ModelFile, strict: bool) -> tuple[FileModelInfo, list[str]]:
     """Compare a model with its entry in models_info.json; returns the corrected entry, and a line if it was wrong."""
     try:
         info, said = check_against_mesh(info, mesh.vertices, hull.diameter)

@@ -120,7 +120,7 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
     )
 
 
-def _layout_data(layout: build.Layout) -> structs.LayoutData:
+def _layout_data(layout: build.WorldLayout) -> structs.LayoutData:
     """Fill `LayoutData` from the layout of the model."""
     return fill(
         structs.LayoutData,
@@ -223,7 +223,7 @@ def bin_data(
     sizes: Sequence[BinSizes],
     bins: schema.Bins,
     move: schema.Move,
-    parts: Sequence[build.Part],
+    parts: Sequence[build.WorldPart],
     device: wp.Device,
     fields: Sequence[HeightField | None] = (),
 ) -> structs.BinData:

@@ -24,7 +24,7 @@ ORDER = ("state", "candidate", "repeat")
 """Columns that identify a trial within its episode, and by which its table is sorted."""
 
 
-class Column(NamedTuple):
+class PickColumn(NamedTuple):
     """Schema of a column: name, type, unit (1: none), meaning, components (1: a scalar), enumeration of its codes, and domain."""
 
     name: str
@@ -55,37 +55,39 @@ class Column(NamedTuple):
 
 
 COLUMNS = (
-    Column("state", "<i4", "1", "Index of the state within the episode.", low=0),
-    Column("frame", "<i4", "1", "Frame of the episode at which the state was saved, and from which the candidate was drawn.", low=0),
-    Column("candidate", "<i4", "1", "Index of the candidate within the state.", low=0),
-    Column("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed.", low=0),
-    Column("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
-    Column(
+    PickColumn("state", "<i4", "1", "Index of the state within the episode.", low=0),
+    PickColumn("frame", "<i4", "1", "Frame of the episode at which the state was saved, and from which the candidate was drawn.", low=0),
+    PickColumn("candidate", "<i4", "1", "Index of the candidate within the state.", low=0),
+    PickColumn("repeat", "<i4", "1", "Repeat of the candidate; 0: not perturbed.", low=0),
+    PickColumn("share", "|u1", "1", "How the candidate was sampled.", codes=Share),
+    PickColumn(
         "weight", "<f4", "1", "Inverse probability weight of its pixel in a draw, for unbiased estimates over pixels; 0: own grasp.", low=0
     ),
-    Column("column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states.", low=0),
-    Column("row", "<i4", "px", "Pixel in the perception image, from the top.", low=0),
-    Column("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none.", low=-1),
-    Column("obj_id", "<i4", "1", "Its object id; -1: none.", low=-1),
-    Column("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3, low=-REACH, high=REACH),
-    Column("normal", "<f4", "1", "Unit surface normal there in the world, out of the object, smoothed as perception does.", 3),
-    Column("yaw", "<f4", "rad", "Rotation of the gripper shaft about the vertical."),
-    Column("tilt", "<f4", "rad", "Rotation of the cup about the wrist axis."),
-    Column("approach", "<f4", "1", "Unit direction in which the cup is pressed on, in the world.", 3),
-    Column("seal", "<f4", "1", "Analytic seal score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
-    Column("wrench", "<f4", "1", "Analytic wrench score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
-    Column("offset", "<f4", "m", "Perturbation of the grasp point.", 3, low=-1, high=1),
-    Column("rotation", "<f4", "rad", "Perturbation of the cup's orientation, as a rotation vector in the world.", 3, low=-4, high=4),
-    Column("friction", "<f4", "1", "Factor on all coefficients of friction.", low=0, high=2),
-    Column("outcome", "|u1", "1", "Outcome of the attempt; none: the simulation ended first.", codes=Outcome),
-    Column("ending", "|u1", "1", "Why the simulation ended during the trial; running: it did not.", codes=Ending),
-    Column("success", "|b1", "1", "Whether any object hung on the cup after lift and hold."),
-    Column("intended", "|b1", "1", "Whether the intended instance hung on the cup after lift and hold."),
-    Column("hits", "<i4", "1", "Suction rays that hit an object when the suction was switched on.", low=0),
-    Column("sealed", "<i4", "1", "Cups with a good seal: bit k, cup k.", low=0),
-    Column("picked", "<i4", "1", "First instance on the cup at the end; -1: none.", low=-1),
-    Column("peak_force", "<f4", "N", "Largest force of any seal, seals that broke included.", low=0),
-    Column(
+    PickColumn(
+        "column", "<i4", "px", "Pixel in the perception image of camera 0, from the left; its size is in the table of states.", low=0
+    ),
+    PickColumn("row", "<i4", "px", "Pixel in the perception image, from the top.", low=0),
+    PickColumn("instance", "<i4", "1", "Instance that the pixel shows, which the pick intends; -1: none.", low=-1),
+    PickColumn("obj_id", "<i4", "1", "Its object id; -1: none.", low=-1),
+    PickColumn("point", "<f4", "m", "Grasp point in the world: surface point at the pixel's centre.", 3, low=-REACH, high=REACH),
+    PickColumn("normal", "<f4", "1", "Unit surface normal there in the world, out of the object, smoothed as perception does.", 3),
+    PickColumn("yaw", "<f4", "rad", "Rotation of the gripper shaft about the vertical."),
+    PickColumn("tilt", "<f4", "rad", "Rotation of the cup about the wrist axis."),
+    PickColumn("approach", "<f4", "1", "Unit direction in which the cup is pressed on, in the world.", 3),
+    PickColumn("seal", "<f4", "1", "Analytic seal score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
+    PickColumn("wrench", "<f4", "1", "Analytic wrench score of SuctionNet at the pixel, 0 to 1.", low=0, high=1),
+    PickColumn("offset", "<f4", "m", "Perturbation of the grasp point.", 3, low=-1, high=1),
+    PickColumn("rotation", "<f4", "rad", "Perturbation of the cup's orientation, as a rotation vector in the world.", 3, low=-4, high=4),
+    PickColumn("friction", "<f4", "1", "Factor on all coefficients of friction.", low=0, high=2),
+    PickColumn("outcome", "|u1", "1", "Outcome of the attempt; none: the simulation ended first.", codes=Outcome),
+    PickColumn("ending", "|u1", "1", "Why the simulation ended during the trial; running: it did not.", codes=Ending),
+    PickColumn("success", "|b1", "1", "Whether any object hung on the cup after lift and hold."),
+    PickColumn("intended", "|b1", "1", "Whether the intended instance hung on the cup after lift and hold."),
+    PickColumn("hits", "<i4", "1", "Suction rays that hit an object when the suction was switched on.", low=0),
+    PickColumn("sealed", "<i4", "1", "Cups with a good seal: bit k, cup k.", low=0),
+    PickColumn("picked", "<i4", "1", "First instance on the cup at the end; -1: none.", low=-1),
+    PickColumn("peak_force", "<f4", "N", "Largest force of any seal, seals that broke included.", low=0),
+    PickColumn(
         "margin",
         "<f4",
         "1",
@@ -93,7 +95,7 @@ COLUMNS = (
         high=1,
         undefined=True,
     ),
-    Column(
+    PickColumn(
         "time_to_break",
         "<f4",
         "s",
@@ -101,21 +103,21 @@ COLUMNS = (
         low=0,
         undefined=True,
     ),
-    Column("held", "<f4", "s", "Time with an object on the cup.", low=0),
-    Column("moved", "<i4", "1", f"Collateral: other objects displaced by more than {1e3 * MOVED:.0f} mm.", low=0),
-    Column("farthest", "<f4", "m", "Largest displacement of another object.", low=0),
-    Column("lost", "<i4", "1", "Objects that left the bin without being picked.", low=0),
-    Column("duration", "<f4", "s", "Simulated duration of the trial.", low=0),
+    PickColumn("held", "<f4", "s", "Time with an object on the cup.", low=0),
+    PickColumn("moved", "<i4", "1", f"Collateral: other objects displaced by more than {1e3 * MOVED:.0f} mm.", low=0),
+    PickColumn("farthest", "<f4", "m", "Largest displacement of another object.", low=0),
+    PickColumn("lost", "<i4", "1", "Objects that left the bin without being picked.", low=0),
+    PickColumn("duration", "<f4", "s", "Simulated duration of the trial.", low=0),
 )
 """Columns of the table of trials, in the order of files."""
 STATES = (
-    Column("state", "<i4", "1", "Index of the state within the episode.", low=0),
-    Column("frame", "<i4", "1", "Frame of the episode at which it was saved.", low=0),
-    Column("camera", "<i4", "1", "Index of the camera from whose perception image the candidates were drawn.", low=0),
-    Column("width", "<i4", "px", "Width of its perception image.", low=1),
-    Column("height", "<i4", "px", "Height of its perception image.", low=1),
-    Column("candidates", "<i4", "1", "Number of candidates.", low=0),
-    Column("visible", "|b1", "1", "Whether each instance is visible in the perception image."),
+    PickColumn("state", "<i4", "1", "Index of the state within the episode.", low=0),
+    PickColumn("frame", "<i4", "1", "Frame of the episode at which it was saved.", low=0),
+    PickColumn("camera", "<i4", "1", "Index of the camera from whose perception image the candidates were drawn.", low=0),
+    PickColumn("width", "<i4", "px", "Width of its perception image.", low=1),
+    PickColumn("height", "<i4", "px", "Height of its perception image.", low=1),
+    PickColumn("candidates", "<i4", "1", "Number of candidates.", low=0),
+    PickColumn("visible", "|b1", "1", "Whether each instance is visible in the perception image."),
 )
 """Columns of the table of states. `visible` has a component for each instance of the episode."""
 
@@ -144,12 +146,12 @@ class PickBatch:
         return len(self.trials["state"])
 
 
-def row_type(columns: Sequence[Column], instances: int = 1) -> np.dtype:
+def row_type(columns: Sequence[PickColumn], instances: int = 1) -> np.dtype:
     """Structured dtype of a table's row; `visible` has `instances` components."""
     return np.dtype([(column.name, column.dtype, (instances,)) if column.name == "visible" else column.field for column in columns])
 
 
-def make_rows(columns: Sequence[Column], arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+def make_rows(columns: Sequence[PickColumn], arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     """Convert columns to the rows of a table: structured array (row) of `row_type`; raises ValueError as `PickBatch`."""
     if wrong := {column.name for column in columns} ^ set(arrays):
         raise ValueError(f"{sorted(wrong)[0]} is missing, or no column of picks")

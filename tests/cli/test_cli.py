@@ -24,7 +24,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.files.load import load_config, preset_names
 from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
 from synpick_warp.factory.memory_plan import Term
 from synpick_warp.stages import timing
 from tests.builders import mistake
@@ -32,7 +32,7 @@ from tests.system.test_pool import refuse  # Writer processes import its module,
 
 
 def finished(number: int) -> BakeSummary:
-    rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
+    rows = [EpisodeOutcome(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
     return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, resampled=1)
 
 

@@ -15,12 +15,12 @@ from synpick_warp.cli import display
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.factory import episodes
-from synpick_warp.factory.episodes import BakeSummary, EpisodeRow, ThroughputMeter
+from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome, ThroughputMeter
 from synpick_warp.system.progress import Progress, SilentProgress
 
 
-def row(episode: int, arrangement: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeRow:
-    return EpisodeRow(episode, arrangement, ending, frames, seconds, mode, *(counts or (9, 0, 0, 0, 9)))
+def row(episode: int, arrangement: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeOutcome:
+    return EpisodeOutcome(episode, arrangement, ending, frames, seconds, mode, *(counts or (9, 0, 0, 0, 9)))
 
 
 def printed(summary: BakeSummary) -> str:
@@ -60,7 +60,7 @@ def test_a_bake_that_others_have_finished_says_where_it_is():
 
 @pytest.mark.parametrize("many", [False, True])
 def test_endings_are_those_of_the_bin(many):
-    given = EpisodeRow(0, 0, Ending.EMPTIED, 9, 1.0, "pick", 3, 3, 3, 0, 0, bin={"name": "kanban"})
+    given = EpisodeOutcome(0, 0, Ending.EMPTIED, 9, 1.0, "pick", 3, 3, 3, 0, 0, bin={"name": "kanban"})
     text = printed(BakeSummary(100, [given] * (100 if many else 1)))
     assert "no object is left in the bin" in text
     assert "tote" not in text

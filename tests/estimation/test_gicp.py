@@ -13,7 +13,7 @@ from synpick_warp.apps.estimation.run import (
     REFINE,
     SINGLE,
     TURN,
-    Options,
+    EstimationOptions,
     disturb_pose,
     observed_points,
     read_scenes,
@@ -38,7 +38,7 @@ def aligner(data):
 
 
 def test_observed_points_lie_on_the_boxes(data):
-    (scene,) = read_scenes(data, [PLAN], Options(REFINE))
+    (scene,) = read_scenes(data, [PLAN], EstimationOptions(REFINE))
     for slot, (object_id, pose) in enumerate(zip(scene.object_ids.tolist(), scene.poses[0], strict=True)):
         points = observed_points(scene, 0, slot, "depth")
         own = (points - pose[:3, 3]) @ pose[:3, :3]
@@ -59,7 +59,7 @@ def test_a_disturbed_pose_is_off_by_the_same_amounts_and_depends_on_its_key():
 
 
 def test_disturbed_boxes_come_back(data, aligner):
-    options = Options(REFINE, threads=2)
+    options = EstimationOptions(REFINE, threads=2)
     (scene,) = scenes = read_scenes(data, [PLAN], options)
     poses = run_estimation(scenes, aligner, options).poses
     assert len(poses) == 6
@@ -75,7 +75,7 @@ def test_disturbed_boxes_come_back(data, aligner):
 
 def test_a_search_finds_the_surface_without_a_start(data, aligner):
     """Distances of the observed points to the box at the estimated pose; turns of a box by 180 degrees are as good."""
-    options = Options(SINGLE, threads=2)
+    options = EstimationOptions(SINGLE, threads=2)
     (scene,) = scenes = read_scenes(data, [PLAN], options)
     poses = run_estimation(scenes, aligner, options).poses
     slots = {int(instance): slot for slot, instance in enumerate(scene.instances)}

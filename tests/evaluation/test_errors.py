@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.evaluation.auc import LIMIT, band_indices, error_bands, exact_auc, recall_curve, vocap_auc
 from synpick_warp.apps.evaluation.errors import VertexSearch, add_errors, adds_errors, rotation_errors, translation_errors
 from synpick_warp.apps.evaluation.models import expand_symmetries
-from synpick_warp.scenes.assets.models_info import ModelInfo
+from synpick_warp.scenes.assets.models_info import FileModelInfo
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
 
@@ -116,13 +116,13 @@ def test_symmetric_objects_are_invariant_under_their_symmetries(seed, sides, ste
 
 def test_continuous_symmetries_are_steps_about_the_axis():
     flip = (1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, 1.0)
-    symmetries = expand_symmetries(ModelInfo(0.1, (flip,), (AXIS,)))
+    symmetries = expand_symmetries(FileModelInfo(0.1, (flip,), (AXIS,)))
     assert len(symmetries) == 2 * 315
     np.testing.assert_array_equal(symmetries[0], np.eye(3))
     true = Rotation.random(50, rng=np.random.default_rng(3)).as_matrix()
     turns = Rotation.from_euler("z", np.linspace(0.0, 360.0, 50)[:, None], degrees=True).as_matrix()
     assert rotation_errors(true @ turns, true, symmetries).max() < 180.0 / 315 + 1e-9
-    assert len(expand_symmetries(ModelInfo())) == 1
+    assert len(expand_symmetries(FileModelInfo())) == 1
 
 
 def test_rotation_errors_are_precise_at_both_ends():

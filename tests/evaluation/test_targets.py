@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.evaluation.targets import Target, count_targets, encode_targets, in_layout, read_targets, select_targets
+from synpick_warp.apps.evaluation.targets import TargetRow, count_targets, encode_targets, in_layout, read_targets, select_targets
 from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.errors import ResultError
 from tests.worlds.evaluation_set import BOX, BRICK, write_evaluation_set
@@ -27,7 +27,7 @@ def test_lists_are_read_as_they_were_written(tmp_path):
         {"scene_id": 0, "im_id": 3, "obj_id": 4, "inst_count": 1},
         {"scene_id": 1, "im_id": 2, "obj_id": 5, "inst_count": 2},
     ]
-    assert read_targets(path).targets == (Target(0, 3, 4, 1), Target(1, 2, 5, 2))
+    assert read_targets(path).targets == (TargetRow(0, 3, 4, 1), TargetRow(1, 2, 5, 2))
     assert read_targets(path).objects == {(0, 3): frozenset({4}), (1, 2): frozenset({5})}
 
 

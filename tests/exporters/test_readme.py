@@ -10,8 +10,8 @@ import synpick_warp.exporters
 from synpick_warp.codes import Effect, Outcome, names
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
-from synpick_warp.factory.attempts import AttemptRecord, InstanceObservation
-from synpick_warp.factory.episodes import EpisodeRow
+from synpick_warp.factory.attempts import AttemptRecord, ObservedInstance
+from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.views.layers import LAYER_TABLE
 
 README = Path(synpick_warp.exporters.__file__).with_name("README.md")
@@ -36,8 +36,8 @@ def test_layers_are_described():
 
 
 def test_keys_of_the_lists_are_described():
-    keys = {field.name for record in (AttemptRecord, InstanceObservation) for field in dataclasses.fields(record)}
-    keys |= {*EpisodeRow._fields, "sentence", "checksum", *names(Outcome)} - {"none"}
+    keys = {field.name for record in (AttemptRecord, ObservedInstance) for field in dataclasses.fields(record)}
+    keys |= {*EpisodeOutcome._fields, "sentence", "checksum", *names(Outcome)} - {"none"}
     assert keys <= described("Episode and attempt lists")
 
 

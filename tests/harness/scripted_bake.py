@@ -17,7 +17,7 @@ from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import BakeSummary, EpisodeRow
+from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
 from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
@@ -116,7 +116,7 @@ def bake_episodes(
     return summary
 
 
-def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> EpisodeRow:
+def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> EpisodeOutcome:
     for batch in trajectories.ticks((episode,), FRAMES):
         exporters.write_ticks(batch)
     for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
@@ -124,7 +124,7 @@ def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool,
     if picks:
         exporters.write_picks(pick_batch(episode, (0, 1), own=False))
     split = DataLayout.of(output.config).split_of(episode)
-    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
+    row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
     exporters.end_episode(end, lambda: output.commit(exporters, pool, end))
     return row

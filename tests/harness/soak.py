@@ -28,7 +28,7 @@ from synpick_warp.dataset.commit.writing import OutputFolder
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import EpisodeRow
+from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import box_views, trajectories
@@ -66,7 +66,7 @@ def make_frames(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
 
 def make_end(episode: int) -> EpisodeEnd:
     """Successful end of an episode, with one attempt."""
-    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
+    row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
     attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
     return EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
 

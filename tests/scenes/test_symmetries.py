@@ -21,7 +21,7 @@ from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
-from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.scenes.symmetries.surface import SampledSurface
 from tests.worlds.model_files import exported, load_models, put
 
 MAKE = trimesh.creation
@@ -128,7 +128,7 @@ def test_a_single_vertex_above_the_tolerance_breaks_a_symmetry():
     size = diameter(mesh)
     inside = np.abs(mesh.vertices - (0.03, 0.015, 0.01)).sum(axis=1).argmin()
     mesh.vertices[inside, 2] += 0.035 * size
-    surface, half_turn = Surface(mesh.vertices, mesh.faces), np.diag([-1.0, -1.0, 1.0, 1.0])
+    surface, half_turn = SampledSurface(mesh.vertices, mesh.faces), np.diag([-1.0, -1.0, 1.0, 1.0])
     assert surface.rough_deviation(half_turn, np.inf) < 0.03 * size
     assert surface.deviation(half_turn) == pytest.approx(0.035 * size, rel=0.02)
     assert [len(find_symmetries(mesh.vertices, mesh.faces, size, share * size).discrete) for share in (0.03, 0.04)] == [0, 3]

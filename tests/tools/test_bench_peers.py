@@ -19,7 +19,7 @@ from tests.worlds.small_worlds import catalog
 from tests.worlds.toy_scene import UPRIGHT
 from tools.bench import __main__ as bench
 from tools.bench import engines, peers, run, worlds
-from tools.options import Row
+from tools.options import MeasuredRow
 
 TWO = Config().with_values({"bake.worlds": 2})
 
@@ -78,7 +78,7 @@ def test_a_peer_that_fails_says_why_and_the_others_go_on(monkeypatch, tmp_path, 
         raise RuntimeError("no rays today\nat all")
 
     monkeypatch.setattr(peers, "compare_hits", fail)
-    monkeypatch.setattr(peers, "measure_engine", lambda *_: iter([Row("next", 2.0)]))
+    monkeypatch.setattr(peers, "measure_engine", lambda *_: iter([MeasuredRow("next", 2.0)]))
     monkeypatch.setattr(bench, "check_installed", lambda names: None)
     values, reason = measure(tmp_path, "sensor-camera,mujoco"), "failed: RuntimeError: no rays today"
     assert values["sensor-camera", "32x18, 1 world: views in a batch"] == 3.0

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from tools import docs, figures
-from tools.options import Row
+from tools.options import MeasuredRow
 
 RUN = {"stage": "pictures", "date": "2030-01-02", "card": "H100", "commit": None, "command": "c", "limit": "rays", "rows": []}
 
@@ -71,7 +71,7 @@ def test_a_table_has_values_with_units_and_numbered_conditions():
 def test_what_a_tool_writes_is_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["bench", "--models", str(tmp_path / "YCB"), "--seconds", "1"])
     machine = [("device", "cuda:0: NVIDIA H100"), ("CPU cores", "16")]
-    rows = [Row("views", 2.0, "1/s", part="pictures"), Row("failed", float("nan"))]
+    rows = [MeasuredRow("views", 2.0, "1/s", part="pictures"), MeasuredRow("failed", float("nan"))]
     record = figures.describe_run("tools.bench", machine, rows, traces={"a": [1]})
     figures.write_run(tmp_path / "run.json", record)
     found = msgspec.json.decode((tmp_path / "run.json").read_bytes())

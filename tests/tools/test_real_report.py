@@ -25,7 +25,7 @@ from tools.reports.real.training import (  # noqa: E402
     train,
     warp_views,
 )
-from tools.reports.real.views import Pool  # noqa: E402
+from tools.reports.real.views import ViewPool  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
 
@@ -123,7 +123,7 @@ def test_the_network_has_logits_of_the_images_size():
 
 
 def test_a_pool_replaces_views_once_it_is_full():
-    pool = Pool(4, 0)
+    pool = ViewPool(4, 0)
     batches = iter([(torch.full((3, 3, 2, 2), index, dtype=torch.uint8), torch.full((3, 2, 2), index)) for index in range(6)])
     assert pool.fill(batches, 4)
     assert (pool.count, pool.seen) == (4, 6)

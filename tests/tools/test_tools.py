@@ -52,7 +52,7 @@ def pile(**changes):
         "depth": np.full(2, 0.5),
         "inside": np.full(2, True),
     }
-    return rest_report.Pile(**values | changes)
+    return rest_report.RestingPile(**values | changes)
 
 
 SETTINGS = Config()
@@ -64,7 +64,7 @@ def violated(results, config=SETTINGS) -> list[str]:
 
 
 def test_a_settled_pile_is_within_all_bounds():
-    assert violated(rest_report.Results([pile(), pile()])) == []
+    assert violated(rest_report.RestResults([pile(), pile()])) == []
 
 
 @pytest.mark.parametrize(
@@ -79,20 +79,20 @@ def test_a_settled_pile_is_within_all_bounds():
     ],
 )
 def test_each_bound_is_checked(changes, names):
-    assert violated(rest_report.Results([pile(**changes)])) == names
+    assert violated(rest_report.RestResults([pile(**changes)])) == names
 
 
 def test_fills_by_number_may_have_any_volume_but_not_more_contacts_than_there_is_room_for():
     config = Config().with_values({"arrangement.counts": (("bracket", 150, 150),)})
-    assert violated(rest_report.Results([pile(volume=28.0)]), config) == []
-    assert violated(rest_report.Results([pile()], contacts=512.0, pairs=1024.0), config) == [
+    assert violated(rest_report.RestResults([pile(volume=28.0)]), config) == []
+    assert violated(rest_report.RestResults([pile()], contacts=512.0, pairs=1024.0), config) == [
         "contacts a world, most in a tick",
         "pairs of shapes a world, most in a tick",
     ]
 
 
 def test_without_piles_all_bounds_are_violated():
-    assert len(violated(rest_report.Results(given_up=1))) == 6
+    assert len(violated(rest_report.RestResults(given_up=1))) == 6
 
 
 def test_inside_is_within_the_rim_from_the_floor_to_the_heap_height():

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from synpick_warp.apps.validation.registry import Violation
-from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from tests.harness import scripted_bake
 from tests.worlds import box_views
 
@@ -41,6 +41,6 @@ def check() -> Callable[..., list[Violation]]:
     """Validate a folder in this process, rendering every view again."""
 
     def run(folder: Path, **options: object) -> list[Violation]:
-        return list(validate(folder, Options(**({"sample": None, "threads": 1} | options)), Summary()))
+        return list(validate(folder, ValidationOptions(**({"sample": None, "threads": 1} | options)), Summary()))
 
     return run

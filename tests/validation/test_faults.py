@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.apps.validation.registry import Level, load_rules
-from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.dataset.bop.layout import Layout
 from tests.validation.faults import FAULTS
 from tests.validation.layouts import LAYOUTS, imagewise, itodd, multisensor, tless, ycbv
@@ -50,7 +50,7 @@ def poses(folder):
 def test_a_correct_set_of_another_layout_has_no_error(good, check, tmp_path, name):
     folder = LAYOUTS[name](good, tmp_path / "set")
     summary = Summary()
-    found = list(validate(folder, Options(sample=None, threads=1), summary))
+    found = list(validate(folder, ValidationOptions(sample=None, threads=1), summary))
     assert errors(found) == []
     assert {violation.rule for violation in found} <= {"set-files", "ground-truth"}
     assert summary.rendered >= 6

@@ -11,7 +11,7 @@ import pytest
 from synpick_warp.apps.validation.diagnosis import DiagnosedView
 from synpick_warp.apps.validation.registry import Tolerance, distributions, load_rules
 from synpick_warp.apps.validation.rules.images import _farthest
-from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.apps.validation.scene_files import crop_mask
 from tests.validation.faults import masks_swapped
 from tests.validation.planting import SCENE, edit_entry
@@ -24,7 +24,7 @@ VISIBLE = f"{SCENE}/mask_visib/000001_000001.png"
 def measure(folder, tolerance=TOLERANCE):
     """Validate with a tolerance: the violated rules, and the distributions of the deviations."""
     summary = Summary()
-    found = {violation.rule for violation in validate(folder, Options(sample=None, threads=1, tolerance=tolerance), summary)}
+    found = {violation.rule for violation in validate(folder, ValidationOptions(sample=None, threads=1, tolerance=tolerance), summary)}
     return found, distributions(summary.deviations)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.apps.viz.explain_record import SeenAttempt
-from synpick_warp.dataset.records import InstanceObservation, Observation
+from synpick_warp.dataset.records import InstanceObservation, RecordedObservation
 
 
 def seen_object(instance: int, object_id: int, suction: tuple[float, float], **other: Any) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def attempt(
     seen: tuple[InstanceObservation, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any
 ) -> SeenAttempt:
     """An attempt as `read_attempts` returns it, with the graph that is given."""
-    observation = Observation((96, 72), list(seen), [(*edge, number) for edge, number in votes.items()])
+    observation = RecordedObservation((96, 72), list(seen), [(*edge, number) for edge, number in votes.items()])
     values: dict[str, Any] = {"sentence": "s", "target": target, "tilt": None, "hits": 10, "good_seal": True}
     return SeenAttempt(**record([], **values | other, observation=observation))
 

@@ -15,7 +15,7 @@ from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.episodes.manipulation import Move
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.kernels import structs
-from synpick_warp.scenes.build import Part
+from synpick_warp.scenes.build import WorldPart
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.arrays import allocate, count_words
 from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
@@ -163,7 +163,7 @@ class KernelWorlds:
 
     def _bins(self) -> Any:
         """Bins by `bins`."""
-        return bin_data(self.bins, self.places, Move(corner=0.5), [Part(*part) for part in self.parts], self.device)
+        return bin_data(self.bins, self.places, Move(corner=0.5), [WorldPart(*part) for part in self.parts], self.device)
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)

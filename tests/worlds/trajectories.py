@@ -12,7 +12,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config, Trajectory
-from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
+from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, TrajectoryArray
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 from tests.harness.exporter_contract import exporting, finish
@@ -88,7 +88,7 @@ def _physics(episode: int, frame: int, steps: bool, room: int) -> tuple[dict[str
     return tick, stepped
 
 
-def _random_array(numbers: np.random.Generator, spec: ArraySpec, room: int) -> np.ndarray:
+def _random_array(numbers: np.random.Generator, spec: TrajectoryArray, room: int) -> np.ndarray:
     shape = spec.shape({"tick": 1, "step": STEP_COUNT, "instance": room})
     shape = shape[1:] if spec.dims[0] == "tick" else shape
     kind = np.dtype(spec.dtype)

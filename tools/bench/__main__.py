@@ -31,11 +31,22 @@ from tools.bench.run import Bench
 from tools.bench.scaling import measure_growth, measure_heaps, measure_patches
 from tools.bench.worlds import measure_worlds
 from tools.figures import describe_run, write_run
-from tools.options import INTERRUPTED, Row, configure, counts, fail, make_names_parser, make_parser, number_in, of_part, positive_count
+from tools.options import (
+    INTERRUPTED,
+    MeasuredRow,
+    configure,
+    counts,
+    fail,
+    make_names_parser,
+    make_parser,
+    number_in,
+    of_part,
+    positive_count,
+)
 
 SHARED_PARTS = ("physics", "perception", "render", "encode", "stream")
 """Parts in the same worlds."""
-OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[Row]]] = {
+OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[MeasuredRow]]] = {
     "pictures": measure_pictures,
     "steady": measure_steady,
     "trajectories": measure_trajectories,
@@ -58,7 +69,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code. Rows measured before an interruption are written."""
     options = _parse(arguments)
     console = Console(highlight=False)
-    rows: list[Row] = []
+    rows: list[MeasuredRow] = []
     machine: dict[str, str] = {}
     code = 0
     try:
@@ -120,9 +131,9 @@ def _config(options: argparse.Namespace) -> Config:
     return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 
 
-def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[Row]:
+def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[MeasuredRow]:
     """Measure the parts, which may be in any order, then the peers; yields rows as they arrive, and keeps their values in `bench`."""
-    runs: list[Iterator[Row]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
+    runs: list[Iterator[MeasuredRow]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
     runs += [of_part(part, make(bench)) for part, make in OWN_PARTS.items() if part in parts]
     runs += [measure_peers(bench, peers)] if peers else []
     for row in itertools.chain.from_iterable(runs):

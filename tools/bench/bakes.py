@@ -28,7 +28,7 @@ from synpick_warp.views.frames import TickBatch
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import SteadyMeter, summarize_rates
 from tools.bench.run import LIVE_FRACTION, SPARE_EPISODES, Bench
-from tools.options import Row
+from tools.options import MeasuredRow
 
 WITHOUT_PICTURES = ("usd", "zarr")
 """Formats of trajectories alone; worlds that pick still render the images of their perception."""
@@ -51,7 +51,7 @@ def clean_up_behind(layout: DataLayout, out: Path) -> Iterator[Cleaner]:
         raise DatasetError(tally.problem)
 
 
-def measure_steady(bench: Bench) -> Iterator[Row]:
+def measure_steady(bench: Bench) -> Iterator[MeasuredRow]:
     """Views per second to disk while nearly all worlds are live, and CPU time of a view by kind of process; each device simulates
     `bake.worlds` worlds."""
     config = bench.config
@@ -68,22 +68,22 @@ def measure_steady(bench: Bench) -> Iterator[Row]:
     meter.raise_interruption(summary)
 
 
-def _summarize_steady(meter: SteadyMeter) -> Iterator[Row]:
+def _summarize_steady(meter: SteadyMeter) -> Iterator[MeasuredRow]:
     """Rows of the rates, the verified scenes, and the space on disk."""
     yield from summarize_rates("view", meter)
     first, last = meter.readings[0], meter.readings[-1]
     verified, deleted = last.tally.episodes - first.tally.episodes, last.tally.deleted - first.tally.deleted
-    yield Row("episodes that ended", last.episodes - first.episodes, "")
-    yield Row("episodes of which all files are verified and deleted", verified, "")
-    yield Row("files of these", last.tally.files - first.tally.files, "")
-    yield Row("errors found in them", int(bool(last.tally.problem)), "")
-    yield Row("size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")
+    yield MeasuredRow("episodes that ended", last.episodes - first.episodes, "")
+    yield MeasuredRow("episodes of which all files are verified and deleted", verified, "")
+    yield MeasuredRow("files of these", last.tally.files - first.tally.files, "")
+    yield MeasuredRow("errors found in them", int(bool(last.tally.problem)), "")
+    yield MeasuredRow("size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")
     # Others may delete files of the same file system meanwhile.
     disk = max(meter.initial_disk, *(reading.disk for reading in meter.readings))
-    yield Row("largest size on disk", 1e-9 * (disk - meter.initial_disk), "GB")
+    yield MeasuredRow("largest size on disk", 1e-9 * (disk - meter.initial_disk), "GB")
 
 
-def measure_trajectories(bench: Bench) -> Iterator[Row]:
+def measure_trajectories(bench: Bench) -> Iterator[MeasuredRow]:
     """World-steps per second and episodes per hour of a bake without pictures in steady state."""
     config = bench.config.with_values({"bake.formats": WITHOUT_PICTURES, "bake.episodes": SPARE_EPISODES * bench.config.bake.worlds})
     worlds = config.bake.worlds
@@ -109,17 +109,17 @@ def _count_frames() -> Iterator[list[int]]:
         yield frames
 
 
-def _summarize_trajectories(config: Config, mean: float, meter: SteadyMeter) -> Iterator[Row]:
+def _summarize_trajectories(config: Config, mean: float, meter: SteadyMeter) -> Iterator[MeasuredRow]:
     """Rows: rates, world-steps of all worlds whether live or not, disk space, and episodes, which have `mean` frames."""
     worlds, physics = config.bake.worlds, config.physics
-    yield Row("worlds", worlds, "")
+    yield MeasuredRow("worlds", worlds, "")
     yield from summarize_rates("frame", meter)
     first, last = meter.readings[0], meter.readings[-1]
     seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
     rate = ticks * physics.steps_per_tick * worlds / seconds
-    yield Row("world-steps", rate, "1/s")
-    yield Row("simulated time: multiple of real time", rate * physics.step, "")
-    yield Row("worlds with a frame in a tick", 100.0 * frames / (ticks * worlds), "%")
-    yield Row("size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
-    yield Row("episodes that ended", last.episodes - first.episodes, "")
-    yield Row(f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")
+    yield MeasuredRow("world-steps", rate, "1/s")
+    yield MeasuredRow("simulated time: multiple of real time", rate * physics.step, "")
+    yield MeasuredRow("worlds with a frame in a tick", 100.0 * frames / (ticks * worlds), "%")
+    yield MeasuredRow("size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
+    yield MeasuredRow("episodes that ended", last.episodes - first.episodes, "")
+    yield MeasuredRow(f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")

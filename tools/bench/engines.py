@@ -21,7 +21,7 @@ from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import make_pipeline, make_solver, may_capture
 from synpick_warp.system.hardware.cores import count_cores
-from tools.options import Row
+from tools.options import MeasuredRow
 from tools.reports.rest import is_inside
 
 LIFT, SPREAD = 0.1, 2.0
@@ -260,7 +260,7 @@ class MujocoEngine:
         return coordinates.reshape(self.worlds, -1, 7)[..., LINEAR], velocities.reshape(self.worlds, -1, 6)[..., LINEAR]
 
 
-def measure_engine(make: Callable[[], Engine], config: Config, pile: EqualPile) -> Iterator[Row]:
+def measure_engine(make: Callable[[], Engine], config: Config, pile: EqualPile) -> Iterator[MeasuredRow]:
     """Rate of an engine while the pile falls and lands; rate and calm at rest. A world-step is `physics.step` of simulated time."""
     engine = make()
 
@@ -269,15 +269,15 @@ def measure_engine(make: Callable[[], Engine], config: Config, pile: EqualPile) 
 
     engine.start(pile.lift())
     worlds = f"{engine.worlds} worlds of {len(pile.entries)} objects"
-    yield Row(f"{engine.name}, {worlds}, falling: world-steps", rate(FALL_STEPS), "1/s")
+    yield MeasuredRow(f"{engine.name}, {worlds}, falling: world-steps", rate(FALL_STEPS), "1/s")
     engine.start(pile)
     engine.run(LEAD_STEPS)
-    yield Row(f"{engine.name}, at rest: world-steps", rate(REST_STEPS), "1/s")
+    yield MeasuredRow(f"{engine.name}, at rest: world-steps", rate(REST_STEPS), "1/s")
     position, velocity = engine.bodies()
     speed = 1e3 * np.linalg.norm(velocity, axis=-1)
-    yield Row(f"{engine.name}, at rest: mean speed", float(speed.mean()), "mm/s")
-    yield Row(f"{engine.name}, at rest: median speed", float(np.median(speed)), "mm/s")
+    yield MeasuredRow(f"{engine.name}, at rest: mean speed", float(speed.mean()), "mm/s")
+    yield MeasuredRow(f"{engine.name}, at rest: median speed", float(np.median(speed)), "mm/s")
     moved = np.linalg.norm(position - pile.pose[:, :3], axis=-1)
-    yield Row(f"{engine.name}, at rest: mean distance from the start", 1e3 * float(moved.mean()), "mm")
+    yield MeasuredRow(f"{engine.name}, at rest: mean distance from the start", 1e3 * float(moved.mean()), "mm")
     inside = is_inside(make_bins(config.cell.bins)[0].sizes, position.reshape(-1, 3)).mean()
-    yield Row(f"{engine.name}, at rest: objects in the tote", 100.0 * float(inside), "%")
+    yield MeasuredRow(f"{engine.name}, at rest: objects in the tote", 100.0 * float(inside), "%")

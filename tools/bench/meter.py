@@ -21,7 +21,7 @@ from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally
-from tools.options import Row
+from tools.options import MeasuredRow
 
 LEAD_TICKS = 2
 """Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
@@ -180,27 +180,27 @@ def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
     return rates
 
 
-def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[Row]:
+def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[MeasuredRow]:
     """Rows of a measurement with at least two readings: rate, its slices, CPU time, and memory at both ends; `unit` is what they count."""
     first, last = meter.readings[0], meter.readings[-1]
     count, seconds = last.count - first.count, last.time - first.time
-    yield Row(f"time to the first {unit}s", meter.first_count, "s")
-    yield Row("measured", seconds, "s")
-    yield Row("a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
-    yield Row(f"{unit}s to disk", count / seconds, "1/s")
+    yield MeasuredRow(f"time to the first {unit}s", meter.first_count, "s")
+    yield MeasuredRow("measured", seconds, "s")
+    yield MeasuredRow("a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
+    yield MeasuredRow(f"{unit}s to disk", count / seconds, "1/s")
     rates = slice_rates(meter.readings, SLICE_SECONDS)
     for name, choose in ((f"median of {len(rates)} times", statistics.median), ("slowest", min), ("fastest", max)) if rates else ():
-        yield Row(f"{unit}s to disk, {name} {SLICE_SECONDS:.0f} s", choose(rates), "1/s")
+        yield MeasuredRow(f"{unit}s to disk, {name} {SLICE_SECONDS:.0f} s", choose(rates), "1/s")
     workers = "writers" if meter.devices == 1 else "writers and devices' processes"
     spent = {workers: last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
     if meter.cleaner:
         spent["verification and deletion"] = last.cleaner.cpu - first.cleaner.cpu
     for name, value in spent.items():
-        yield Row(f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
-    yield Row("cores busy", sum(spent.values()) / seconds, "")
+        yield MeasuredRow(f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
+    yield MeasuredRow("cores busy", sum(spent.values()) / seconds, "")
     for when, reading in (("at the beginning", first), ("at the end", last)):
-        yield Row(f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
-        yield Row(f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
-        yield Row(f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
+        yield MeasuredRow(f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
+        yield MeasuredRow(f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
+        yield MeasuredRow(f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
     if meter.device.is_cuda:
-        yield Row("device memory in use by all processes, first device", last.device / GIB, "GiB")
+        yield MeasuredRow("device memory in use by all processes, first device", last.device / GIB, "GiB")

@@ -28,7 +28,7 @@ from synpick_warp.stages.stream import TickReport, read_tick
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.run import Bench
-from tools.options import Row
+from tools.options import MeasuredRow
 
 ROUNDS = 5
 """Alternations between the two loops of a comparison."""
@@ -85,21 +85,21 @@ class _UnloggedProducer(Producer):
         return
 
 
-def measure_stream(bench: Bench, factory: Factory, report: TickReport) -> Iterator[Row]:
+def measure_stream(bench: Bench, factory: Factory, report: TickReport) -> Iterator[MeasuredRow]:
     """Benchmark of the online generator against the bare renderer, and against the bare loop of simulation and rendering.
 
     `factory`: worlds in the middle of acting, and renderer; `report`: that of the last tick, with the rendered worlds marked as live.
     """
     ring = BatchRing(factory.groups[0], factory.config.render.layers, factory.config.bop.depth_scale)
     parts = (factory, (ring,), Selection().resolve(len(factory.cameras)), BakeSummary(), SilentProgress())
-    yield Row("views in a batch", ring.views, "")
+    yield MeasuredRow("views in a batch", ring.views, "")
     still, ticks = ViewStream(_StillProducer(report, *parts)), ViewStream(_UnloggedProducer(*parts))
     consume = _consumer(bench.device)
     yield from _compare(bench, {"renderer alone": _render_loop(factory, ring, report), "stream of one tick": map(consume, still)})
     yield from _compare(bench, {"simulation and renderer alone": _tick_loop(factory, ring), "stream of ticks": map(consume, ticks)})
 
 
-def _compare(bench: Bench, sources: dict[str, Iterator[int]]) -> Iterator[Row]:
+def _compare(bench: Bench, sources: dict[str, Iterator[int]]) -> Iterator[MeasuredRow]:
     """Rows of the views per second of two sources, which take turns, and of the second's rate in percent of the first's.
 
     `sources`: name -> iterator over the numbers of views that it makes, of which a step is short beside `bench.seconds`.
@@ -112,9 +112,9 @@ def _compare(bench: Bench, sources: dict[str, Iterator[int]]) -> Iterator[Row]:
     if not all(rates.values()):
         return  # All episodes have ended.
     for name, rate in rates.items():
-        yield Row(f"{name}, views", rate, "1/s")
+        yield MeasuredRow(f"{name}, views", rate, "1/s")
     (alone, own), (name, rate) = rates.items()
-    yield Row(f"{name}: of {alone}", 100.0 * rate / own, "%")
+    yield MeasuredRow(f"{name}: of {alone}", 100.0 * rate / own, "%")
 
 
 def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tuple[float, float]:
@@ -184,7 +184,7 @@ def batch_views(report: TickReport, cameras: int, size: int, renderer: Renderer)
 # ---- environment ----
 
 
-def measure_environment(bench: Bench, make: Callable[..., PickingEnvironment] = make_picking) -> Iterator[Row]:
+def measure_environment(bench: Bench, make: Callable[..., PickingEnvironment] = make_picking) -> Iterator[MeasuredRow]:
     """Attempts per second of whole picks, and ticks per second of twists, with and without pictures.
 
     As many worlds as --worlds says pick, four times as many twist. Rates are of steps alone: resets, which simulate piles to rest, are a
@@ -203,8 +203,8 @@ def measure_environment(bench: Bench, make: Callable[..., PickingEnvironment] = 
             environment.step(_sample(environment, random))
             steps += 1
         seconds = time.perf_counter() - started
-        yield Row(f"{name}, {count} worlds", steps * count / seconds, "1/s")
-        yield Row(f"{name}: a reset of all", settled, "s")
+        yield MeasuredRow(f"{name}, {count} worlds", steps * count / seconds, "1/s")
+        yield MeasuredRow(f"{name}: a reset of all", settled, "s")
         del environment
 
 
@@ -223,7 +223,7 @@ def _sample(environment: PickingEnvironment, random: np.random.Generator) -> np.
 # ---- picks ----
 
 
-def measure_picks(bench: Bench) -> Iterator[Row]:
+def measure_picks(bench: Bench) -> Iterator[MeasuredRow]:
     """Labels and world-steps per second of grasp trials, and where time goes.
 
     As many states of first attempts as a batch of a bake has are saved, and their trials run twice; the second run is measured.
@@ -238,11 +238,11 @@ def measure_picks(bench: Bench) -> Iterator[Row]:
     while len(choices) < batch:
         simulation.tick()
         choices += reader.read(read_tick(simulation.record))
-    yield Row("worlds", worlds, "")
-    yield Row("size of a state", 1e-3 * recorder.ring.words.shape[1] * 4, "kB, without contacts")
+    yield MeasuredRow("worlds", worlds, "")
+    yield MeasuredRow("size of a state", 1e-3 * recorder.ring.words.shape[1] * 4, "kB, without contacts")
     started = time.perf_counter()
     engine.run(recorder.ring, choices)
-    yield Row("first run, which loads kernels", time.perf_counter() - started, "s")
+    yield MeasuredRow("first run, which loads kernels", time.perf_counter() - started, "s")
     with timing.record() as times:
         started = time.perf_counter()
         batches = engine.run(recorder.ring, choices)
@@ -250,15 +250,15 @@ def measure_picks(bench: Bench) -> Iterator[Row]:
         seconds = time.perf_counter() - started
     duration, success, hits = (np.concatenate([one.trials[name] for one in batches]) for name in ("duration", "success", "hits"))
     ticks = sum(stage.calls for path, stage in times.times.items() if path[-1] == "judge")
-    yield Row("states", len(choices), "")
-    yield Row("labels", len(duration), "")
-    yield Row("labels/s", len(duration) / seconds, "1/s")
-    yield Row("world-steps", ticks * physics.steps_per_tick * worlds / seconds, "1/s")
-    yield Row("world-steps that trials need", duration.sum() / physics.step / seconds, "1/s")
-    yield Row("ticks of a trial", duration.mean() / physics.tick_time, "")
-    yield Row("ticks of a success", duration[success].mean() / physics.tick_time, "")
-    yield Row("successes", 100.0 * success.mean(), "%")
-    yield Row("trials that hit nothing", 100.0 * (hits == 0).mean(), "%")
+    yield MeasuredRow("states", len(choices), "")
+    yield MeasuredRow("labels", len(duration), "")
+    yield MeasuredRow("labels/s", len(duration) / seconds, "1/s")
+    yield MeasuredRow("world-steps", ticks * physics.steps_per_tick * worlds / seconds, "1/s")
+    yield MeasuredRow("world-steps that trials need", duration.sum() / physics.step / seconds, "1/s")
+    yield MeasuredRow("ticks of a trial", duration.mean() / physics.tick_time, "")
+    yield MeasuredRow("ticks of a success", duration[success].mean() / physics.tick_time, "")
+    yield MeasuredRow("successes", 100.0 * success.mean(), "%")
+    yield MeasuredRow("trials that hit nothing", 100.0 * (hits == 0).mean(), "%")
     for path, stage in times.times.items():
         if len(path) < 4:
-            yield Row("time: " + ": ".join(path), stage.device if device.is_cuda else stage.host, "s")
+            yield MeasuredRow("time: " + ": ".join(path), stage.device if device.is_cuda else stage.host, "s")

@@ -30,7 +30,7 @@ from tools.bench.engines import CONES, Engine, MujocoEngine, make_mujoco_warp, m
 from tools.bench.ray_scene import RayScene
 from tools.bench.run import FOREVER, Bench
 from tools.bench.sensor import SensorScene, build_sensor_scene, compare_hits
-from tools.options import Row, of_part
+from tools.options import MeasuredRow, of_part
 
 PEERS: Mapping[str, tuple[str, ...]] = {"mujoco-warp": ("mujoco", "mujoco_warp"), "mujoco": ("mujoco",), "sensor-camera": ()}
 """Peers, and the modules that they import besides those of the product."""
@@ -60,7 +60,7 @@ def check_installed(peers: tuple[str, ...]) -> None:
         raise SynpickError(f"--compare {','.join(peers)} needs {' and '.join(missing)}: pip install 'synpick-warp[peers]'")
 
 
-def measure_peers(bench: Bench, peers: tuple[str, ...]) -> Iterator[Row]:
+def measure_peers(bench: Bench, peers: tuple[str, ...]) -> Iterator[MeasuredRow]:
     """Benchmark of peers out of `PEERS` beside ours; a peer that fails costs its own rows alone.
 
     Images have `cameras.resolution`, in as many worlds as make a batch, and SMALL_SIZE, in many; physics runs in `bake.worlds` worlds.
@@ -73,7 +73,7 @@ def measure_peers(bench: Bench, peers: tuple[str, ...]) -> Iterator[Row]:
     for _ in range(worlds.FALL_TICKS + worlds.SETTLE_TICKS):
         simulation.tick()
     pile = pick_pile(factory.catalog, simulation.record.snapshot)
-    yield Row(f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s", part="setup")
+    yield MeasuredRow(f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s", part="setup")
     cameras, small = factory.cameras, make_cameras(Rig.of(replace(config.cameras, resolution=SMALL_SIZE)))
     sizes = (
         (cameras, max(1, factory.stream.rings[0].batch // len(cameras))),
@@ -95,16 +95,16 @@ def measure_peers(bench: Bench, peers: tuple[str, ...]) -> Iterator[Row]:
             yield from _guard(peer, measure_engine(partial(make, cone), config, pile))
 
 
-def _guard(part: str, rows: Iterator[Row]) -> Iterator[Row]:
+def _guard(part: str, rows: Iterator[MeasuredRow]) -> Iterator[MeasuredRow]:
     """Rows of a peer; if it raises an exception, a last row with the reason."""
     try:
         yield from of_part(part, rows)
     except Exception as error:
         reason = (str(error).splitlines() or [""])[0]
-        yield Row(f"failed: {type(error).__name__}: {reason}", math.nan, part=part)
+        yield MeasuredRow(f"failed: {type(error).__name__}: {reason}", math.nan, part=part)
 
 
-def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple[Camera, ...], count_worlds: int) -> Iterator[Row]:
+def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple[Camera, ...], count_worlds: int) -> Iterator[MeasuredRow]:
     """Benchmark of a peer's renderer and of ours with images of these cameras; worlds beyond the factory's show its piles again.
 
     Both update poses and render all views. On CUDA both launch without waiting, so that launch overhead is hidden.
@@ -114,7 +114,7 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
     snapshot = tile_snapshot(factory.simulation.record.snapshot, count_worlds, device)
     count, pixels = count_worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {count_worlds:,} world{'' if count_worlds == 1 else 's'}"
-    yield Row(f"{size}: views in a batch", count, "")
+    yield MeasuredRow(f"{size}: views in a batch", count, "")
     fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     theirs = build(config.render, factory.catalog, fixtures, cameras, table, snapshot, count, device)
     renderer, unoccluded = (_make_views_of(factory, mode, cameras, count) for mode in (config.render.mode, UNOCCLUDED))
@@ -144,9 +144,9 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
         (f"{plain} {rest}", time_view(partial(unoccluded.render, snapshot, views, out)), colored, theirs_color),
     ):
         for label, time_of_view in ((f"{size}, ours: {ours}", seconds), (f"{size}, {name}: {outputs}", their_seconds)):
-            yield Row(f"{label}: views", 1.0 / time_of_view, "1/s")
-            yield Row(f"{label}: pixels", 1e-6 * pixels / time_of_view, "Mpx/s")
-        yield Row(f"{size}: rate of ours ({ours}) over {name}'s ({outputs})", their_seconds / seconds, "")
+            yield MeasuredRow(f"{label}: views", 1.0 / time_of_view, "1/s")
+            yield MeasuredRow(f"{label}: pixels", 1e-6 * pixels / time_of_view, "Mpx/s")
+        yield MeasuredRow(f"{size}: rate of ours ({ours}) over {name}'s ({outputs})", their_seconds / seconds, "")
 
 
 def tile_snapshot(snapshot: Snapshot, count: int, device: wp.Device) -> Snapshot:

@@ -30,7 +30,7 @@ from synpick_warp.stages.stream import FrameStream, TickReport, read_tick
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.online import batch_views
 from tools.bench.run import LIVE_FRACTION, SPARE_EPISODES, Bench
-from tools.options import Row
+from tools.options import MeasuredRow
 
 HISTORY_TICKS = 24
 """Ticks rendered before the measurement. Where nothing moves, a coarse pixel traces its 2nd path in the next frame, 2 more in every second
@@ -76,7 +76,7 @@ def light_history(renderer: Renderer) -> Any:
     return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
 
 
-def measure_pictures(bench: Bench) -> Iterator[Row]:
+def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
     """Simulate, keep and render ticks: rows of counts, and of the rates with `render.history` as set, and with 0.
 
     More device memory is needed than for a bake: for a copy of the histories, the kept snapshots, and the scratch arrays of a second
@@ -94,27 +94,27 @@ def measure_pictures(bench: Bench) -> Iterator[Row]:
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
     views = sum(tick.views for tick in ticks)
     wp.synchronize_device(stream.device)
-    yield Row(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
-    yield Row("ticks in a pass", len(ticks), "")
-    yield Row("views in a pass", views, "")
-    yield Row("views in a batch", ring.batch, "")
+    yield MeasuredRow(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
+    yield MeasuredRow("ticks in a pass", len(ticks), "")
+    yield MeasuredRow("views in a pass", views, "")
+    yield MeasuredRow("views in a batch", ring.batch, "")
     if views == 0:
         return  # All episodes have ended.
     renderers = {"all stages": ring.renderer}
     history = light_history(ring.renderer)
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
-        yield Row("paths in a history before a pass, mean", float(paths.mean()), "")
+        yield MeasuredRow("paths in a history before a pass, mean", float(paths.mean()), "")
         without = config.with_values({"render.history": 0})
         renderers["all stages, render.history=0"] = make_renderer(without, ring.renderer.scene, ring.instances, ring.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
-        yield Row(f"{name}: views, median of {len(times)} passes", rate, "1/s")
-        yield Row(f"{name}: views, slowest pass", views / max(times), "1/s")
-        yield Row(f"{name}: views, fastest pass", views / min(times), "1/s")
-        yield Row(f"{name}: pixels", megapixels * rate, "Mpx/s")
-        yield Row(f"{name}: a view", 1e3 / rate, "ms")
+        yield MeasuredRow(f"{name}: views, median of {len(times)} passes", rate, "1/s")
+        yield MeasuredRow(f"{name}: views, slowest pass", views / max(times), "1/s")
+        yield MeasuredRow(f"{name}: views, fastest pass", views / min(times), "1/s")
+        yield MeasuredRow(f"{name}: pixels", megapixels * rate, "Mpx/s")
+        yield MeasuredRow(f"{name}: a view", 1e3 / rate, "ms")
 
 
 def simulate_until_live(factory: Factory) -> None:

@@ -45,7 +45,7 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.run import BURST, FOREVER, Bench, seconds_per_call
 from tools.bench.worlds import measure_perception
-from tools.options import Row
+from tools.options import MeasuredRow
 
 FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "paths": (1, 2, 4), "cameras": (1 / 3, 2.0)}
 """Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
@@ -164,7 +164,7 @@ def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, 
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
 
 
-def measure_growth(bench: Bench) -> Iterator[Row]:
+def measure_growth(bench: Bench) -> Iterator[MeasuredRow]:
     """Measure the settings themselves, then each factor's values; or physics alone of `bench.instances` like parts."""
     started, config = time.perf_counter(), bench.config
     if bench.instances:
@@ -180,16 +180,16 @@ def measure_growth(bench: Bench) -> Iterator[Row]:
                 other = varied.build_scene() if factor in ("resolution", "cameras") else scene
                 dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
                 yield from _rows(f"{factor} {value}", varied.steps, dropped, varied.time_view(other, dropped or pile))
-    yield Row("all measurements", time.perf_counter() - started, "s")
+    yield MeasuredRow("all measurements", time.perf_counter() - started, "s")
 
 
-def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[Row]:
+def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[MeasuredRow]:
     """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
     if pile is not None:
-        yield Row(f"{name}: objects a tote", pile.objects)
-        yield Row(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")
-        yield Row(f"{name}: world-steps", steps / pile.seconds, "1/s")
-    yield Row(f"{name}: a view", 1e3 * view, "ms")
+        yield MeasuredRow(f"{name}: objects a tote", pile.objects)
+        yield MeasuredRow(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")
+        yield MeasuredRow(f"{name}: world-steps", steps / pile.seconds, "1/s")
+    yield MeasuredRow(f"{name}: a view", 1e3 * view, "ms")
 
 
 # ---- growth by instances ----
@@ -202,7 +202,7 @@ def number_settings(counts: Counts, number: int) -> dict[str, Any]:
     return {"bake.mode": "move"} | fill | ({} if counts else {"objects.embedded": ("industrial",)})
 
 
-def _measure_instances(bench: Bench) -> Iterator[Row]:
+def _measure_instances(bench: Bench) -> Iterator[MeasuredRow]:
     """Time of a tick, contacts and memory of piles of like parts in the same bin, DROP_TICKS after the drop, while nearly all lie, and as
     soon as all rest.
 
@@ -216,23 +216,23 @@ def _measure_instances(bench: Bench) -> Iterator[Row]:
         yield from _measure_like_parts(Variant(fitted, catalog, (), device, bench.seconds))
 
 
-def _measure_like_parts(pile: Variant) -> Iterator[Row]:
+def _measure_like_parts(pile: Variant) -> Iterator[MeasuredRow]:
     """Rows of landing and resting parts, of contacts and of memory."""
     config, worlds, before = pile.config, pile.config.bake.worlds, _memory_in_use(pile.device)
     simulation, name = pile.simulate(None), f"{pile.config.arrangement.max_objects} instances"
     for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
         seconds = pile.time_ticks(simulation, ticks)
-        yield Row(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
-        yield Row(f"{name}, {state}: world-steps", pile.steps / seconds, "1/s")
-        yield Row(f"{name}, {state}: part-steps", pile.steps * config.arrangement.max_objects / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
+        yield MeasuredRow(f"{name}, {state}: world-steps", pile.steps / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: part-steps", pile.steps * config.arrangement.max_objects / seconds, "1/s")
     own = simulation.physics
     for what, array in (("contacts", own.contacts.rigid_contact_count), ("overlaps", own.overlap_count)):
-        yield Row(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
-    yield Row(f"{name}: worlds without overflow", 100.0 * float(np.mean(~own.solver.constraint_overflow.numpy()[:-1])), "%")
-    yield Row(f"{name}: memory of the physics", (_memory_in_use(pile.device) - before) / GIB, "GiB")
+        yield MeasuredRow(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
+    yield MeasuredRow(f"{name}: worlds without overflow", 100.0 * float(np.mean(~own.solver.constraint_overflow.numpy()[:-1])), "%")
+    yield MeasuredRow(f"{name}: memory of the physics", (_memory_in_use(pile.device) - before) / GIB, "GiB")
     pieces = max(len(pile.catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, pile.catalog))
     terms = [term for term in plan_memory(config, pile.device, 0, pieces) if term.name.startswith(("Newton", "the state", "separating"))]
-    yield Row(f"{name}: memory planned for it, at least", sum(term.size for term in terms) / GIB, "GiB")
+    yield MeasuredRow(f"{name}: memory planned for it, at least", sum(term.size for term in terms) / GIB, "GiB")
 
 
 def _memory_in_use(device: wp.Device) -> int:
@@ -246,7 +246,7 @@ def _memory_in_use(device: wp.Device) -> int:
 # ---- heaps ----
 
 
-def measure_heaps(bench: Bench) -> Iterator[Row]:
+def measure_heaps(bench: Bench) -> Iterator[MeasuredRow]:
     """Measure perception of heaps of INSTANCES: objects in random poses, which may overlap. Nothing is simulated, so that any number is
     quick."""
     worlds = min(bench.config.bake.worlds, HEAP_WORLDS)
@@ -268,8 +268,8 @@ def measure_heaps(bench: Bench) -> Iterator[Row]:
             yield replace(row, name=f"{count} instances: {row.name}")
         seen = perception.images.views.world.numpy()
         visible, above = (getattr(record.observation, name).numpy()[seen] for name in ("visible", "above"))
-        yield Row(f"{count} instances: visible", float((visible > 0).sum() / len(seen)))
-        yield Row(f"{count} instances: edges of the clutter graph", float(np.bitwise_count(above).sum() / len(seen)))
+        yield MeasuredRow(f"{count} instances: visible", float((visible > 0).sum() / len(seen)))
+        yield MeasuredRow(f"{count} instances: edges of the clutter graph", float(np.bitwise_count(above).sum() / len(seen)))
 
 
 def heap(catalog: Catalog, floor: tuple[float, ...], seed: int, worlds: int, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -291,7 +291,7 @@ def heap(catalog: Catalog, floor: tuple[float, ...], seed: int, worlds: int, cou
 # ---- replacements of Newton's parts ----
 
 
-def measure_patches(bench: Bench) -> Iterator[Row]:
+def measure_patches(bench: Bench) -> Iterator[MeasuredRow]:
     """Rates of physics in mode move with all replacements (`newton_patches`), without each, without any, and with all once more.
 
     The same piles fall, come to rest and are stirred in every run, since all variants find the same contacts.
@@ -304,7 +304,7 @@ def measure_patches(bench: Bench) -> Iterator[Row]:
             for function, own in map(NEWTONS_OWN.__getitem__, left_out):
                 stack.enter_context(mock.patch.object(physics, function, own))
             seconds = _time_stirring(Simulation(config, catalog, 1, bench.device))
-        yield Row(f"{name}: world-steps", TICKS * config.physics.steps_per_tick * config.bake.worlds / seconds, "1/s")
+        yield MeasuredRow(f"{name}: world-steps", TICKS * config.physics.steps_per_tick * config.bake.worlds / seconds, "1/s")
 
 
 def _time_stirring(simulation: Simulation) -> float:

@@ -17,7 +17,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Render
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import Snapshot
-from tools.options import Row
+from tools.options import MeasuredRow
 
 ORDERS = (
     SensorCamera.RenderConfig(),
@@ -158,7 +158,9 @@ def newton_mesh(mesh: TriangleMesh, material: Material) -> newton.Mesh:
     return _Mesh(mesh.vertices, mesh.faces.reshape(-1), normals=mesh.normals, uvs=uvs, texture=material.texture, compute_inertia=False)
 
 
-def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float) -> list[Row]:
+def compare_hits(
+    ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float
+) -> list[MeasuredRow]:
     """Agreement of another renderer with ours in segmentation and depth.
 
     Args:
@@ -174,7 +176,7 @@ def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment:
     close = same & (difference <= DEPTH_TOLERANCE)
     largest = float(difference[same].max()) * scale if same.any() else 0.0
     return [
-        Row("pixels with the same instance in both", 100.0 * float(same.mean()), "%"),
-        Row(f"pixels with the same instance and depth within {DEPTH_TOLERANCE * scale:g} mm", 100.0 * float(close.mean()), "%"),
-        Row("largest difference of depths of the same instance", largest, "mm"),
+        MeasuredRow("pixels with the same instance in both", 100.0 * float(same.mean()), "%"),
+        MeasuredRow(f"pixels with the same instance and depth within {DEPTH_TOLERANCE * scale:g} mm", 100.0 * float(close.mean()), "%"),
+        MeasuredRow("largest difference of depths of the same instance", largest, "mm"),
     ]

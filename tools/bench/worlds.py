@@ -32,7 +32,7 @@ from synpick_warp.system.progress import SilentProgress
 from tools.bench import run
 from tools.bench.online import measure_stream
 from tools.bench.run import FOREVER, Bench, Stopwatch
-from tools.options import Row, of_part
+from tools.options import MeasuredRow, of_part
 
 FALL_TICKS, SETTLE_TICKS = 4, 60
 """Ticks from the drop until the first objects land, and from there until piles are at rest (4 s at 15 Hz)."""
@@ -46,13 +46,13 @@ CPU_VIEWS = 6
 """Number of views that are encoded on the CPU."""
 
 
-def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
+def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[MeasuredRow]:
     """Measure the parts physics, perception, render, encode and stream of these, in this order."""
     started = time.perf_counter()
     factory = build_factory(bench.config, SilentProgress(), needs_images=Needs.of(bench.config).images)
     simulation, device = factory.simulation, factory.simulation.device
     wp.synchronize_device(device)
-    yield Row("load and build", time.perf_counter() - started, "s", part="setup")
+    yield MeasuredRow("load and build", time.perf_counter() - started, "s", part="setup")
     yield from of_part("physics", _measure_simulation(bench, simulation, parts))
     if simulation.perception is not None and "perception" in parts:
         yield from of_part("perception", measure_perception(simulation.perception, simulation.record.snapshot, device, bench.seconds))
@@ -66,12 +66,12 @@ def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[Row]:
     yield _memory_in_use(device)
 
 
-def _memory_in_use(device: wp.Device) -> Row:
+def _memory_in_use(device: wp.Device) -> MeasuredRow:
     """Row of the device memory in use by all processes; on the CPU, of the process's peak memory."""
     if device.is_cuda:
-        return Row("device memory in use by all processes", (device.total_memory - device.free_memory) / GIB, "GiB", part="setup")
+        return MeasuredRow("device memory in use by all processes", (device.total_memory - device.free_memory) / GIB, "GiB", part="setup")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return Row("peak memory of the process", peak / 1024**2, "GiB", part="setup")
+    return MeasuredRow("peak memory of the process", peak / 1024**2, "GiB", part="setup")
 
 
 def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
@@ -84,7 +84,7 @@ def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
 # ---- physics ----
 
 
-def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, ...]) -> Iterator[Row]:
+def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, ...]) -> Iterator[MeasuredRow]:
     """Benchmark of all phases of an episode: drop, settle, let act; measures `parts` (physics, perception) on the way.
 
     The state at the end is that of worlds in the middle of acting, as the benchmark of rendering needs it.
@@ -95,7 +95,7 @@ def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, 
     started = time.perf_counter()
     _simulate(simulation, FALL_TICKS)
     wp.synchronize_device(simulation.device)
-    yield Row(f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s", part="setup")
+    yield MeasuredRow(f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s", part="setup")
     if measured:
         yield from _tick_rates(simulation, bench.seconds_per_call(tick), "falling and landing")
     _simulate(simulation, SETTLE_TICKS)
@@ -120,9 +120,9 @@ def _measure_simulation(bench: Bench, simulation: Simulation, parts: tuple[str, 
             yield from (row for row in of_part("physics", _measure_picking(simulation, pile_seconds)) if row.part in parts)
     if measured:
         acting = float((simulation.state.phase.numpy() == Phase.ACT).mean())
-        yield Row("worlds that act", 100.0 * acting, "%")
+        yield MeasuredRow("worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
-        yield Row("contacts per world", contacts / simulation.layout.worlds, "")
+        yield MeasuredRow("contacts per world", contacts / simulation.layout.worlds, "")
 
 
 def _simulate(simulation: Simulation, ticks: int) -> None:
@@ -130,14 +130,14 @@ def _simulate(simulation: Simulation, ticks: int) -> None:
         simulation.tick()
 
 
-def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[Row]:
+def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[MeasuredRow]:
     """Rows of time and rates of ticks that take `seconds` each in a state of the worlds."""
     steps = simulation.config.physics.steps_per_tick
-    yield Row(f"{state}: world-steps", steps * simulation.layout.worlds / seconds, "1/s")
-    yield Row(f"{state}: a step of all worlds", 1e3 * seconds / steps, "ms")
+    yield MeasuredRow(f"{state}: world-steps", steps * simulation.layout.worlds / seconds, "1/s")
+    yield MeasuredRow(f"{state}: a step of all worlds", 1e3 * seconds / steps, "ms")
 
 
-def _measure_tick_parts(bench: Bench, simulation: Simulation) -> Iterator[Row]:
+def _measure_tick_parts(bench: Bench, simulation: Simulation) -> Iterator[MeasuredRow]:
     """Breakdown of a tick: physics steps, everything else, launch overhead, collision detection."""
     physics, tick = simulation.physics, simulation.tick
     watch, calls = Stopwatch(simulation.device), 0
@@ -151,10 +151,10 @@ def _measure_tick_parts(bench: Bench, simulation: Simulation) -> Iterator[Row]:
     with mock.patch.object(physics, "tick_parts", side_effect=lambda *_: iter(())):
         outside = bench.seconds_per_call(tick, 0.25)
     collide = _capture_graph(lambda: physics.pipeline.collide(physics.state, physics.contacts), simulation.device)
-    yield Row("a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
-    yield Row("a tick: everything but physics steps", 1e3 * outside, "ms")
-    yield Row("a tick: host time to launch it", 1e3 * host, "ms")
-    yield Row("a collision detection of all worlds", 1e3 * bench.seconds_per_call(collide, 0.25), "ms")
+    yield MeasuredRow("a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
+    yield MeasuredRow("a tick: everything but physics steps", 1e3 * outside, "ms")
+    yield MeasuredRow("a tick: host time to launch it", 1e3 * host, "ms")
+    yield MeasuredRow("a collision detection of all worlds", 1e3 * bench.seconds_per_call(collide, 0.25), "ms")
 
 
 def _capture_graph(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
@@ -184,7 +184,7 @@ def _measure_pile_steps(bench: Bench, simulation: Simulation) -> float:
     return seconds
 
 
-def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Row]:
+def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[MeasuredRow]:
     """Benchmark of ticks in which worlds pick, and of their perception.
 
     Args:
@@ -211,18 +211,18 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
     yield from _tick_rates(simulation, tick, "picking")
     yield from _tick_rates(simulation, steps, "picking, steps alone")
     if pile_seconds:
-        yield Row("picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
+        yield MeasuredRow("picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
     for name, count in (("act", acting), ("have an object attached", attached)):
-        yield Row(f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
-    yield Row("worlds perceived a tick", perceptions / PICK_TICKS, part="perception")
-    yield Row("perception and planning, a tick", 1e3 * perceive, "ms", part="perception")
-    yield Row("perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%", part="perception")
+        yield MeasuredRow(f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
+    yield MeasuredRow("worlds perceived a tick", perceptions / PICK_TICKS, part="perception")
+    yield MeasuredRow("perception and planning, a tick", 1e3 * perceive, "ms", part="perception")
+    yield MeasuredRow("perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%", part="perception")
 
 
 # ---- perception ----
 
 
-def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.Device, min_seconds: float) -> Iterator[Row]:
+def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.Device, min_seconds: float) -> Iterator[MeasuredRow]:
     """Measure perception and planning by stage, in full batches of worlds that all look, for at least `min_seconds` [s]."""
     perception.state.phase.fill_(Phase.ACT)
     perception.attempts.task.fill_(Task.LOOK)
@@ -246,31 +246,31 @@ def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.De
             perceive_batch()
             calls += 1
     views = perception.images.views.count
-    yield Row("views in a batch", views, "")
+    yield MeasuredRow("views in a batch", views, "")
     for name in (*names, graph):
-        yield Row(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
-    yield Row("a view", 1e3 * sum(map(watch.seconds, names)) / (calls * views), "ms")
+        yield MeasuredRow(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
+    yield MeasuredRow("a view", 1e3 * sum(map(watch.seconds, names)) / (calls * views), "ms")
 
 
-def _perception_fraction(bench: Bench) -> Iterator[Row]:
+def _perception_fraction(bench: Bench) -> Iterator[MeasuredRow]:
     """Fraction of perception and planning in a tick in which all worlds pick and are rendered, if all of these were measured."""
     names = ("perception and planning, a tick", "picking: a step of all worlds", "views, all stages")
     perceive, step, rate = map(bench.values.get, names)
     if perceive is not None and step and rate:
         render = 1e3 * bench.config.bake.worlds * len(bench.config.rig) / rate
         fraction = perceive / (step * bench.config.physics.steps_per_tick + render)
-        yield Row("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
+        yield MeasuredRow("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
 
 
 # ---- rendering and encoders ----
 
 
-def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[Row]:
+def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:
     """Benchmark of rendering: each stage of a view, a whole batch, copies to the host, and batches with copies overlapped."""
     simulation, stream, ring = factory.simulation, factory.stream, factory.stream.rings[0]
     device, cameras = simulation.device, len(factory.cameras)
     count = min(ring.batch, simulation.layout.worlds * cameras)
-    yield Row("views in a batch", count, "")
+    yield MeasuredRow("views in a batch", count, "")
     views = first_views(count, cameras, ring.renderer.instances, device)
 
     def render() -> None:
@@ -279,9 +279,9 @@ def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[Row]:
     spent = {name: seconds / count for name, seconds in _time_passes(render, device, bench.seconds).items()}
     spent["all"] = bench.seconds_per_call(render, 0.25) / count
     for name, seconds in spent.items():
-        yield Row(f"a view: {name}", 1e3 * seconds, "ms")
-    yield Row("views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
-    yield Row("views, all stages", 1.0 / spent["all"], "1/s")
+        yield MeasuredRow(f"a view: {name}", 1e3 * seconds, "ms")
+    yield MeasuredRow("views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
+    yield MeasuredRow("views, all stages", 1.0 / spent["all"], "1/s")
     if device.is_cuda:
         size = sum(array.capacity for array in ring.copies[0].source)
 
@@ -290,12 +290,12 @@ def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[Row]:
             ring.copies[0].wait()
 
         seconds = bench.seconds_per_call(copy, 0.25, 1)
-        yield Row("copy to the host", 1e-9 * size / seconds, "GB/s")
-        yield Row("views copied to the host", ring.batch / seconds, "1/s")
+        yield MeasuredRow("copy to the host", 1e-9 * size / seconds, "GB/s")
+        yield MeasuredRow("views copied to the host", ring.batch / seconds, "1/s")
     worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * ring.batch // cameras))
     report = _mark_live(simulation, worlds)
     seconds = bench.seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], 1.0, 1)
-    yield Row("views, all stages and copies", worlds * cameras / seconds, "1/s")
+    yield MeasuredRow("views, all stages and copies", worlds * cameras / seconds, "1/s")
 
 
 def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: float) -> dict[str, float]:
@@ -312,7 +312,7 @@ def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: flo
     return {": ".join(path): (stage.device if device.is_cuda else stage.host) / stage.calls for path, stage in times}
 
 
-def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[Row]:
+def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:
     """Benchmark of the image encoders: colour as JPEG and depth as PNG, on the device, and on a core of the CPU for comparison."""
     ring, simulation, quality = factory.stream.rings[0], factory.simulation, factory.config.bop.jpeg_quality
     device, images = simulation.device, ring.slots[0].images
@@ -326,11 +326,11 @@ def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[Row]:
         ("depth PNG", depth, depth_out.depth_idat_size, depth_out.depth_idat, lambda view: encode_png(depths[view])),
     )
     for name, encode, sizes, data, encode_on_cpu in runs:
-        yield Row(f"a view: {name}", 1e3 * bench.seconds_per_call(encode) / count, "ms")
+        yield MeasuredRow(f"a view: {name}", 1e3 * bench.seconds_per_call(encode) / count, "ms")
         bytes_ = sizes.numpy()[:count]
-        yield Row(f"{name}: size", 1e-6 * float(bytes_.mean()), "MB")
-        yield Row(f"{name}: largest size, of its capacity", 100.0 * float(bytes_.max()) / data.shape[1], "%")
-        yield Row(f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode_on_cpu, len(depths)), "ms")
+        yield MeasuredRow(f"{name}: size", 1e-6 * float(bytes_.mean()), "MB")
+        yield MeasuredRow(f"{name}: largest size, of its capacity", 100.0 * float(bytes_.max()) / data.shape[1], "%")
+        yield MeasuredRow(f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode_on_cpu, len(depths)), "ms")
 
 
 def _jpeg_encoder(images: ViewBuffers, quality: int, count: int, device: wp.Device) -> tuple[Callable[[], None], JpegBuffers]:

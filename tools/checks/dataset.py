@@ -24,7 +24,7 @@ import trimesh
 
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.configs.files.load import load_config
-from tools.checks.measures import Measure, UnusableError, run_check
+from tools.checks.measures import MeasuredValue, UnusableError, run_check
 
 DEPTH_TOLERANCE = 0.2
 """Largest allowed difference between a depth image and the models [mm]."""
@@ -38,15 +38,15 @@ CHUNK = 2_000_000
 class Report:
     """Measures of the check, one for each bounded quantity."""
 
-    rotation: Measure = field(default_factory=lambda: Measure("rotations: deviation from orthonormal", "", 1e-9))
-    world: Measure = field(default_factory=lambda: Measure("position of an instance, camera against camera", "mm", 1e-3))
-    depth: Measure = field(default_factory=lambda: Measure("depth against models, inside", "mm", DEPTH_TOLERANCE))
-    border: Measure = field(default_factory=lambda: Measure("depth against models, borders beyond tolerance", "% of px", 0.05))
-    unknown: Measure = field(default_factory=lambda: Measure("visible instance without depth", "% of px", 0))
-    mask: Measure = field(default_factory=lambda: Measure("mask against models", "% of px", 0.05))
-    visible: Measure = field(default_factory=lambda: Measure("mask_visib against models and depth", "% of px", 0.05))
-    count_all: Measure = field(default_factory=lambda: Measure("px_count_all against models, beyond 2 px and 0.1 %", "px", 0))
-    box_amodal: Measure = field(default_factory=lambda: Measure("bbox_obj against models", "px", 1))
+    rotation: MeasuredValue = field(default_factory=lambda: MeasuredValue("rotations: deviation from orthonormal", "", 1e-9))
+    world: MeasuredValue = field(default_factory=lambda: MeasuredValue("position of an instance, camera against camera", "mm", 1e-3))
+    depth: MeasuredValue = field(default_factory=lambda: MeasuredValue("depth against models, inside", "mm", DEPTH_TOLERANCE))
+    border: MeasuredValue = field(default_factory=lambda: MeasuredValue("depth against models, borders beyond tolerance", "% of px", 0.05))
+    unknown: MeasuredValue = field(default_factory=lambda: MeasuredValue("visible instance without depth", "% of px", 0))
+    mask: MeasuredValue = field(default_factory=lambda: MeasuredValue("mask against models", "% of px", 0.05))
+    visible: MeasuredValue = field(default_factory=lambda: MeasuredValue("mask_visib against models and depth", "% of px", 0.05))
+    count_all: MeasuredValue = field(default_factory=lambda: MeasuredValue("px_count_all against models, beyond 2 px and 0.1 %", "px", 0))
+    box_amodal: MeasuredValue = field(default_factory=lambda: MeasuredValue("bbox_obj against models", "px", 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +185,7 @@ def check_world(scenes: list[Path], frame: str, report: Report) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CheckedView:
     """Files of one view, and the silhouettes of its instances by ray casting."""
 
     where: str
@@ -199,7 +199,7 @@ class View:
     silhouettes: list[Silhouette]
 
 
-def read_view(scene: Path, frame: str) -> View:
+def read_view(scene: Path, frame: str) -> CheckedView:
     """Read one view, and cast rays at its instances."""
     camera = read_json(scene / "scene_camera.json")[frame]
     stem = f"{int(frame):06d}"
@@ -217,7 +217,7 @@ def read_view(scene: Path, frame: str) -> View:
         paths = [scene / name / f"{stem}_{index:06d}.png" for index in range(len(records))] if (scene / name).is_dir() else []
         images[name] = np.array([read_image(path) > 0 for path in paths]).reshape(len(paths), height, width)
     depth = np.where(counts > 0, counts * float(camera["depth_scale"]), np.inf)
-    return View(
+    return CheckedView(
         f"{scene.name} image {frame}",
         read_json(scene / "scene_gt_info.json")[frame],
         depth,
@@ -227,7 +227,7 @@ def read_view(scene: Path, frame: str) -> View:
     )
 
 
-def check_images(view: View, report: Report) -> None:
+def check_images(view: CheckedView, report: Report) -> None:
     """Check depth and masks against the models."""
     inside = np.array([silhouette.crop(*view.depth.shape) for silhouette in view.silhouettes])
     if not len(inside):
@@ -252,7 +252,7 @@ def check_images(view: View, report: Report) -> None:
         report.visible.add_pixels(visible ^ expected[index], visible, view.where)
 
 
-def check_info(view: View, report: Report) -> None:
+def check_info(view: CheckedView, report: Report) -> None:
     """Check scene_gt_info against models."""
     for index, (info, silhouette) in enumerate(zip(view.infos, view.silhouettes, strict=True)):
         where = f"{view.where} instance {index}"

@@ -18,7 +18,7 @@ class UnusableError(Exception):
 
 
 @dataclass
-class Measure:
+class MeasuredValue:
     """Bounded quantity: the largest magnitude of all values (`update_max`), or the percentage of bad pixels (`add_pixels`)."""
 
     name: str
@@ -56,7 +56,7 @@ class Measure:
         return self.worst <= self.allowed
 
 
-def print_measures(measures: Iterable[Measure]) -> bool:
+def print_measures(measures: Iterable[MeasuredValue]) -> bool:
     """Print the table of all quantities; returns whether all bounds hold."""
     held = True
     print(f"{'quantity':<60} {'measured':>12} {'allowed':>9} {'unit':<8} {'count':>10}  worst case")
@@ -69,7 +69,7 @@ def print_measures(measures: Iterable[Measure]) -> bool:
 
 
 def run_check(
-    doc: str | None, samples: str, default: int, check: Callable[[Path, int], Mapping[str, Measure]], needed: Iterable[str]
+    doc: str | None, samples: str, default: int, check: Callable[[Path, int], Mapping[str, MeasuredValue]], needed: Iterable[str]
 ) -> int:
     """Run the command line of a check; returns the exit code.
 

@@ -23,24 +23,24 @@ LOADS, WARNS, REFUSES, FAILS = KINDS = ("loads", "warns", "refuses", "fails")
 """Outcomes; the last is a fault of the program: a traceback, a crash or a time-out."""
 
 
-class Outcome(NamedTuple):
+class MeshOutcome(NamedTuple):
     """Outcome of reading a mesh file: its kind, and the message."""
 
     kind: str
     text: str
 
 
-def read(file: Path) -> Outcome:
+def read(file: Path) -> MeshOutcome:
     """Read a mesh file as the catalog does, in metres and centred; returns whether it loads, warns, is refused or fails."""
     said: list[str] = []
     try:
         read_mesh(file, 1.0, MeshOptions(center=True), said.append)
     except SynpickError as error:
-        return Outcome(REFUSES, str(error))
+        return MeshOutcome(REFUSES, str(error))
     except Exception as error:
-        return Outcome(FAILS, repr(error))
+        return MeshOutcome(FAILS, repr(error))
     said = [line for line in said if ": centred: moved by" not in line or ";" in line]
-    return Outcome(WARNS if said else LOADS, " ".join(said))
+    return MeshOutcome(WARNS if said else LOADS, " ".join(said))
 
 
 def _send(file: Path, pipe: Any) -> None:
@@ -48,7 +48,7 @@ def _send(file: Path, pipe: Any) -> None:
     pipe.send(read(file))
 
 
-def read_apart(file: Path, seconds: float) -> Outcome:
+def read_apart(file: Path, seconds: float) -> MeshOutcome:
     """Read a file in a child process."""
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
@@ -56,9 +56,9 @@ def read_apart(file: Path, seconds: float) -> Outcome:
     child.start()
     sender.close()
     try:
-        return receiver.recv() if receiver.poll(seconds) else Outcome(FAILS, f"not read within {seconds:g} s")
+        return receiver.recv() if receiver.poll(seconds) else MeshOutcome(FAILS, f"not read within {seconds:g} s")
     except EOFError:
-        return Outcome(FAILS, f"its reader ended with code {child.exitcode}")
+        return MeshOutcome(FAILS, f"its reader ended with code {child.exitcode}")
     finally:
         child.kill()
         child.join()

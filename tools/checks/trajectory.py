@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from tools.checks.measures import Measure, UnusableError, run_check
+from tools.checks.measures import MeasuredValue, UnusableError, run_check
 
 STORE = "trajectory.zarr"
 MAX_SPEED = 5.0
@@ -27,23 +27,23 @@ MAX_SPEED_FRACTION = 0.95
 """Objects above this fraction of the solver's speed limit are not checked: the limit changes their momentum, too."""
 
 
-def make_measures() -> dict[str, Measure]:
+def make_measures() -> dict[str, MeasuredValue]:
     """Make the measures of all bounded quantities, without values."""
     return {
-        "pose": Measure("objects: last step against frame", "m", 0.0),
-        "labels": Measure("arrays without unit, description or dimension names", "", 0.0),
-        "finite": Measure("objects: poses that are not finite", "", 0.0),
-        "speed": Measure("objects: speed, by displacement over a tick", "m/s", MAX_SPEED),
-        "momentum": Measure("objects: change of momentum against contacts and weight", "ratio", 1e-3),
-        "rest": Measure("first frame: contacts of all objects against their weight", "ratio", 0.1),
-        "displacement": Measure("objects: displacement in a step against speed", "m", 1e-4),
-        "force": Measure("gripper: force against its law", "N", 1e-2),
-        "peak_force": Measure("seals: peak force of a tick's steps against the tick's", "N", 0.0),
-        "attempts": Measure("seals: peak force of a tick's steps against the attempt's", "N", 1e-4),
+        "pose": MeasuredValue("objects: last step against frame", "m", 0.0),
+        "labels": MeasuredValue("arrays without unit, description or dimension names", "", 0.0),
+        "finite": MeasuredValue("objects: poses that are not finite", "", 0.0),
+        "speed": MeasuredValue("objects: speed, by displacement over a tick", "m/s", MAX_SPEED),
+        "momentum": MeasuredValue("objects: change of momentum against contacts and weight", "ratio", 1e-3),
+        "rest": MeasuredValue("first frame: contacts of all objects against their weight", "ratio", 0.1),
+        "displacement": MeasuredValue("objects: displacement in a step against speed", "m", 1e-4),
+        "force": MeasuredValue("gripper: force against its law", "N", 1e-2),
+        "peak_force": MeasuredValue("seals: peak force of a tick's steps against the tick's", "N", 0.0),
+        "attempts": MeasuredValue("seals: peak force of a tick's steps against the attempt's", "N", 1e-4),
     }
 
 
-def check_labels(episode: zarr.Group, measures: dict[str, Measure], where: str) -> None:
+def check_labels(episode: zarr.Group, measures: dict[str, MeasuredValue], where: str) -> None:
     """Check that every array has a unit, a description and dimension names."""
     arrays = [member for _, member in episode.members(max_depth=None) if isinstance(member, zarr.Array)]
     unlabelled = sum(
@@ -53,7 +53,7 @@ def check_labels(episode: zarr.Group, measures: dict[str, Measure], where: str) 
     measures["labels"].update_max(unlabelled, where)
 
 
-def check_frames(ticks: dict[str, np.ndarray], tick: float, measures: dict[str, Measure], where: str) -> None:
+def check_frames(ticks: dict[str, np.ndarray], tick: float, measures: dict[str, MeasuredValue], where: str) -> None:
     """Check that objects have finite poses in all frames, `tick` [s] apart, and that none is flung."""
     present, pose = ticks["object_id"] >= 0, ticks["pose"].astype(float)
     measures["finite"].update_max((~np.isfinite(pose[present]).all(axis=1)).sum(), where)
@@ -67,7 +67,7 @@ def check_objects(
     mass: np.ndarray,
     root: Any,
     settings: Any,
-    measures: dict[str, Measure],
+    measures: dict[str, MeasuredValue],
     where: str,
 ) -> None:
     """Check poses, velocities and contact forces of objects; `mass` (instance) [kg]."""
@@ -93,7 +93,9 @@ def check_objects(
     measures["displacement"].update_max(np.maximum(0.0, displacement - max_displacement)[np.isfinite(displacement)], where)
 
 
-def check_gripper(steps: dict[str, np.ndarray], root: Any, settings: Any, mode: str, measures: dict[str, Measure], where: str) -> None:
+def check_gripper(
+    steps: dict[str, np.ndarray], root: Any, settings: Any, mode: str, measures: dict[str, MeasuredValue], where: str
+) -> None:
     """Check the gripper's impedance law: F = (k (goal - x - h v) - d v) / (1 + (d h + k h²) / m), clamped to its limit.
 
     x and v are of the step's beginning, h is the time step, m the mass of shaft and cup.
@@ -111,7 +113,9 @@ def check_gripper(steps: dict[str, np.ndarray], root: Any, settings: Any, mode: 
     measures["force"].update_max((force - steps["impedance_force"][1:])[unmoved], where)
 
 
-def check_seals(steps: dict[str, np.ndarray], ticks: dict[str, np.ndarray], attempts: list[dict], measures: dict[str, Measure], where: str):
+def check_seals(
+    steps: dict[str, np.ndarray], ticks: dict[str, np.ndarray], attempts: list[dict], measures: dict[str, MeasuredValue], where: str
+):
     """Check peak seal forces of ticks and attempts against those of steps."""
     forces = np.nan_to_num(steps["seal_force"]).reshape(len(ticks["peak_force"]), -1)
     peak = forces.max(axis=1, initial=0.0)
@@ -121,7 +125,7 @@ def check_seals(steps: dict[str, np.ndarray], ticks: dict[str, np.ndarray], atte
         measures["attempts"].update_max(peak[last - count : last] - np.array(attempt["peak_force"]), where)
 
 
-def check(dataset: Path, count: int) -> dict[str, Measure]:
+def check(dataset: Path, count: int) -> dict[str, MeasuredValue]:
     """Check `count` episodes spread evenly over a data set; returns all quantities by name."""
     try:
         store = zarr.open_group(dataset / STORE, mode="r")
@@ -129,7 +133,7 @@ def check(dataset: Path, count: int) -> dict[str, Measure]:
         names = sorted(store["episodes"].group_keys())  # type: ignore[union-attr]
     except (OSError, KeyError, ValueError) as error:
         raise UnusableError(f"{dataset} has no trajectories and settings: {error}") from error
-    measures: dict[str, Measure] = make_measures()
+    measures: dict[str, MeasuredValue] = make_measures()
     root: dict[str, Any] = dict(store.attrs)
     # The diameter bounds the distance of an object's origin from its centre of mass.
     radius = dict(zip(store["objects/object_id"][:].tolist(), store["objects/diameter"][:].tolist(), strict=True))  # type: ignore[index,union-attr]

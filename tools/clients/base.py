@@ -22,7 +22,7 @@ Values = dict[str, np.ndarray]
 
 
 @dataclass
-class Reading:
+class ClientReading:
     """Values that a client has read, with remarks and versions for the table."""
 
     what: str
@@ -68,7 +68,7 @@ class Client:
     """Distributions that it needs; the first one's version is printed."""
     find: Callable[[Path], Path | None]
     """File or folder of a data set that it opens; None: the data set has not that format."""
-    read: Callable[[Path, Path, str], Reading]
+    read: Callable[[Path, Path, str], ClientReading]
     """What the client makes of it, given that, the data set's folder, and that of a copy of the BOP toolkit (empty: none). Runs in the
     client's interpreter."""
     expect: Callable[[Any], Values] = expect_views

@@ -23,7 +23,7 @@ import numpy as np
 
 from tools.clients.base import (
     MILLIMETERS,
-    Reading,
+    ClientReading,
     Values,
     expect_views,
     first_episode,
@@ -41,7 +41,7 @@ BATCH, WORKERS = 2, 2
 # ---- BOP toolkit ----
 
 
-def read_bop_toolkit(place: Path, data: Path, toolkit: str) -> Reading:
+def read_bop_toolkit(place: Path, data: Path, toolkit: str) -> ClientReading:
     """Views of a scene by the toolkit's own loaders, and one of each from its shard; the first model by its PLY reader."""
     if toolkit:
         sys.path.insert(0, toolkit)
@@ -75,7 +75,7 @@ def read_bop_toolkit(place: Path, data: Path, toolkit: str) -> Reading:
     what = f"{place.parent.name}/{place.name}{', its shard' if shard.is_file() else ''}, a model"
     project = Path(inout.__file__).parents[1] / "pyproject.toml"
     version = re.search(r'^version = "(.*)"', project.read_text() if project.is_file() else "", re.MULTILINE)
-    return Reading(what, values, versions={"bop_toolkit_lib": version[1]} if version else {})
+    return ClientReading(what, values, versions={"bop_toolkit_lib": version[1]} if version else {})
 
 
 def expect_bop_toolkit(data_set: Any) -> Values:
@@ -102,7 +102,7 @@ def find_views(data: Path) -> Path | None:
     return data if first_scene(data) or first_shard(data) else None
 
 
-def read_shards(place: Path, data: Path, _: str) -> Reading:
+def read_shards(place: Path, data: Path, _: str) -> ClientReading:
     """Sampled views of the first shard through webdataset's own pipeline with our decoder; two batches with torch, if that is installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Its import looks for torch.
@@ -123,15 +123,15 @@ def read_shards(place: Path, data: Path, _: str) -> Reading:
     stock = next(iter(webdataset.WebDataset(str(place), shardshuffle=False).decode("l8")))["depth.png"]
     remarks = ["its own decoders clip depth to 0 and 255: use decode_view"] if set(np.unique(stock)) <= {0, 255} else []
     if importlib.util.find_spec("torch") is None:
-        return Reading(place.name, values, [*remarks, "torch is not installed: no DataLoader"])
+        return ClientReading(place.name, values, [*remarks, "torch is not installed: no DataLoader"])
     import torch
 
     views = webdataset.WebDataset(str(place), shardshuffle=False).decode(decode_view).to_tuple("depth.png")
     batches = list(islice(torch.utils.data.DataLoader(views, batch_size=BATCH), 2))
-    return Reading(f"{place.name}, {len(batches)} batches of {len(batches[0][0])}", values, remarks)
+    return ClientReading(f"{place.name}, {len(batches)} batches of {len(batches[0][0])}", values, remarks)
 
 
-def read_pytorch(place: Path, data: Path, _: str) -> Reading:
+def read_pytorch(place: Path, data: Path, _: str) -> ClientReading:
     """Sampled views of the first camera of the first episode, out of batches of PyTorch's DataLoader with two workers."""
     import torch
 
@@ -149,10 +149,10 @@ def read_pytorch(place: Path, data: Path, _: str) -> Reading:
                 color, depth, masks, ids, poses = (batch[name][row].numpy() for name in fields)
                 values |= {f"rgb {frame}": color.transpose(1, 2, 0), f"depth {frame}": depth[0], f"visible_mask {frame}": masks}
                 values |= {f"visible_obj_id {frame}": ids, f"visible_pose {frame}": poses}
-    return Reading(f"{len(views)} views; {batches} batches of {BATCH} by {WORKERS} workers", values)
+    return ClientReading(f"{len(views)} views; {batches} batches of {BATCH} by {WORKERS} workers", values)
 
 
-def read_hugging_face(place: Path, data: Path, _: str) -> Reading:
+def read_hugging_face(place: Path, data: Path, _: str) -> ClientReading:
     """Sampled views of shards by `load_dataset("webdataset")`, streamed, offline, with a cache in a temporary folder."""
     os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
     with tempfile.TemporaryDirectory() as cache:
@@ -169,7 +169,7 @@ def read_hugging_face(place: Path, data: Path, _: str) -> Reading:
                 color = row["rgb.png"] if "rgb.png" in row else row["rgb.jpg"]
                 values |= {f"rgb {index}": np.asarray(color), f"depth_count {index}": np.asarray(row["depth.png"]).astype(np.int64)}
                 values[f"obj_id {index}"] = np.array([entry["obj_id"] for entry in row["gt.json"]])
-    return Reading(f"{place.name}, split {split}", values)
+    return ClientReading(f"{place.name}, split {split}", values)
 
 
 # ---- COCO ----
@@ -191,7 +191,7 @@ def find_coco(data: Path) -> Path | None:
     return _coco_of_scene(data) or _coco_of_split(data)
 
 
-def read_coco(place: Path, data: Path, _: str) -> Reading:
+def read_coco(place: Path, data: Path, _: str) -> ClientReading:
     """Masks and categories of the sampled images, of scene and split, through pycocotools' own index."""
     from pycocotools.coco import COCO
 
@@ -215,7 +215,7 @@ def read_coco(place: Path, data: Path, _: str) -> Reading:
         if all(category["name"].isdigit() for category in coco.dataset["categories"]):
             remarks.append(f"{file.name}: categories are named by their number")
         texts.append(f"{file.name}, {len(coco.anns)} annotations")
-    return Reading("; ".join(texts), values, remarks)
+    return ClientReading("; ".join(texts), values, remarks)
 
 
 def expect_coco(data_set: Any) -> Values:
@@ -227,7 +227,7 @@ def expect_coco(data_set: Any) -> Values:
 # ---- YOLO ----
 
 
-def read_yolo(place: Path, data: Path, _: str) -> Reading:
+def read_yolo(place: Path, data: Path, _: str) -> ClientReading:
     """Labels of the sampled images of the first camera of the first episode. Ultralytics writes a cache beside labels: it gets a copy."""
     frames = sample_frames(first_episode(data)["frames"])
     with tempfile.TemporaryDirectory() as folder:
@@ -237,7 +237,7 @@ def read_yolo(place: Path, data: Path, _: str) -> Reading:
         scene, split = lists[0].stem, lists[0].read_text().split("/")[2]
         values, names = _read_ultralytics(copy, split, scene, frames)
         values |= _read_supervision(copy, split, scene, frames)
-    return Reading(f"{len(lists)} scenes, {len(names)} classes", values)
+    return ClientReading(f"{len(lists)} scenes, {len(names)} classes", values)
 
 
 def _read_ultralytics(copy: Path, split: str, scene: str, frames: list[int]) -> tuple[Values, dict[int, str]]:

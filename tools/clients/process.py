@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tools.figures import describe_run, write_run
-from tools.options import Row
+from tools.options import MeasuredRow
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900.0
@@ -78,6 +78,6 @@ def finish(tool: str, json_file: Path | None, results: list[Result]) -> int:
     for result in results:
         table.add_row(result.client, result.version, result.read, result.agreement, result.remarks, style="" if result.holds else "bold")
     Console().print(table)
-    rows = [Row(result.client, float(result.holds), bound="= 1", holds=result.holds) for result in results]
+    rows = [MeasuredRow(result.client, float(result.holds), bound="= 1", holds=result.holds) for result in results]
     write_run(json_file, describe_run(tool, [], rows, clients=[asdict(result) for result in results]))
     return 0 if all(result.holds for result in results) else 1

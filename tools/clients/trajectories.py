@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.clients.base import PICTURE, Reading, Values, first_episode, pose_matrix, sample_frames, sampled_views
+from tools.clients.base import PICTURE, ClientReading, Values, first_episode, pose_matrix, sample_frames, sampled_views
 
 ARRAYS = ("time", "object_id", "pose", "fixture_pose", "fixture_visible", "attached", "peak_force")
 """Arrays of ticks that xarray reads."""
@@ -30,7 +30,7 @@ SHOULDER_START = 0.6
 """Knee of the tone curve (kernels/render/images/postprocess.py)."""
 
 
-def read_xarray(place: Path, data: Path, _: str) -> Reading:
+def read_xarray(place: Path, data: Path, _: str) -> ClientReading:
     """Arrays of the ticks at the sampled frames, selected by names of dimensions, and the objects' masses; coordinates along each labelled
     dimension."""
     import xarray
@@ -44,7 +44,7 @@ def read_xarray(place: Path, data: Path, _: str) -> Reading:
     height = ticks["pose"].isel(tick=frames).sel({ticks["pose"].dims[-1]: "z"})
     objects = xarray.open_zarr(place, group="objects", consolidated=False)
     values |= {"z by label": height.to_numpy(), "mass": objects["mass"].to_numpy()}
-    return Reading(f"{place.name}: ticks of episode {row['episode']}, objects", values)
+    return ClientReading(f"{place.name}: ticks of episode {row['episode']}, objects", values)
 
 
 def expect_ticks(data_set: Any) -> Values:
@@ -55,7 +55,7 @@ def expect_ticks(data_set: Any) -> Values:
     return values | {"z by label": values["pose"][..., 2], "mass": np.array([entry.mass for entry in data_set.objects])}
 
 
-def read_newton(place: Path, data: Path, _: str) -> Reading:
+def read_newton(place: Path, data: Path, _: str) -> ClientReading:
     """Poses of the objects that are in the first frame, by instance_id: bodies of a model by `ModelBuilder.add_usd`."""
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -67,7 +67,7 @@ def read_newton(place: Path, data: Path, _: str) -> Reading:
     poses = {int(label.rpartition("_")[2]): pose for label, pose in bodies if "/Objects/" in label}
     values = {"instance_id": np.array(sorted(poses))}
     values["object_to_world"] = np.array([pose_matrix(np.array(poses[index])) for index in sorted(poses)])
-    return Reading(f"{place.parent.name}/{place.name}: {builder.body_count} bodies, {builder.shape_count} shapes", values)
+    return ClientReading(f"{place.parent.name}/{place.name}: {builder.body_count} bodies, {builder.shape_count} shapes", values)
 
 
 def expect_first_frame(data_set: Any) -> Values:
@@ -79,7 +79,7 @@ def expect_first_frame(data_set: Any) -> Values:
 # ---- Blender ----
 
 
-def read_blender(place: Path, data: Path, _: str) -> Reading:
+def read_blender(place: Path, data: Path, _: str) -> ClientReading:
     """USD imported by `bpy`: objects at the sampled frames, cameras, properties; the picture of the middle frame by the first camera."""
     import bpy
 
@@ -104,7 +104,7 @@ def read_blender(place: Path, data: Path, _: str) -> Reading:
     unset = scene.render.fps / scene.render.fps_base == 24.0
     values[f"{PICTURE} {frames[1]}"] = _render(frames[1])
     remarks = ["frame rate and resolution are not taken from the file: set them"] if unset else []
-    return Reading(f"{place.parent.name}/{place.name}: {len(instances)} objects, frame {frames[1]} rendered", values, remarks)
+    return ClientReading(f"{place.parent.name}/{place.name}: {len(instances)} objects, frame {frames[1]} rendered", values, remarks)
 
 
 def _render(frame: int) -> np.ndarray:
@@ -181,7 +181,7 @@ def find_lerobot(data: Path) -> Path | None:
     return data / "lerobot" if (data / "lerobot" / "meta" / "info.json").is_file() else None
 
 
-def read_lerobot(place: Path, data: Path, _: str) -> Reading:
+def read_lerobot(place: Path, data: Path, _: str) -> ClientReading:
     """State of the sampled frames of the first episode by pyarrow, and their pictures in the first camera's video by PyAV; each split by
     LeRobotDataset where it is installed."""
     import av
@@ -200,11 +200,11 @@ def read_lerobot(place: Path, data: Path, _: str) -> Reading:
     values |= {f"{PICTURE} {frame}": pictures[frame] / 255.0 for frame in frames}
     what = f"{place.name}: {info['total_episodes']} episodes, {info['total_frames']} frames; {len(pictures)} pictures"
     if importlib.util.find_spec("lerobot") is None:
-        return Reading(what, values, ["the package lerobot is not installed: its reader was not tried"])
+        return ClientReading(what, values, ["the package lerobot is not installed: its reader was not tried"])
     ranges = {name: range(*map(int, span.split(":"))) for name, span in info["splits"].items()}
     for name, episodes in ranges.items():
         values |= _read_split(place, name, list(episodes), frames)
-    return Reading(f"{what}; {len(ranges)} splits by LeRobotDataset", values, ["decoded by pyav: torchcodec needs a system's FFmpeg"])
+    return ClientReading(f"{what}; {len(ranges)} splits by LeRobotDataset", values, ["decoded by pyav: torchcodec needs a system's FFmpeg"])
 
 
 def _read_split(place: Path, name: str, episodes: list[int], frames: list[int]) -> Values:

@@ -228,7 +228,7 @@ def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Lin
         return Line(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
     try:
         layers, difference = runs.compare(old, new)
-    except runs.UnusableError as error:
+    except runs.UnusableRunError as error:
         return Line(part, name, "failed", str(error))
     files, differing = (sum(getattr(layer, name) for layer in layers.values()) for name in ("files", "differing"))
     return Line(

@@ -51,7 +51,7 @@ MAX_TICKS = 400
 
 
 @dataclass(frozen=True)
-class Tolerance:
+class PictureTolerance:
     """Tolerance of one output: a difference per pixel, and the fraction of pixels that may exceed it."""
 
     difference: float | None
@@ -64,34 +64,38 @@ class Tolerance:
 PACKED = ("mask_words", "mask_first", "mask_box", "mask_length")
 """Outputs that are compared as the masks that they are."""
 TOLERANCES = {
-    "instance": Tolerance(None, 0.05),
-    "masks": Tolerance(None, 0.1),
-    "classes": Tolerance(None, 0.05),
-    "depth": Tolerance(1.0, 0.05, "counts"),
-    "pixels": Tolerance(4.0, 1.0, "px"),
-    "boxes": Tolerance(1.0, 1.0, "px"),
-    "effects": Tolerance(1e-5, 0.0),
-    "normals": Tolerance(2e-3, 0.1),
-    "albedo": Tolerance(2.0, 0.1, "grey"),
-    "nocs": Tolerance(1e-3, 0.1),
-    "flow": Tolerance(0.02, 0.1, "px"),
-    "scene_flow": Tolerance(2e-5, 0.1, "m"),
-    "depth_sensor": Tolerance(1.0, 0.5, "counts"),
-    "ir_left": Tolerance(1.0, 0.1, "grey"),
-    "ir_right": Tolerance(1.0, 0.1, "grey"),
-    "depth_stereo": Tolerance(1.0, 5.0, "counts"),
-    "suction_seal": Tolerance(1e-2, 0.5),
-    "suction_wrench": Tolerance(1e-4, 0.1),
+    "instance": PictureTolerance(None, 0.05),
+    "masks": PictureTolerance(None, 0.1),
+    "classes": PictureTolerance(None, 0.05),
+    "depth": PictureTolerance(1.0, 0.05, "counts"),
+    "pixels": PictureTolerance(4.0, 1.0, "px"),
+    "boxes": PictureTolerance(1.0, 1.0, "px"),
+    "effects": PictureTolerance(1e-5, 0.0),
+    "normals": PictureTolerance(2e-3, 0.1),
+    "albedo": PictureTolerance(2.0, 0.1, "grey"),
+    "nocs": PictureTolerance(1e-3, 0.1),
+    "flow": PictureTolerance(0.02, 0.1, "px"),
+    "scene_flow": PictureTolerance(2e-5, 0.1, "m"),
+    "depth_sensor": PictureTolerance(1.0, 0.5, "counts"),
+    "ir_left": PictureTolerance(1.0, 0.1, "grey"),
+    "ir_right": PictureTolerance(1.0, 0.1, "grey"),
+    "depth_stereo": PictureTolerance(1.0, 5.0, "counts"),
+    "suction_seal": PictureTolerance(1e-2, 0.5),
+    "suction_wrench": PictureTolerance(1e-4, 0.1),
 }
 """Tolerances of all outputs but color, which are the same in all modes."""
 TABLES = ("pixels", "boxes", "effects")
 """Outputs that are not images."""
-COLORS = {FAST: Tolerance(2.0, 1.0, "grey"), UNOCCLUDED: Tolerance(2.0, 1.0, "grey"), REFERENCE: Tolerance(4.0, 2.0, "grey")}
+COLORS = {
+    FAST: PictureTolerance(2.0, 1.0, "grey"),
+    UNOCCLUDED: PictureTolerance(2.0, 1.0, "grey"),
+    REFERENCE: PictureTolerance(4.0, 2.0, "grey"),
+}
 """Tolerances of color, by mode. Where rounding changes a sampled path, its pixel changes; denoising spreads that over neighbours."""
 
 
 @dataclass(frozen=True)
-class Difference:
+class PictureDifference:
     """Difference of one output between two devices."""
 
     mode: str
@@ -104,7 +108,7 @@ class Difference:
     """Largest difference [unit]; of labels 1 if any differ."""
     beyond: float
     """Pixels, or values, that differ by more than the tolerance [%]."""
-    tolerance: Tolerance
+    tolerance: PictureTolerance
 
     @property
     def holds(self) -> bool:
@@ -112,7 +116,7 @@ class Difference:
         return self.beyond <= self.tolerance.max_beyond
 
 
-def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
+def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> PictureDifference:
     """Compare one output of two devices.
 
     Args:
@@ -132,7 +136,7 @@ def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
     if output not in TABLES:
         difference = difference.reshape(*difference.shape[:3], -1).max(axis=-1)
     finite = difference[np.isfinite(difference)]
-    return Difference(
+    return PictureDifference(
         mode,
         output,
         100.0 * float((difference > 0.0).mean()),
@@ -165,7 +169,7 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if all(row.holds for row in differences) else 1
 
 
-def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:
+def compare_devices(config: Config, devices: list[Any], console: Console) -> list[PictureDifference]:
     """Render settled piles on both devices and compare all outputs; first those of the denoised mode.
 
     Raises:
@@ -248,7 +252,7 @@ def render_views(renderer: Renderer, snapshot: Snapshot) -> dict[str, np.ndarray
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 
 
-def _print(console: Console, differences: list[Difference], title: str) -> None:
+def _print(console: Console, differences: list[PictureDifference], title: str) -> None:
     table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "max %", title=title)
     table.add_column("", min_width=len("VIOLATED"), no_wrap=True)
     for row in differences:

@@ -51,7 +51,7 @@ class Difference:
 
 
 @dataclass
-class Layer:
+class LayerImages:
     """Comparison of all files of one type: their number, how many differ, largest difference (NaN: something other than numbers
     differs).
     """
@@ -62,20 +62,20 @@ class Layer:
     """Largest difference of two numbers; NaN: something other than numbers differs."""
 
 
-class UnusableError(Exception):
+class UnusableRunError(Exception):
     """Error: a folder is missing or empty."""
 
 
-def compare(first: Path, second: Path) -> tuple[dict[str, Layer], str]:
+def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
     """Compare two folders; returns layers by name, and the first difference as one line (empty: none).
 
     Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
     """
     names = [_list_files(folder) for folder in (first, second)]
-    layers: dict[str, Layer] = {}
+    layers: dict[str, LayerImages] = {}
     first_difference = ""
     for name in sorted(names[0] | names[1], key=_sort_key):
-        layer = layers.setdefault(layer_of(name), Layer())
+        layer = layers.setdefault(layer_of(name), LayerImages())
         layer.files += 1
         difference = _compare_file(first, second, name, names)
         if difference is not None:
@@ -88,10 +88,10 @@ def compare(first: Path, second: Path) -> tuple[dict[str, Layer], str]:
 def _list_files(folder: Path) -> set[str]:
     """Paths of all files below a folder, relative to it."""
     if not folder.is_dir():
-        raise UnusableError(f"there is no folder {folder}")
+        raise UnusableRunError(f"there is no folder {folder}")
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     if not names:
-        raise UnusableError(f"{folder} is empty")
+        raise UnusableRunError(f"{folder} is empty")
     return names
 
 
@@ -274,7 +274,7 @@ def _line(data: bytes, index: int) -> str:
     return lines[index].decode(errors="replace") if index < len(lines) else "nothing"
 
 
-def print_layers(layers: dict[str, Layer]) -> None:
+def print_layers(layers: dict[str, LayerImages]) -> None:
     """Print the table of layers."""
     width = max(len(name) for name in layers)
     print(f"{'layer':{width}}  files  differ  largest difference")
@@ -291,7 +291,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         layers, first_difference = compare(options.first, options.second)
-    except (UnusableError, OSError, ValueError) as error:
+    except (UnusableRunError, OSError, ValueError) as error:
         return fail("compare runs", " ".join(str(error).split()))
     print_layers(layers)
     print(f"first difference: {first_difference}" if first_difference else "no difference")

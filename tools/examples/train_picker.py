@@ -68,7 +68,7 @@ LEARNED, OWN = "learned", "heuristic"
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class PickSamples:
     """Images of camera 0 at the states of a data set, and the picks that were tried from them."""
 
     depth: torch.Tensor
@@ -82,17 +82,17 @@ class Samples:
     trials: dict[str, np.ndarray]
     """Columns by trial, sorted by state: `state`, `x` and `y` [px], LABELS, `weight`."""
 
-    def part(self, states: np.ndarray) -> Samples:
+    def part(self, states: np.ndarray) -> PickSamples:
         """Subset of the states, in ascending order; `state` of trials becomes the position in `states`."""
         place = np.full(len(self.episode), -1)
         place[states] = np.arange(len(states))
         kept = place[self.trials["state"]] >= 0
         rows = {name: values[kept] for name, values in self.trials.items()}
         chosen = torch.from_numpy(states)
-        return Samples(self.depth[chosen], self.seen[chosen], self.focal, self.episode[states], rows | {"state": place[rows["state"]]})
+        return PickSamples(self.depth[chosen], self.seen[chosen], self.focal, self.episode[states], rows | {"state": place[rows["state"]]})
 
 
-def load_samples(folder: Path) -> Samples:
+def load_samples(folder: Path) -> PickSamples:
     """Read all states of a data set with picks and images of camera 0, on all cores; raises DatasetError if it lacks them."""
     data = synpick_warp.open(folder)
     read = map_in_threads(lambda index: list(_read_states(data[index])), list(data))
@@ -103,7 +103,7 @@ def load_samples(folder: Path) -> Samples:
     depth, seen = (torch.from_numpy(np.stack([getattr(view, name) for view, _ in shots])) for name in ("depth", "seen"))
     trials = {name: np.concatenate([rows[name] for _, rows in shots]) for name in shots[0][1]}
     trials["state"] = np.repeat(np.arange(len(shots)), [len(rows["x"]) for _, rows in shots])
-    return Samples(depth, seen, shots[0][0].focal, np.repeat(list(data), [len(part) for part in read]), trials)
+    return PickSamples(depth, seen, shots[0][0].focal, np.repeat(list(data), [len(part) for part in read]), trials)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ def find_normals(depth: torch.Tensor, focal: float) -> torch.Tensor:
     return functional.normalize(torch.stack((across * slope, along * slope, -torch.ones_like(depth)), dim=1), dim=1)
 
 
-def train(samples: Samples, width: int, steps: int, device: torch.device, seed: int, batch: int) -> tuple[Network, list[float]]:
+def train(samples: PickSamples, width: int, steps: int, device: torch.device, seed: int, batch: int) -> tuple[Network, list[float]]:
     """Train a U-Net (AdamW, cosine decay) on trials of mirrored images; returns it and the loss of each step."""
     torch.manual_seed(seed)
     network = Network(len(LABELS), width, inputs=5).to(device)
@@ -203,7 +203,7 @@ def load_picker(path: Path, device: torch.device) -> tuple[Network, dict[str, An
     return network.eval(), parts
 
 
-def measure_auc(network: torch.nn.Module, samples: Samples, device: torch.device) -> Interval:
+def measure_auc(network: torch.nn.Module, samples: PickSamples, device: torch.device) -> Interval:
     """AUC of predictions at tried pixels, with inverse probability weights, and its interval by cluster bootstrap over states."""
     trials, value = samples.trials, predict(network, samples.depth.to(device), samples.focal, LABELS[0]).cpu().numpy()
     score = value[trials["state"], trials["y"], trials["x"]]

@@ -17,7 +17,7 @@ from synpick_warp.apps.evaluation.truth import Truth, read_truth
 from synpick_warp.dataset.reading import DataSet, open_data_set
 from synpick_warp.errors import SynpickError
 from tools.figures import describe_run, write_run
-from tools.options import Row, fail, make_parser
+from tools.options import MeasuredRow, fail, make_parser
 
 OCCLUDED = 0.5
 """Visible fraction below which an instance counts as occluded."""
@@ -63,7 +63,7 @@ def main() -> int:
     """Print a table for each data set."""
     parser = make_parser(__doc__, "json")
     parser.add_argument("datasets", type=Path, nargs="+", metavar="DATA", help="folder of a data set, format bop or shards")
-    options, console, rows = parser.parse_args(), Console(), list[Row]()
+    options, console, rows = parser.parse_args(), Console(), list[MeasuredRow]()
     for folder in options.datasets:
         try:
             data_set = open_data_set(folder)
@@ -75,7 +75,7 @@ def main() -> int:
         table = Table("", *found)
         for name in found[ALL]:
             table.add_row(escape(name), *(f"{values[name]:.4g}" for values in found.values()))
-            rows += [Row(f"{mode}: {name}", values[name], part=folder.name) for mode, values in found.items()]
+            rows += [MeasuredRow(f"{mode}: {name}", values[name], part=folder.name) for mode, values in found.items()]
         console.print(table)
     write_run(options.json, describe_run("tools.reports.difficulty", [], rows))
     return 0

@@ -34,7 +34,7 @@ from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
-from tools.options import INTERRUPTED, Row, configure, fail, make_parser
+from tools.options import INTERRUPTED, MeasuredRow, configure, fail, make_parser
 
 MAX_SPEED = 0.2
 """Bound of the median speed of objects [mm/s]."""
@@ -58,7 +58,7 @@ OWN = {
 
 
 @dataclass(frozen=True, eq=False)
-class Pile:
+class RestingPile:
     """Measures of one arrangement at rest; arrays are by object."""
 
     episode: int
@@ -81,10 +81,10 @@ class Pile:
 
 
 @dataclass
-class Results:
+class RestResults:
     """Results of all arrangements."""
 
-    piles: list[Pile] = field(default_factory=list)
+    piles: list[RestingPile] = field(default_factory=list)
     resampled: Counter[str] = field(default_factory=Counter)
     """Arrangements that failed, by ending."""
     given_up: int = 0
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
         simulation = Simulation(config, catalog, 1, device)
     except SynpickError as error:
         return fail("reports.rest", error)
-    results = Results()
+    results = RestResults()
     interrupted = False
     try:
         settle(simulation, catalog, results, console.print)
@@ -126,7 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
     return INTERRUPTED if interrupted else code
 
 
-def settle(simulation: Simulation, catalog: Catalog, results: Results, report_progress: Callable[[str], None]) -> None:
+def settle(simulation: Simulation, catalog: Catalog, results: RestResults, report_progress: Callable[[str], None]) -> None:
     """Simulate until every arrangement is at rest or has failed, and add the measured values to `results`."""
     config = simulation.config
     reported = time.perf_counter()
@@ -167,7 +167,7 @@ def _finish_episodes(simulation: Simulation, worlds: np.ndarray) -> None:
         array.assign(host)
 
 
-def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: TickReport, worlds: np.ndarray) -> list[Pile]:
+def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: TickReport, worlds: np.ndarray) -> list[RestingPile]:
     """Measure the piles of `worlds` at the end of the tick `now`; `before` is the report of the tick before."""
     state, layout = simulation.state, simulation.layout
     tick = simulation.config.physics.tick_time
@@ -189,7 +189,7 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
         mass = np.array([entry.mass for entry in entries])
         energy = (mass * (linear**2).sum(axis=1)).sum() + np.einsum("ni,nij,nj->", body_angular, inertia, body_angular)
         piles.append(
-            Pile(
+            RestingPile(
                 episode=int(now.column("episode")[world]),
                 ticks=int(progress[world][0]),
                 redrops=int(progress[world][2]),
@@ -216,7 +216,7 @@ def is_inside(sizes: BinSizes, position: np.ndarray) -> np.ndarray:
     return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < sizes.height + HEAP_HEIGHT)
 
 
-def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
+def report(results: RestResults, physics: Physics, any_volume: bool) -> list[MeasuredRow]:
     """Rows of the report. Bounds are violated if no pile came to rest; `any_volume` lifts the bound of the total volume, which fills by
     `arrangement.counts` need not keep."""
     piles = results.piles
@@ -231,37 +231,37 @@ def report(results: Results, physics: Physics, any_volume: bool) -> list[Row]:
     speed, tick_speed, depth = over_objects("speed"), over_objects("tick_speed"), over_objects("depth")
     inside = 100.0 * float(over_objects("inside").mean())
     limited = _bounded("total volume, max", float(volume.max()), "l", MAX_VOLUME * (1 + ROUNDING), f"<= {MAX_VOLUME:g}")
-    largest = Row(limited.name, limited.value, "l") if any_volume else limited
+    largest = MeasuredRow(limited.name, limited.value, "l") if any_volume else limited
     return [
-        Row("arrangements at rest", len(piles), ""),
-        Row("arrangements given up", results.given_up, "", "= 0", results.given_up == 0),
-        *(Row(f"arrangements resampled: {name}", count, "") for name, count in sorted(results.resampled.items())),
-        Row("objects", sum(len(pile.speed) for pile in piles), ""),
-        Row("objects dropped again", sum(pile.redrops for pile in piles), ""),
+        MeasuredRow("arrangements at rest", len(piles), ""),
+        MeasuredRow("arrangements given up", results.given_up, "", "= 0", results.given_up == 0),
+        *(MeasuredRow(f"arrangements resampled: {name}", count, "") for name, count in sorted(results.resampled.items())),
+        MeasuredRow("objects", sum(len(pile.speed) for pile in piles), ""),
+        MeasuredRow("objects dropped again", sum(pile.redrops for pile in piles), ""),
         *_percentiles("ticks to rest", ticks, "", (50, 90, 100)),
-        Row("total volume, mean", float(volume.mean()), "l"),
+        MeasuredRow("total volume, mean", float(volume.mean()), "l"),
         largest,
         *_percentiles("speed, instantaneous", speed, "mm/s", (50, 90, 99), MAX_SPEED),
         *_percentiles("speed, by displacement over a tick", tick_speed, "mm/s", (50, 90, 99), MAX_SPEED),
         *_percentiles("penetration", depth, "mm", (50,)),
         _bounded("penetration, 99 %", float(np.percentile(depth, 99)), "mm", MAX_DEPTH),
         *_percentiles("penetration", depth, "mm", (100,)),
-        Row("objects inside the tote", inside, "%", f">= {MIN_INSIDE:g}", inside >= MIN_INSIDE),
+        MeasuredRow("objects inside the tote", inside, "%", f">= {MIN_INSIDE:g}", inside >= MIN_INSIDE),
         *_percentiles("kinetic energy of a world", energy, "µJ", (50, 90, 100)),
         _bounded("contacts a world, most in a tick", results.contacts, "", physics.contacts_per_world),
         _bounded("pairs of shapes a world, most in a tick", results.pairs, "", physics.pairs_per_world),
     ]
 
 
-def _bounded(name: str, value: float, unit: str, limit: float, bound: str = "") -> Row:
+def _bounded(name: str, value: float, unit: str, limit: float, bound: str = "") -> MeasuredRow:
     """Row of a value that must be below `limit`; NaN violates it."""
-    return Row(name, value, unit, bound or f"< {limit:g}", value < limit)
+    return MeasuredRow(name, value, unit, bound or f"< {limit:g}", value < limit)
 
 
-def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], max_median: float | None = None) -> list[Row]:
+def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], max_median: float | None = None) -> list[MeasuredRow]:
     """Rows of percentiles of values; with `max_median` the first one, the median, must be below it."""
     names = {50: "median", 100: "max"}
-    rows = [Row(f"{name}, {names.get(level, f'{level} %')}", float(np.percentile(values, level)), unit) for level in which]
+    rows = [MeasuredRow(f"{name}, {names.get(level, f'{level} %')}", float(np.percentile(values, level)), unit) for level in which]
     if max_median is not None:
         rows[0] = _bounded(rows[0].name, rows[0].value, unit, max_median)
     return rows

@@ -42,7 +42,7 @@ from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
-from tools.options import Row, configure, existing_folder, fail, make_parser, positive_count, writable_file
+from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, positive_count, writable_file
 
 MIN_PSNR, MAX_BIAS = 35.0, 1.0
 """Bounds of the mean PSNR over all compared frames [dB], and of the mean bias [%]."""
@@ -166,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
     shared = ("models", "lights", "device", "seed", "set", "json", "size")
     options = make_parser(__doc__, *shared, own=OWN, size="480x270").parse_args(arguments)
     console, started = Console(highlight=False), time.perf_counter()
-    rows: list[Row] = []
+    rows: list[MeasuredRow] = []
     pairs: list[Pair] = []
     missing = set(options.frames)
     try:
@@ -178,8 +178,8 @@ def main(arguments: list[str] | None = None) -> int:
             pairs.append(pair)
             missing.discard(frame)
             name, seconds = f"frame {frame}, {pair.light}", time.perf_counter() - started
-            rows.append(Row(f"{name}: denoised against reference", pair.quality, "dB"))
-            rows.append(Row(f"{name}: bias of mean radiance", pair.bias, "%"))
+            rows.append(MeasuredRow(f"{name}: denoised against reference", pair.quality, "dB"))
+            rows.append(MeasuredRow(f"{name}: bias of mean radiance", pair.bias, "%"))
             console.print(f"{seconds:6.0f} s  frame {frame:4}  {pair.light}: {pair.quality:.2f} dB, {pair.bias:+.2f} %")
         if missing:
             raise SynpickError(f"no episode has frame {min(missing)} of --frames; name earlier ones")
@@ -223,14 +223,14 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
             return
 
 
-def summarize_pairs(pairs: list[Pair]) -> list[Row]:
+def summarize_pairs(pairs: list[Pair]) -> list[MeasuredRow]:
     """Rows of the quality of all pairs, and of their mean bias, with bounds."""
     qualities, bias = [pair.quality for pair in pairs], float(np.mean([pair.bias for pair in pairs]))
     mean = float(np.mean(qualities))
     return [
-        Row("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),
-        Row("denoised against reference, min", min(qualities), "dB"),
-        Row("bias of mean radiance, mean", bias, "%", f"within {MAX_BIAS:g}", abs(bias) < MAX_BIAS),
+        MeasuredRow("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),
+        MeasuredRow("denoised against reference, min", min(qualities), "dB"),
+        MeasuredRow("bias of mean radiance, mean", bias, "%", f"within {MAX_BIAS:g}", abs(bias) < MAX_BIAS),
     ]
 
 

@@ -20,7 +20,7 @@ from synpick_warp.scenes.assets.models_info import bop_obj_id, read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.symmetries.detection import find_symmetries, turn_matrix
 from synpick_warp.scenes.symmetries.groups import describe_counts
-from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.scenes.symmetries.surface import SampledSurface
 
 _MILLIMETRE = 1e-3
 _SAME = np.cos(np.radians(8.0))
@@ -28,7 +28,7 @@ _SAME = np.cos(np.radians(8.0))
 HEADER = ("object", "stated", "detected", "stated ones move it by", "detected ones by", "verdict")
 
 
-class Comparison(NamedTuple):
+class SymmetryComparison(NamedTuple):
     """Stated and detected symmetries of an object: (discrete, continuous) each, largest distances in diameters, and the verdict."""
 
     obj_id: int
@@ -39,7 +39,7 @@ class Comparison(NamedTuple):
     verdict: str
 
 
-class Group(NamedTuple):
+class SymmetryGroup(NamedTuple):
     """Symmetries of an object: discrete ones (N, 4, 4), and axes and points of continuous ones."""
 
     discrete: np.ndarray
@@ -63,16 +63,16 @@ class Group(NamedTuple):
         return any((np.trace(move[:3, :3].T @ other[:3, :3]) - 1.0) / 2.0 > _SAME for other in self.discrete)
 
 
-def compare(folder: Path, obj_ids: Iterable[int], tolerance: float) -> Iterator[Comparison]:
+def compare(folder: Path, obj_ids: Iterable[int], tolerance: float) -> Iterator[SymmetryComparison]:
     """Compare objects of a BOP model folder; `tolerance`: of the detection, in diameters."""
     for obj_id, info in sorted(read_models_info(folder / "models_info.json", obj_ids).items()):
         mesh, _ = read_mesh(folder / f"obj_{obj_id:06d}.ply", _MILLIMETRE)
         diameter = hull_size(mesh.vertices).diameter
         found = find_symmetries(mesh.vertices, mesh.faces, diameter, tolerance * diameter)
-        detected = Group(np.reshape(found.discrete, (-1, 4, 4)), [(turn.axis, turn.point) for turn in found.continuous])
+        detected = SymmetryGroup(np.reshape(found.discrete, (-1, 4, 4)), [(turn.axis, turn.point) for turn in found.continuous])
         axes = [(np.array(axis), np.array(point)) for axis, point in info.symmetries_continuous]
-        stated = Group(np.reshape(info.symmetries_discrete, (-1, 4, 4)), axes)
-        surface = Surface(mesh.vertices, mesh.faces)
+        stated = SymmetryGroup(np.reshape(info.symmetries_discrete, (-1, 4, 4)), axes)
+        surface = SampledSurface(mesh.vertices, mesh.faces)
         off = max((surface.deviation(matrix) for matrix in stated.moves()), default=0.0) / diameter
         own_off = max([*found.deviations, *(turn.deviation for turn in found.continuous)], default=0.0) / diameter
         parts = []
@@ -81,7 +81,7 @@ def compare(folder: Path, obj_ids: Iterable[int], tolerance: float) -> Iterator[
             parts.append(f"lacks what is stated: {reason}")
         if not all(map(stated.holds, detected.moves())):
             parts.append("more than stated: shape alone, which texture tells apart")
-        yield Comparison(obj_id, stated.counts, detected.counts, off, own_off, "; ".join(parts) or "the same")
+        yield SymmetryComparison(obj_id, stated.counts, detected.counts, off, own_off, "; ".join(parts) or "the same")
 
 
 def main() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from synpick_warp.apps.conversion.foreign import convert_foreign
-from synpick_warp.apps.conversion.source import Source, StoredContext
+from synpick_warp.apps.conversion.source import ConversionSource, StoredContext
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
@@ -58,7 +58,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         return Converted(count, 0, remark)
     if split is not None:
         raise ConfigError("--split is for data sets from other sources; those of synpick-warp bake are converted as a whole")
-    source = Source(folder)
+    source = ConversionSource(folder)
     check_formats(formats, source.config.bop.layout, source.config.bake.formats, folder)
     contents: set[Content] = {content for name in formats for content in contents_of(name, source.config.bop)}
     source.check_contents(contents)
@@ -81,7 +81,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
 
 
 def _convert_episodes(
-    source: Source, output: OutputFolder, exporters: Exporters, pool: WriterPool, contents: Collection[Content], report: Report
+    source: ConversionSource, output: OutputFolder, exporters: Exporters, pool: WriterPool, contents: Collection[Content], report: Report
 ) -> None:
     """Pass what formats are made of, the views and ticks of all remaining episodes, to their exporters."""
     total, working = len(output.episodes), [0]

@@ -48,7 +48,7 @@ _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
 
 
-class Source:
+class ConversionSource:
     """A baked data set that is converted. Reads its manifest and settings, and checks them."""
 
     def __init__(self, folder: Path) -> None:
@@ -165,7 +165,7 @@ class Source:
 class StoredContext(ExportContext):
     """Context of the exporters that write a converted data set."""
 
-    def __init__(self, source: Source, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
+    def __init__(self, source: ConversionSource, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
         """
         Args:
             source: The data set that is converted.

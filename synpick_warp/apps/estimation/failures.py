@@ -47,7 +47,7 @@ _HEADINGS = ("observed, with its mask", "estimate (red), truth (green)", "estima
 
 
 @dataclass(frozen=True, eq=False)
-class Failure:
+class PoseFailure:
     """An instance that a method has missed or estimated badly."""
 
     truth: int
@@ -86,7 +86,7 @@ class _Window:
         return result
 
 
-def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int) -> list[Failure]:
+def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int) -> list[PoseFailure]:
     """The worst instance of each object by ADD-S, worst first; an object's misses with an estimate before those without.
 
     Args:
@@ -110,7 +110,7 @@ def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int
         target = int(scores.target[row])
         nearest = nearest_estimate(truth.poses, target, estimates)
         offset = np.inf if nearest < 0 else np.linalg.norm(estimates.translation[nearest] - truth.poses.translation[target])
-        result.append(Failure(target, nearest, float(scores.errors[METRIC][row]), float(offset)))
+        result.append(PoseFailure(target, nearest, float(scores.errors[METRIC][row]), float(offset)))
     return sorted(result, key=lambda failure: -failure.error)[:count]
 
 
@@ -128,7 +128,7 @@ def draw_failures(
     data_set: DataSet,
     truth: Truth,
     estimates: PoseTable,
-    failures: Sequence[Failure],
+    failures: Sequence[PoseFailure],
     models: Sequence[ObjectModel],
     names: Mapping[int, str],
     device: wp.Device,
@@ -163,7 +163,7 @@ def draw_failures(
     return _write_texts(canvas, captions)
 
 
-def describe_failure(truth: Truth, failure: Failure, view: View, names: Mapping[int, str]) -> tuple[str, str]:
+def describe_failure(truth: Truth, failure: PoseFailure, view: View, names: Mapping[int, str]) -> tuple[str, str]:
     """Caption of two lines: object and error; location in the data set, visibility and speed."""
     object_id = int(truth.poses.object_id[failure.truth])
     name = printable(names.get(object_id, f"object {object_id}"))

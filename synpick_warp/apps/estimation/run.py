@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.estimation.gicp import Aligner
-from synpick_warp.apps.estimation.scenes import ABSENT, Scene, ScenePlan, read_scene
+from synpick_warp.apps.estimation.scenes import ABSENT, EstimationScene, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.targets import Target, TargetList, count_targets
+from synpick_warp.apps.evaluation.targets import TargetList, TargetRow, count_targets
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.hardware.cores import count_cores
@@ -37,7 +37,7 @@ DEPTHS = {"clean": "depth", "sensor": "depth_sensor"}
 
 
 @dataclass(frozen=True)
-class Options:
+class EstimationOptions:
     """Options of an estimation."""
 
     method: str
@@ -51,7 +51,7 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class EstimationRun:
     """Result of an estimation."""
 
     poses: PoseTable
@@ -77,8 +77,12 @@ class Estimate(NamedTuple):
 
 
 def read_scenes(
-    data_set: DataSet, plans: Sequence[ScenePlan], options: Options, targets: TargetList | None = None, report: Report = ignore_progress
-) -> list[Scene]:
+    data_set: DataSet,
+    plans: Sequence[ScenePlan],
+    options: EstimationOptions,
+    targets: TargetList | None = None,
+    report: Report = ignore_progress,
+) -> list[EstimationScene]:
     """Read the ground truth of scenes, and check that there is something to estimate.
 
     Args:
@@ -107,7 +111,7 @@ def read_scenes(
     return scenes
 
 
-def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[frozenset[int] | None]) -> Scene:
+def ask(scene: EstimationScene, method: str, min_visibility: float, objects: Sequence[frozenset[int] | None]) -> EstimationScene:
     """Select the instances to estimate in each frame.
 
     Tracks are asked in all frames from the first one on in which the instance is visible enough, as long as the image has it. Other
@@ -129,7 +133,7 @@ def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[froz
     return replace(scene, asked=asked)
 
 
-def list_targets(scenes: Sequence[Scene]) -> list[Target]:
+def list_targets(scenes: Sequence[EstimationScene]) -> list[TargetRow]:
     """Target list of the instances that are asked for: scene, frame, object and number of instances."""
     rows = []
     for scene in scenes:
@@ -138,7 +142,9 @@ def list_targets(scenes: Sequence[Scene]) -> list[Target]:
     return count_targets(rows)
 
 
-def run_estimation(scenes: Sequence[Scene], aligner: Aligner, options: Options, report: Report = ignore_progress) -> Run:
+def run_estimation(
+    scenes: Sequence[EstimationScene], aligner: Aligner, options: EstimationOptions, report: Report = ignore_progress
+) -> EstimationRun:
     """Estimate the poses of all instances that are asked for, in threads: a track's scene, or an image, at a time.
 
     Raises:
@@ -159,10 +165,10 @@ def run_estimation(scenes: Sequence[Scene], aligner: Aligner, options: Options, 
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return Run(_tabulate(sorted(rows, key=lambda row: row[:4])), total, time.perf_counter() - begin)
+    return EstimationRun(_tabulate(sorted(rows, key=lambda row: row[:4])), total, time.perf_counter() - begin)
 
 
-def _estimate(scene: Scene, steps: Sequence[int], aligner: Aligner, options: Options) -> Iterator[Estimate]:
+def _estimate(scene: EstimationScene, steps: Sequence[int], aligner: Aligner, options: EstimationOptions) -> Iterator[Estimate]:
     """Estimates in these frames of a scene, in order; tracks go on from one to the next."""
     tracks: dict[int, np.ndarray] = {}
     for step in steps:
@@ -188,7 +194,7 @@ def _estimate(scene: Scene, steps: Sequence[int], aligner: Aligner, options: Opt
         yield from (row._replace(seconds=seconds) for row in found)
 
 
-def observed_points(scene: Scene, step: int, slot: int, layer: str) -> np.ndarray:
+def observed_points(scene: EstimationScene, step: int, slot: int, layer: str) -> np.ndarray:
     """Depth pixels of an instance's visible mask as points in the camera's axes (P, 3) float64 [m].
 
     Raises:

@@ -40,7 +40,7 @@ class ScenePlan:
 
 
 @dataclass(frozen=True)
-class Selection:
+class ImageSelection:
     """Filters of the images to estimate, by mode, camera and episode (None: all), frame or target list."""
 
     modes: tuple[str, ...] | None = None
@@ -52,7 +52,7 @@ class Selection:
     """Images and objects; instead of `every`."""
 
 
-def plan_scenes(data_set: DataSet, selection: Selection) -> tuple[list[ScenePlan], bool]:
+def plan_scenes(data_set: DataSet, selection: ImageSelection) -> tuple[list[ScenePlan], bool]:
     """List the scenes of a data set and the frames of each that are estimated.
 
     Returns:
@@ -108,7 +108,7 @@ def _check(option: str, values: Sequence[object] | None, allowed: Sequence[objec
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class EstimationScene:
     """Scene to estimate: F planned frames and S instances (slots, by instance index)."""
 
     plan: ScenePlan
@@ -142,7 +142,7 @@ class Scene:
         return len(self.plan.frames)
 
 
-def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
+def read_scene(data_set: DataSet, plan: ScenePlan) -> EstimationScene:
     """Read the ground truth of a scene's planned frames; images are not read.
 
     Raises:
@@ -174,7 +174,7 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
     poses[..., :3, :3][cells], poses[..., :3, 3][cells] = truth.rotation, _METERS * truth.translation
     _check_rotations(poses[..., :3, :3], plan, place)
     matrices, scales = _read_cameras(truth, place)
-    return Scene(
+    return EstimationScene(
         plan=plan,
         files=data_set.scene_files(plan.episode, plan.camera),
         size=source.image_size(plan.frames[0]),

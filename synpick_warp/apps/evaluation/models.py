@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.evaluation.errors import VertexSearch
 from synpick_warp.dataset.bop.models import find_models
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.models_info import ModelInfo
+from synpick_warp.scenes.assets.models_info import FileModelInfo
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 
 _METERS = 1e-3
@@ -64,7 +64,7 @@ def read_models(folder: Path, object_ids: Iterable[int], vertices: int = 0) -> d
     return {object_id: _read_model(*pair, object_id, vertices) for object_id, pair in found.items()}
 
 
-def _read_model(path: Path, info: ModelInfo, object_id: int, count: int) -> Model:
+def _read_model(path: Path, info: FileModelInfo, object_id: int, count: int) -> Model:
     """Read a model, from mm to m, thinned to at most `count` vertices (0: all); raises CatalogError if a vertex lies absurdly far out."""
     points = _METERS * read_ply_vertices(path)
     if np.abs(points).max() > 1e6:
@@ -73,7 +73,7 @@ def _read_model(path: Path, info: ModelInfo, object_id: int, count: int) -> Mode
     return Model(object_id, points, expand_symmetries(info), symmetric).thinned(count)
 
 
-def expand_symmetries(info: ModelInfo) -> np.ndarray:
+def expand_symmetries(info: FileModelInfo) -> np.ndarray:
     """Rotations of all symmetries (S, 3, 3), as the BOP toolkit combines them: continuous ones in steps, after each discrete one."""
     discrete = np.stack([np.eye(3), *(np.reshape(matrix, (4, 4))[:3, :3] for matrix in info.symmetries_discrete)])
     if not info.symmetries_continuous:

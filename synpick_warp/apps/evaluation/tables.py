@@ -33,7 +33,7 @@ _PERCENT = 100.0
 
 
 @dataclass(frozen=True)
-class Row:
+class ScoreRow:
     """Row of a table: group of instances, their number, and each method's scores by column."""
 
     group: str
@@ -47,7 +47,7 @@ class Row:
     instances `rotation` [°] and `translation` [mm]; NaN: nothing found."""
 
 
-def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], groups: Sequence[str] = GROUPS) -> list[Row]:
+def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], groups: Sequence[str] = GROUPS) -> list[ScoreRow]:
     """Rows of the table; groups without instances are left out.
 
     Args:
@@ -87,9 +87,9 @@ def _interval(low: float, high: float) -> str:
     return f"over {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
 
 
-def _row(group: str, label: str, inside: np.ndarray, object_ids: np.ndarray, scores: Sequence[Scores]) -> Row:
+def _row(group: str, label: str, inside: np.ndarray, object_ids: np.ndarray, scores: Sequence[Scores]) -> ScoreRow:
     """Row of a table: the number of rows selected by `inside` (N,) bool, and each method's scores over them."""
-    return Row(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
+    return ScoreRow(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
 
 
 def _cells(inside: np.ndarray, object_ids: np.ndarray, scores: Scores) -> dict[str, float]:
@@ -116,7 +116,7 @@ def _median(values: np.ndarray) -> float:
     return float(np.median(found)) if len(found) else math.nan
 
 
-def render(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores], style: str, convention: str = "exact") -> str:
+def render(rows: Sequence[ScoreRow], truth: Truth, scores: Sequence[Scores], style: str, convention: str = "exact") -> str:
     """Write the table as text, in one of FORMATS.
 
     Args:
@@ -142,7 +142,7 @@ def render(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores], style: s
     return "\n".join([*lines, "of ADD(-S) below it [%]; medians of rotation and translation error of what was found"]) + "\n"
 
 
-def _wide(rows: Sequence[Row], names: Sequence[str], shown: Mapping[str, str], label: str, targets: bool = False) -> Table:
+def _wide(rows: Sequence[ScoreRow], names: Sequence[str], shown: Mapping[str, str], label: str, targets: bool = False) -> Table:
     """A row for each group, in which methods stand beside each other; `shown` are columns with their labels."""
     keys = (Column("label", label=label), *([Column("targets", ",")] if targets else []))
     columns = (*keys, *(Column(name, ".1f", each) for _ in names for name, each in shown.items()))
@@ -155,7 +155,7 @@ def _wide(rows: Sequence[Row], names: Sequence[str], shown: Mapping[str, str], l
     return table
 
 
-def _long(rows: Sequence[Row], scores: Sequence[Scores]) -> Table:
+def _long(rows: Sequence[ScoreRow], scores: Sequence[Scores]) -> Table:
     """Table with a row for each group and method, and all columns."""
     columns = [Column(name) for name in ("group", "label", "targets", "method")] + [Column(name, digits=".6g") for name in rows[0].cells[0]]
     return Table(
@@ -175,7 +175,7 @@ def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
 
 
-def _json(rows: Sequence[Row], truth: Truth, scores: Sequence[Scores]) -> str:
+def _json(rows: Sequence[ScoreRow], truth: Truth, scores: Sequence[Scores]) -> str:
     """JSON of all results: both conventions, recall curves, error bands by visibility and speed."""
     methods = []
     for index, each in enumerate(scores):

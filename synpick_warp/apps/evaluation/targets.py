@@ -21,7 +21,7 @@ from synpick_warp.system.inputs.json import read_json
 _FORMAT = "a target list has objects with scene_id, im_id, obj_id and inst_count, as BOP's test_targets_bop19.json"
 
 
-class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
+class TargetRow(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
     """Entry of a target list. `inst_count` is written but not read, since the ground truth has it."""
 
     scene_id: int
@@ -38,7 +38,7 @@ class TargetList:
     """BOP target list, in the order of its file."""
 
     path: Path
-    targets: tuple[Target, ...]
+    targets: tuple[TargetRow, ...]
 
     @cached_property
     def objects(self) -> dict[tuple[int, int], frozenset[int] | None]:
@@ -86,14 +86,14 @@ def read_targets(path: Path) -> TargetList:
     return TargetList(path, tuple(target for entry in entries for target in _read_entry(entry)))
 
 
-def _read_entry(entry: TargetEntry) -> list[Target]:
+def _read_entry(entry: TargetEntry) -> list[TargetRow]:
     """Targets of an entry, one per image, as it may list several; object None: any object; count 0: not given."""
     images = [(entry.sensor, entry.im_id)] if isinstance(entry.im_id, int) else entry.im_id
     object_id, count = entry.obj_id if isinstance(entry.obj_id, int) else None, entry.inst_count or 0
-    return [Target(entry.scene_id, image, object_id, count, sensor) for sensor, image in images]
+    return [TargetRow(entry.scene_id, image, object_id, count, sensor) for sensor, image in images]
 
 
-def in_layout(targets: Sequence[Target], sensors: Sequence[str]) -> list[Target]:
+def in_layout(targets: Sequence[TargetRow], sensors: Sequence[str]) -> list[TargetRow]:
     """Convert targets from the classic layout, a scene for each camera, to scenes with `sensors`: the inverse of `in_classic_layout`.
 
     Without sensors the lists are alike."""
@@ -103,14 +103,14 @@ def in_layout(targets: Sequence[Target], sensors: Sequence[str]) -> list[Target]
     return [replace_struct(each, scene_id=each.scene_id // count, sensor=sensors[each.scene_id % count]) for each in targets]
 
 
-def encode_targets(targets: Sequence[Target]) -> bytes:
+def encode_targets(targets: Sequence[TargetRow]) -> bytes:
     """Encode a target list, one target a line, sorted."""
     return b"[\n" + b",\n".join(json.dumps(msgspec.to_builtins(target)).encode() for target in sorted(targets)) + b"\n]\n"
 
 
-def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[Target]:
+def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[TargetRow]:
     """Targets with their numbers of instances, from instances given as (scene, image, obj_id)."""
-    return [Target(scene, image, object_id, count) for (scene, image, object_id), count in Counter(rows).items()]
+    return [TargetRow(scene, image, object_id, count) for (scene, image, object_id), count in Counter(rows).items()]
 
 
 def select_targets(truth: Truth, targets: TargetList) -> Truth:

@@ -10,14 +10,14 @@ import numpy as np
 from msgspec import UNSET
 from scipy.signal import fftconvolve
 
-from synpick_warp.apps.validation.scene_files import Mask, crop_mask
+from synpick_warp.apps.validation.scene_files import StoredMask, crop_mask
 from synpick_warp.apps.validation.subjects import ViewSubject
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
     from synpick_warp.apps.validation.registry import Tolerance
-    from synpick_warp.apps.validation.rendering import ObjectRenderer, Patch
+    from synpick_warp.apps.validation.rendering import DepthPatch, ObjectRenderer
 
 EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
 """Largest difference of depth from the model [mm]: of rendered depth, and of a sensor's (BOP's tolerance of visibility)."""
@@ -87,7 +87,7 @@ class Fit:
     """Mean distance of the outlines [px]: differing pixels per pixel of the longer outline."""
 
 
-class RenderedView:
+class ComparedView:
     """A view with its re-rendered instances: those with a model, and with a mask or silhouette that is large enough."""
 
     def __init__(self, view: ViewSubject, renderer: ObjectRenderer, given: Tolerance | None = None) -> None:
@@ -141,7 +141,7 @@ class RenderedView:
         view, matrix = self.view, self.matrix
         if matrix is None or view.size is None:
             return []
-        patches: list[Patch | None] = []
+        patches: list[DepthPatch | None] = []
         for item in view.truths:
             rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
             usable = self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01
@@ -169,7 +169,7 @@ class RenderedView:
         moved_mask = replace(shown, left=shown.left + patch.left, top=shown.top + patch.top)
         return moved_mask.window(item.left, item.top, result.shape[1], result.shape[0])
 
-    def _instance(self, index: int, patch: Patch, nearest: np.ndarray) -> Instance | None:
+    def _instance(self, index: int, patch: DepthPatch, nearest: np.ndarray) -> Instance | None:
         """Cut an instance's window; None: too few pixels, or nothing to compare them with."""
         masks = [self._mask(kind, index) for kind in ("mask", "mask_visib")]
         present = [mask for mask in masks if mask is not None]
@@ -192,7 +192,7 @@ class RenderedView:
         depth = None if self.depth is None else self.depth[window]
         return Instance(index, item.obj_id, left, top, rendered, mask, visible, depth, nearest[window], np.array(item.cam_t_m2c))
 
-    def _mask(self, kind: str, index: int) -> Mask | None:
+    def _mask(self, kind: str, index: int) -> StoredMask | None:
         """Mask of an instance; None: it is missing, or of another size than the image."""
         masks = self.view.masks.get(kind)
         found = None if masks is None else masks[index]

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from synpick_warp.apps.validation.comparison import Instance, RenderedView, best_shift, fit_masks, moved
+from synpick_warp.apps.validation.comparison import ComparedView, Instance, best_shift, fit_masks, moved
 
 SCALE_SPREAD = 0.003
 """Largest spread of the instances' ratios of depth to the model, for depth as a whole to be scaled."""
@@ -71,7 +71,7 @@ class Finding:
         return index in (self.index, self.other) or (self.index is None and unit == "mm")
 
 
-class DiagnosedView(RenderedView):
+class DiagnosedView(ComparedView):
     """A re-rendered view with what was found in it: the subject of the rules about poses."""
 
     @cached_property
@@ -89,7 +89,7 @@ class DiagnosedView(RenderedView):
         return found
 
 
-def diagnose(rendered: RenderedView) -> list[Finding]:
+def diagnose(rendered: ComparedView) -> list[Finding]:
     """Find all contradictions between the rendering of a view and its files."""
     instances = rendered.instances
     fits = {item.index: _outline_fits(item, rendered) for item in instances}
@@ -125,7 +125,7 @@ def _reference(item: Instance, tolerance: float) -> tuple[np.ndarray, np.ndarray
     return item.visible, item.visible_part(tolerance)
 
 
-def _outline_fits(item: Instance, rendered: RenderedView) -> bool:
+def _outline_fits(item: Instance, rendered: ComparedView) -> bool:
     """Whether mask and silhouette agree. Without amodal masks it is enough that visible pixels lie in the silhouette."""
     mask, silhouette = _reference(item, rendered.tolerance)
     within = None if rendered.given is None else rendered.given.px
@@ -136,7 +136,7 @@ def _outline_fits(item: Instance, rendered: RenderedView) -> bool:
     )
 
 
-def _check_depth(rendered: RenderedView, instances: list[Instance]) -> tuple[list[Finding], float | None]:
+def _check_depth(rendered: ComparedView, instances: list[Instance]) -> tuple[list[Finding], float | None]:
     """Depth as a whole: scaled, or ray lengths. Returns the finding, and the scale if it is one."""
     view, tolerance = rendered.view, rendered.tolerance
     parts = [item for item in instances if np.count_nonzero(item.seen) >= 20]
@@ -186,7 +186,7 @@ def _overlap(item: Instance, other: Instance) -> float:
     return shared / max(1, np.count_nonzero(one if item.mask is None else one | two))
 
 
-def _explain(item: Instance, rendered: RenderedView) -> Finding:
+def _explain(item: Instance, rendered: ComparedView) -> Finding:
     """Classify a mismatch of mask and silhouette: shifted mask, other object, wrong pose or wrong mask."""
     tolerance, place = rendered.tolerance, f"image {rendered.view.image}, instance {item.index}"
     mask, silhouette = _reference(item, tolerance)
@@ -220,7 +220,7 @@ def _find_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int] | N
     return (right, down) if after > max(0.9, before) else None
 
 
-def _find_object(item: Instance, mask: np.ndarray, rendered: RenderedView) -> int | None:
+def _find_object(item: Instance, mask: np.ndarray, rendered: ComparedView) -> int | None:
     """obj_id of another object of the view whose silhouette at this pose fits the mask; None: there is none."""
     if item.mask is None:
         return None
@@ -250,7 +250,7 @@ def _pose_agrees(item: Instance, mask: np.ndarray, tolerance: float) -> bool:
     return bool(count > 0 and np.count_nonzero(agreeing) >= AGREEING * count)
 
 
-def _describe_offset(item: Instance, rendered: RenderedView, shift: tuple[int, int] | None, iou: float) -> str:
+def _describe_offset(item: Instance, rendered: ComparedView, shift: tuple[int, int] | None, iou: float) -> str:
     """Size of a pose error: sideways from the shift of the mask, along the ray from depth in it."""
     assert rendered.matrix is not None
     distance = float(item.translation[2])
@@ -281,7 +281,7 @@ def _moved_depth(depth: np.ndarray, columns: int, rows: int) -> np.ndarray:
     return np.where(moved(np.isfinite(depth), columns, rows), result, np.float32(np.inf))
 
 
-def _check_instance(item: Instance, rendered: RenderedView) -> list[Finding]:
+def _check_instance(item: Instance, rendered: ComparedView) -> list[Finding]:
     """Depth inside the visible mask, and pixels that the mask leaves out, of an instance whose outline fits."""
     if item.depth is None or item.visible is None:
         return []

@@ -143,7 +143,7 @@ def apply_rules(
             yield Violation(Level.ERROR, getattr(subject, "place", "."), item.name, f"cannot be checked: {error}")
 
 
-class Distribution(NamedTuple):
+class DeviationSummary(NamedTuple):
     """Distribution of the deviations of one rule over the instances of an object, or of all."""
 
     rule: str
@@ -156,14 +156,14 @@ class Distribution(NamedTuple):
     largest: float
 
 
-def distributions(deviations: Mapping[tuple[str, int], Sequence[float]]) -> list[Distribution]:
+def distributions(deviations: Mapping[tuple[str, int], Sequence[float]]) -> list[DeviationSummary]:
     """Distributions of deviations by (rule, obj_id): of each rule over all objects, then over each, in the order of the rules."""
     found = []
     for item in load_rules().values():
         parts = {obj_id: np.array(values) for (rule, obj_id), values in sorted(deviations.items()) if rule == item.name}
         if parts:
             every = {None: np.concatenate(list(parts.values()))} | parts
-            found += [Distribution(item.name, obj_id, item.unit, len(part), *_summarize(part)) for obj_id, part in every.items()]
+            found += [DeviationSummary(item.name, obj_id, item.unit, len(part), *_summarize(part)) for obj_id, part in every.items()]
     return found
 
 

@@ -27,7 +27,7 @@ MAX_MODELS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class DepthPatch:
     """Depth of one object in a crop of the image."""
 
     left: int
@@ -54,7 +54,7 @@ class ObjectRenderer:
         matrix: np.ndarray,
         size: tuple[int, int],
         lens: LensMap | None = None,
-    ) -> Patch:
+    ) -> DepthPatch:
         """Render an object.
 
         Args:
@@ -73,13 +73,13 @@ class ObjectRenderer:
         points = mesh.vertices.astype(np.float64) @ rotation.T + translation * _MILLIMETRE
         left, top, right, bottom = _crop(points, matrix, size, lens)
         if left >= right or top >= bottom:
-            return Patch(0, 0, np.full((0, 0), np.inf, np.float32))
+            return DepthPatch(0, 0, np.full((0, 0), np.inf, np.float32))
         shifted = matrix - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
         bent = None if lens is None else lens.cropped(left, top, (right - left, bottom - top))
         camera = Camera(right - left, bottom - top, shifted, rotation, translation * _MILLIMETRE, lens=bent)
         depth = render_object(object_scene(meshes, keep, (camera,), self.device), 0).depth.numpy()[0]
         depth = depth[: bottom - top, : right - left].astype(np.float32)
-        return Patch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
+        return DepthPatch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
 
     def has(self, obj_id: int) -> bool:
         """Whether an object has a model that can be rendered; others are left to the rules about models."""

@@ -15,7 +15,7 @@ from synpick_warp.apps.validation.model_files import ModelsFolder
 from synpick_warp.apps.validation.registry import Level, Tolerance, Violation, apply_rules
 from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
 from synpick_warp.apps.validation.subjects import TargetLists, TreeSubject
-from synpick_warp.apps.validation.tasks import CheckModel, CheckPicks, CheckRig, CheckScene, State, Task
+from synpick_warp.apps.validation.tasks import CheckModel, CheckPicks, CheckRig, CheckScene, TaskState, ValidationTask
 from synpick_warp.dataset.bop.images import KeyedFolder
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.commit.manifest import committed_episodes, read_manifest, read_settings
@@ -33,7 +33,7 @@ VIEWS_PER_PROCESS = 100
 
 
 @dataclass(frozen=True)
-class Options:
+class ValidationOptions:
     """What is checked, by how many processes."""
 
     sample: int | None = DEFAULT_SAMPLE
@@ -64,7 +64,7 @@ class Summary:
     """Deviations of instances by rule and obj_id, in the unit of the rule."""
 
 
-def validate(folder: Path, options: Options, summary: Summary, report: Report = ignore_progress) -> Iterator[Violation]:
+def validate(folder: Path, options: ValidationOptions, summary: Summary, report: Report = ignore_progress) -> Iterator[Violation]:
     """Check a data set by all rules.
 
     Args:
@@ -90,10 +90,10 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     models = list(_plan_models(layout))
     summary.models = len({task.obj_id for task in models if task.obj_id is not None})
     cameras, picks = _read_plan(layout)
-    tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(cameras, scenes)]
+    tasks: list[ValidationTask] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(cameras, scenes)]
     tasks += map(CheckPicks, committed_episodes(layout.root)) if picks else ()
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
-    program = WorkerProgram(partial(State, layout.root, options.tolerance), "process that validates")
+    program = WorkerProgram(partial(TaskState, layout.root, options.tolerance), "process that validates")
     rendered: set[tuple[tuple[str, int, str], int]] = set()
     for task, checked in zip(tasks, map_ordered(program, tasks, processes), strict=True):
         if isinstance(task, CheckScene):
@@ -153,7 +153,7 @@ def _plan_models(layout: Layout) -> Iterator[CheckModel]:
             yield CheckModel(name, obj_id)
 
 
-def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, options: Options) -> Iterator[Task]:
+def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, options: ValidationOptions) -> Iterator[ValidationTask]:
     """Parts of scenes, with the views that are rendered again: evenly spread over the views of all scenes."""
     total = sum(len(images) for _, images in scenes)
     sample = total if options.sample is None else min(options.sample, total)
@@ -171,7 +171,7 @@ def _plan_scenes(scenes: list[tuple[SceneRef, np.ndarray]], lists: TargetLists, 
         start += len(images)
 
 
-def _plan_rigs(cameras: int, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[Task]:
+def _plan_rigs(cameras: int, scenes: list[tuple[SceneRef, np.ndarray]]) -> Iterator[ValidationTask]:
     """Yield tasks for scenes that belong together: those of the cameras of an episode, or of the sensors of one scene."""
     groups: dict[tuple[str, int], list[SceneRef]] = {}
     sensors: dict[tuple[str, int], list[SceneRef]] = {}

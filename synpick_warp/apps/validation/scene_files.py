@@ -33,7 +33,7 @@ def png_type(data: bytes) -> tuple[int, str] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Mask:
+class StoredMask:
     """Mask of an instance as the crop (at left, top) that contains all of its pixels, with the image size, and how the file was encoded."""
 
     file: str
@@ -71,7 +71,7 @@ class Mask:
         return result
 
 
-def decode_mask(data: bytes, file: str) -> Mask:
+def decode_mask(data: bytes, file: str) -> StoredMask:
     """Decode a mask; raises as `decode_picture`."""
     image = decode_picture(data, file, DatasetError)
     size, kind = (image.shape[1], image.shape[0]), png_type(data)
@@ -82,14 +82,14 @@ def decode_mask(data: bytes, file: str) -> Mask:
     crop = image[top : top + height, left : left + width]
     filled = crop > 0
     binary = int(crop.sum(dtype=np.int64)) == 255 * int(np.count_nonzero(filled))
-    return Mask(file, size, left, top, filled, binary, kind)
+    return StoredMask(file, size, left, top, filled, binary, kind)
 
 
-def crop_mask(image: np.ndarray, file: str, *, binary: bool = True, kind: tuple[int, str] | None = (8, "greyscale")) -> Mask:
+def crop_mask(image: np.ndarray, file: str, *, binary: bool = True, kind: tuple[int, str] | None = (8, "greyscale")) -> StoredMask:
     """Mask from a whole image (H, W) bool."""
     left, top, width, height = cv2.boundingRect(np.ascontiguousarray(image).view(np.uint8))
     crop = np.ascontiguousarray(image[top : top + height, left : left + width])
-    return Mask(file, (image.shape[1], image.shape[0]), left, top, crop, binary, kind)
+    return StoredMask(file, (image.shape[1], image.shape[0]), left, top, crop, binary, kind)
 
 
 _DIGITS = 6
@@ -169,7 +169,7 @@ class FolderScene(FolderImages):
                 return place, decode_json(self.listing.read(file, MAX_JSON), Coco, place, DatasetError)
         return None
 
-    def mask(self, kind: str, image: int, index: int) -> Mask | None:
+    def mask(self, kind: str, image: int, index: int) -> StoredMask | None:
         """Decode a mask; None: there is none. Raises DatasetError if it cannot be decoded."""
         data = self.read(kind, image, index, MAX_JSON)
         return None if data is None else decode_mask(data, self.file(kind, image, index))
@@ -206,7 +206,7 @@ class KeyedScene(KeyedImages):
         """None: keyed layouts have no COCO file. See `FolderScene`."""
         return None
 
-    def mask(self, kind: str, image: int, index: int) -> Mask | None:
+    def mask(self, kind: str, image: int, index: int) -> StoredMask | None:
         """Mask of an instance, decoded from the view's run lengths; None: there is none. See `FolderScene`."""
         if self._masks is None or self._masks[0] != (kind, image):
             data = self.read(kind, image, None, MAX_JSON)

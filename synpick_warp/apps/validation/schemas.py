@@ -14,7 +14,7 @@ PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
 
 
-class Camera(ForeignCameraEntry, gc=False):
+class CameraSchema(ForeignCameraEntry, gc=False):
     """Schema of an entry of scene_camera.json: intrinsics [px], depth scale [mm per count], world-to-camera rotation and translation [mm];
     UNSET: missing.
     """
@@ -24,7 +24,7 @@ class Camera(ForeignCameraEntry, gc=False):
     cam_R_w2c: Matrix3 | UnsetType = UNSET  # noqa: N815
 
 
-class Truth(TruthEntry, gc=False):
+class TruthSchema(TruthEntry, gc=False):
     """Schema of an instance's entry in scene_gt.json: object-to-camera rotation and translation [mm], obj_id."""
 
     cam_R_m2c: Matrix3  # noqa: N815
@@ -79,7 +79,7 @@ class Coco(Struct, gc=False):
     categories: list[Category]
 
 
-RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[Info], "graph": GraphEntry}
+RECORDS: dict[str, Any] = {"camera": CameraSchema, "gt": list[TruthSchema], "gt_info": list[Info], "graph": GraphEntry}
 """Schema of an image's entry by file."""
 
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from synpick_warp.apps.validation.scene_files import CheckedScene, Mask, RecordFile, png_type
-from synpick_warp.apps.validation.schemas import Annotation, Camera, Coco, Info, Truth
+from synpick_warp.apps.validation.scene_files import CheckedScene, RecordFile, StoredMask, png_type
+from synpick_warp.apps.validation.schemas import Annotation, CameraSchema, Coco, Info, TruthSchema
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
@@ -73,12 +73,12 @@ class SceneSubject:
         return self.files.record(name)
 
     @property
-    def cameras(self) -> dict[int, Camera]:
+    def cameras(self) -> dict[int, CameraSchema]:
         """Entries of scene_camera.json by image, those that fit the schema."""
         return self.record("camera").entries
 
     @property
-    def truths(self) -> dict[int, list[Truth]]:
+    def truths(self) -> dict[int, list[TruthSchema]]:
         """Entries of scene_gt.json by image, those that fit the schema."""
         return self.record("gt").entries
 
@@ -112,7 +112,7 @@ class SceneSubject:
         return next((name for name in COLOURS if name in self.files.kinds), None)
 
 
-class Picture(NamedTuple):
+class CheckedPicture(NamedTuple):
     """Decoded image of a view."""
 
     file: str
@@ -137,17 +137,17 @@ class ViewSubject:
         """Files that cannot be decoded: (file, why)."""
         self.camera = scene.cameras.get(image)
         truths, infos = scene.truths.get(image), scene.infos.get(image)
-        self.truths: list[Truth] = truths or []
+        self.truths: list[TruthSchema] = truths or []
         self.infos: list[Info] = infos if infos is not None and len(infos) == len(self.truths) else []
         """As long as `truths`, or empty."""
 
     @cached_property
-    def colour(self) -> Picture | None:
+    def colour(self) -> CheckedPicture | None:
         """Colour or greyscale image."""
         return self._picture(self.scene.colour) if self.scene.colour else None
 
     @cached_property
-    def depth_file(self) -> Picture | None:
+    def depth_file(self) -> CheckedPicture | None:
         """Depth image."""
         return self._picture("depth")
 
@@ -157,7 +157,7 @@ class ViewSubject:
         return None if self.depth_file is None or self.depth_file.pixels.ndim != 2 else self.depth_file.pixels
 
     @cached_property
-    def masks(self) -> dict[str, list[Mask | None]]:
+    def masks(self) -> dict[str, list[StoredMask | None]]:
         """Amodal ("mask") and visible masks ("mask_visib") by ground-truth index; None: the file is missing or cannot be decoded."""
         return {name: [self._mask(name, index) for index in range(len(self.truths))] for name in MASKS if name in self.scene.files.kinds}
 
@@ -169,17 +169,17 @@ class ViewSubject:
                 return found.size
         return next((mask.size for masks in self.masks.values() for mask in masks if mask is not None), None)
 
-    def _mask(self, kind: str, index: int) -> Mask | None:
+    def _mask(self, kind: str, index: int) -> StoredMask | None:
         """Mask of an instance; None: missing, or a fault."""
         return self._try(self.scene.files.file(kind, self.image, index), lambda: self.scene.files.mask(kind, self.image, index))
 
-    def _picture(self, kind: str) -> Picture | None:
+    def _picture(self, kind: str) -> CheckedPicture | None:
         """Image of a kind; None: missing, or a fault."""
         file = self.scene.files.file(kind, self.image)
 
-        def read() -> Picture | None:
+        def read() -> CheckedPicture | None:
             data = self.scene.files.read(kind, self.image, None, MAX_IMAGE_FILE)
-            return None if data is None else Picture(file, decode_picture(data, file, DatasetError), png_type(data))
+            return None if data is None else CheckedPicture(file, decode_picture(data, file, DatasetError), png_type(data))
 
         return self._try(file, read)
 

@@ -16,7 +16,7 @@ from synpick_warp.apps.validation.subjects import SceneSubject, ViewSubject
 from synpick_warp.dataset.bop.layout import Layout, Listing, SceneRef
 
 
-class Checked(NamedTuple):
+class TaskResult(NamedTuple):
     """Result of a validation task, which checks a scene or a part of its views."""
 
     violations: list[Violation]
@@ -28,7 +28,7 @@ class Checked(NamedTuple):
     """(rule, obj_id, value) of each deviation; empty without a tolerance."""
 
 
-class State:
+class TaskState:
     """State that a process keeps between tasks: layout, tolerance, scene that was read last, renderer."""
 
     def __init__(self, folder: Path, tolerance: Tolerance | None = None) -> None:
@@ -61,10 +61,10 @@ class State:
         return self._models[1]
 
 
-class Task(Protocol):
+class ValidationTask(Protocol):
     """A message to a process; see `WorkerProgram`."""
 
-    def __call__(self, state: State) -> Checked:
+    def __call__(self, state: TaskState) -> TaskResult:
         """Check."""
         ...
 
@@ -76,10 +76,10 @@ class CheckModel:
     folder: str
     obj_id: int | None
 
-    def __call__(self, state: State) -> Checked:
-        """See `Task`."""
+    def __call__(self, state: TaskState) -> TaskResult:
+        """See `ValidationTask`."""
         folder = state.models(self.folder)
-        return Checked(list(apply_rules(folder if self.obj_id is None else ModelSubject(folder, self.obj_id))))
+        return TaskResult(list(apply_rules(folder if self.obj_id is None else ModelSubject(folder, self.obj_id))))
 
 
 @dataclass(frozen=True)
@@ -99,15 +99,15 @@ class CheckScene:
     """Images that are rendered again."""
     targets: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self, state: State) -> Checked:
-        """See `Task`."""
+    def __call__(self, state: TaskState) -> TaskResult:
+        """See `ValidationTask`."""
         scene = state.scene(self.ref, self.targets)
         violations: list[Violation] = []
         deviations: list[tuple[str, int, float]] = []
         if self.first == 0:
             violations += apply_rules(scene, state.tolerance, deviations)
         if not self.images:
-            return Checked(violations, deviations=deviations)
+            return TaskResult(violations, deviations=deviations)
         images = scene.images[self.first : self.last]
         rendered: list[int] = []
         for image in images:
@@ -118,7 +118,7 @@ class CheckScene:
 
                 rendered.append(image)
                 violations += apply_rules(DiagnosedView(view, state.renderer, state.tolerance), state.tolerance, deviations)
-        return Checked(violations, len(images), rendered, deviations)
+        return TaskResult(violations, len(images), rendered, deviations)
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,10 @@ class CheckRig:
     refs: tuple[SceneRef, ...]
     cameras: int
 
-    def __call__(self, state: State) -> Checked:
-        """See `Task`."""
+    def __call__(self, state: TaskState) -> TaskResult:
+        """See `ValidationTask`."""
         scenes = tuple(SceneSubject(state.layout, open_scene(state.layout, ref)) for ref in self.refs)
-        return Checked(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))
+        return TaskResult(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))
 
 
 @dataclass(frozen=True)
@@ -140,8 +140,8 @@ class CheckPicks:
 
     index: int
 
-    def __call__(self, state: State) -> Checked:
-        """See `Task`."""
+    def __call__(self, state: TaskState) -> TaskResult:
+        """See `ValidationTask`."""
         from synpick_warp.apps.validation.rules.trials import PicksSubject
 
         violations = []
@@ -149,4 +149,4 @@ class CheckPicks:
             violations.append(violation)
             if violation.rule == "picks-tables":
                 break  # The other rules read the same tables.
-        return Checked(violations)
+        return TaskResult(violations)

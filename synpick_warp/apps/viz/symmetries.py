@@ -12,7 +12,7 @@ import numpy as np
 from synpick_warp.apps.viz.drawing import Image, blank, put_text, stacked, with_text, write_picture
 from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
 from synpick_warp.scenes.symmetries.groups import describe_counts
-from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.scenes.types import RawObject
 
 MAX_OBJECTS = 32
@@ -60,7 +60,7 @@ def group_turns(raw: RawObject) -> list[Turn]:
 
 def _row(raw: RawObject, tolerance: float) -> Image:
     """Panels of an object: itself with its axes, and up to four rotations with their distances."""
-    surface, turns = Surface(raw.mesh.vertices, raw.mesh.faces), group_turns(raw)
+    surface, turns = SampledSurface(raw.mesh.vertices, raw.mesh.faces), group_turns(raw)
     scale = 0.4 * _SIDE / (raw.hull.diameter / 2.0)
     itself = _Drawn(surface.points, surface.normals, np.full((len(surface.points), 3), 200, np.uint8))
     first = _splat([itself], surface.center, scale)
@@ -76,7 +76,9 @@ def _row(raw: RawObject, tolerance: float) -> Image:
     return np.concatenate(panels, axis=1)
 
 
-def _overlay(surface: Surface, itself: _Drawn, turn: Turn, matrix: np.ndarray, scale: float, tolerance: float, diameter: float) -> Image:
+def _overlay(
+    surface: SampledSurface, itself: _Drawn, turn: Turn, matrix: np.ndarray, scale: float, tolerance: float, diameter: float
+) -> Image:
     """An object in grey and its rotated self, coloured by distance, which is drawn where both coincide."""
     moved = surface.points @ matrix[:3, :3].T + matrix[:3, 3]
     level = (_BLUE + (255.0 - _BLUE) * np.minimum(surface.distances(moved) / (2.0 * tolerance), 1.0)).astype(np.uint8)

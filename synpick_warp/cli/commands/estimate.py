@@ -14,8 +14,8 @@ from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.errors import ConfigError, OutputError, escape, format_value
 
 if TYPE_CHECKING:
-    from synpick_warp.apps.estimation.run import Options, Run
-    from synpick_warp.apps.estimation.scenes import Selection
+    from synpick_warp.apps.estimation.run import EstimationOptions, EstimationRun
+    from synpick_warp.apps.estimation.scenes import ImageSelection
 
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
@@ -90,7 +90,9 @@ def estimate(
     return 0
 
 
-def run_method(data: Path, selection: Selection, options: Options, out: Path, *, split: str | None = None) -> tuple[Run, Path | None]:
+def run_method(
+    data: Path, selection: ImageSelection, options: EstimationOptions, out: Path, *, split: str | None = None
+) -> tuple[EstimationRun, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
     from synpick_warp.apps.estimation.gicp import Aligner, read_object_models
     from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
@@ -121,7 +123,7 @@ def run_method(data: Path, selection: Selection, options: Options, out: Path, *,
 
 def make_selection(
     method: str, every: int | None, targets: Path | None, modes: str | None, cameras: str | None, episodes: str | None
-) -> Selection:
+) -> ImageSelection:
     """Make the selection of images from the command's options, which are checked.
 
     Raises:
@@ -129,7 +131,7 @@ def make_selection(
         ResultError: The target list cannot be read.
     """
     from synpick_warp.apps.estimation.run import METHODS, SPARSE, TRACK
-    from synpick_warp.apps.estimation.scenes import Selection
+    from synpick_warp.apps.estimation.scenes import ImageSelection
     from synpick_warp.apps.evaluation.targets import read_targets
 
     if method not in METHODS:
@@ -140,7 +142,7 @@ def make_selection(
         raise ConfigError("--method track takes every frame, so neither --every nor --targets; `eval --targets` scores some of them")
     if targets is not None and every is not None:
         raise ConfigError("--every and --targets both choose images; drop one of them")
-    return Selection(
+    return ImageSelection(
         modes=None if modes is None else tuple(name.strip() for name in modes.split(",")),
         cameras=None if cameras is None else parse_indices("--cameras", cameras),
         episodes=None if episodes is None else parse_indices("--episodes", episodes),
@@ -149,13 +151,13 @@ def make_selection(
     )
 
 
-def make_options(method: str, depth: str, visib_min: float, seed: int, threads: int) -> Options:
+def make_options(method: str, depth: str, visib_min: float, seed: int, threads: int) -> EstimationOptions:
     """Make the options of the estimation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed.
     """
-    from synpick_warp.apps.estimation.run import DEPTHS, Options
+    from synpick_warp.apps.estimation.run import DEPTHS, EstimationOptions
 
     if depth not in DEPTHS:
         raise ConfigError(f"--depth is {format_value(depth)}; allowed: {', '.join(DEPTHS)}")
@@ -163,7 +165,7 @@ def make_options(method: str, depth: str, visib_min: float, seed: int, threads: 
     check_range("--seed", seed, 0, _MAX_SEED)
     check_range("--threads", threads, 0, MAX_THREADS)
     given = {"threads": threads} if threads else {}
-    return Options(method, depth, visib_min, seed, **given)
+    return EstimationOptions(method, depth, visib_min, seed, **given)
 
 
 def parse_indices(option: str, text: str) -> tuple[int, ...]:
@@ -187,7 +189,7 @@ def targets_file(out: Path) -> Path:
     return out.with_name(f"{out.stem}-targets.json")
 
 
-def check_output(out: Path, selection: Selection) -> None:
+def check_output(out: Path, selection: ImageSelection) -> None:
     """Check the output before anything is read.
 
     Raises:
@@ -200,6 +202,6 @@ def check_output(out: Path, selection: Selection) -> None:
         raise OutputError(f"--out is {out}, which would replace {given.path}; name another file")
 
 
-def describe_run(run: Run) -> str:
+def describe_run(run: EstimationRun) -> str:
     """One line on a run: views, poses, rate."""
     return f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({len(run.poses) / max(run.wall, 1e-9):,.0f} poses/s)"

@@ -16,7 +16,7 @@ from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
     from synpick_warp.apps.validation.registry import Violation
-    from synpick_warp.apps.validation.run import Options, Summary
+    from synpick_warp.apps.validation.run import Summary, ValidationOptions
 
 EXIT_VIOLATIONS = 1
 _MAX_SAMPLE = 10**9
@@ -80,14 +80,14 @@ def validate(
     return EXIT_VIOLATIONS if summary.errors else 0
 
 
-def _make_options(sample: int | None, threads: int, tolerance: str | None, *, poses: bool, fast: bool) -> Options:
+def _make_options(sample: int | None, threads: int, tolerance: str | None, *, poses: bool, fast: bool) -> ValidationOptions:
     """Make the options of the validation from the command's options, which are checked.
 
     Raises:
         ConfigError: A value is not allowed, or two options exclude each other.
     """
     from synpick_warp.apps.validation.registry import parse_tolerance
-    from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, Options
+    from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, ValidationOptions
 
     if fast and (poses or sample):
         raise ConfigError("--fast reads no images, so it renders none; drop it, or --sample and --poses")
@@ -97,7 +97,7 @@ def _make_options(sample: int | None, threads: int, tolerance: str | None, *, po
     check_range("--threads", threads, 0, MAX_THREADS)
     given: dict[str, Any] = {"threads": threads} if threads else {}
     bounds = None if tolerance is None else parse_tolerance(tolerance)
-    return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, tolerance=bounds, **given)
+    return ValidationOptions(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, tolerance=bounds, **given)
 
 
 def _describe(violation: Violation) -> str:

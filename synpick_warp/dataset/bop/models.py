@@ -11,7 +11,7 @@ from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
 from synpick_warp.dataset.bop.layout import RENDERING_MODELS
 from synpick_warp.errors import DatasetError
-from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
+from synpick_warp.scenes.assets.models_info import FileModelInfo, read_models_info
 from synpick_warp.system.inputs.files import check_regular_file
 from synpick_warp.system.inputs.paths import path_inside
 
@@ -32,7 +32,7 @@ def models_folder(folder: Path) -> str:
     return next((name for name in RENDERING_MODELS if (folder / name).is_dir()), RENDERING_MODELS[0])
 
 
-def find_models(folder: Path, object_ids: Iterable[int], purpose: str) -> dict[int, tuple[Path, ModelInfo]]:
+def find_models(folder: Path, object_ids: Iterable[int], purpose: str) -> dict[int, tuple[Path, FileModelInfo]]:
     """Find the models of objects.
 
     Args:

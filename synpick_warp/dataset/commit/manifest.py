@@ -34,7 +34,7 @@ from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.files.load import load_config, override_config, table_lists
 from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.schema import CLASSIC, COLUMN, WITHIN, Config
-from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
+from synpick_warp.dataset.records import Entry, IndicesEntry, Manifest, RecordedEpisode, read_record
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import format_table
 from synpick_warp.exporters.writing.checksums import parse_checksums
@@ -321,9 +321,9 @@ def read_entry(folder: Path, entry: Path) -> dict[str, Any] | None:
     path = path_inside(folder, f"{entry}.json", folder, DatasetError)
     if not os.path.lexists(path):
         return None
-    schema = {CONSTANTS: Entry, INDICES: IndicesEntry}.get(entry, EpisodeEntry)
+    schema = {CONSTANTS: Entry, INDICES: IndicesEntry}.get(entry, RecordedEpisode)
     content, raw = read_record(path, schema, entry_advice(entry))
-    if isinstance(content, EpisodeEntry) and content.episode != int(entry.name):
+    if isinstance(content, RecordedEpisode) and content.episode != int(entry.name):
         raise DatasetError(f"{path} is damaged: it is of episode {content.episode}; {entry_advice(entry)}")
     return raw
 

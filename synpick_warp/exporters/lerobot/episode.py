@@ -13,13 +13,13 @@ import numpy as np
 
 from synpick_warp.configs.cell.rig import Size
 from synpick_warp.exporters.lerobot.layout import part_path, video_path
-from synpick_warp.exporters.lerobot.part import TICK, Part, describe_tasks, make_rows
+from synpick_warp.exporters.lerobot.part import TICK, LerobotPart, describe_tasks, make_rows
 from synpick_warp.exporters.lerobot.video import GROUP, join_groups
 from synpick_warp.exporters.writing.files import sync_file, sync_folder, write_synced
 
 
 @dataclass(frozen=True)
-class EpisodeSettings:
+class LerobotSettings:
     """Settings common to all episodes: data set, cameras, image sizes [px], frame rate [1/s], object names by obj_id."""
 
     out: Path
@@ -37,7 +37,7 @@ class EpisodeSettings:
 
 
 @dataclass(frozen=True)
-class EpisodeContent:
+class LerobotContent:
     """Content of an episode besides its videos: mode, ending, objects picked, rows of `TICK`, lines of attempts.jsonl."""
 
     episode: int
@@ -60,7 +60,7 @@ def frame_path(folder: Path, camera: int, frame: int) -> Path:
     return folder / f"{camera}-{frame:06d}.frame"
 
 
-def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSettings) -> None:
+def commit_episode(folder: Path, content: LerobotContent, settings: LerobotSettings) -> None:
     """Task: join the videos of an episode and rename part and videos to their places, the part first: by it a resumed bake finds them."""
     ticks = np.frombuffer(content.ticks, TICK)
     groups = range(-(-len(ticks) // GROUP))
@@ -73,7 +73,7 @@ def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSetti
     attempts = [json.loads(line) for line in content.attempts]
     sentences, tasks = describe_tasks(content.mode, len(ticks), attempts, settings.objects, settings.noun)
     rows = make_rows(ticks, attempts, sentences, tasks)
-    part = Part(len(ticks), content.mode, content.ending, len(attempts), content.picked, sentences, rows.tobytes(), levels)
+    part = LerobotPart(len(ticks), content.mode, content.ending, len(attempts), content.picked, sentences, rows.tobytes(), levels)
     write_synced(folder / "part", msgspec.json.encode(part))
     for source, place in ((folder / "part", settings.out / part_path(content.episode)), *videos):
         make_folders(settings.out, place.parent)

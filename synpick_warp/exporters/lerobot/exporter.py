@@ -16,7 +16,7 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Physics
 from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
-from synpick_warp.exporters.lerobot.episode import EpisodeContent, EpisodeSettings, commit_episode, frame_path, group_path
+from synpick_warp.exporters.lerobot.episode import LerobotContent, LerobotSettings, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
     CARD,
@@ -49,7 +49,7 @@ _MAX_DENOMINATOR = 100_000
 
 
 @dataclass(eq=False)
-class _Content:
+class _LerobotContent:
     """What is kept of an episode whose frames are being spooled and encoded."""
 
     ticks: bytearray = field(default_factory=bytearray)
@@ -58,10 +58,10 @@ class _Content:
     """Spooled frames of each (camera, group) that is not encoded yet."""
 
 
-_Staged = StagedEpisode[_Content]
+_Staged = StagedEpisode[_LerobotContent]
 
 
-class LerobotExporter(EpisodeExporter[_Content]):
+class LerobotExporter(EpisodeExporter[_LerobotContent]):
     """`Exporter` of LeRobot v3. Episode k becomes a video a camera and a part, from which the tables of all episodes are made at the end.
 
     Views are spooled as planes; GROUP of them are encoded together, so that little disk space is used twice.
@@ -77,7 +77,7 @@ class LerobotExporter(EpisodeExporter[_Content]):
         super().__init__(context)
         settings, rig = context.settings, context.settings.rig
         known = (video_rate(settings.physics), context.names, settings.bins[0].noun)
-        self._settings = EpisodeSettings(context.out, rig.names, rig.sizes, *known)
+        self._settings = LerobotSettings(context.out, rig.names, rig.sizes, *known)
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
@@ -163,14 +163,14 @@ class LerobotExporter(EpisodeExporter[_Content]):
         return WriteTask(commit_episode, (), (episode.folder, content, self._settings), place)
 
 
-def _make_content(_: Path) -> _Content:
-    return _Content()
+def _make_content(_: Path) -> _LerobotContent:
+    return _LerobotContent()
 
 
-def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
+def make_content(end: EpisodeEnd, ticks: bytes) -> LerobotContent:
     """What the part of an episode is made of."""
     row = end.row
-    return EpisodeContent(
+    return LerobotContent(
         end.episode, str(row.get("mode", "")), Ending(end.ending).name.lower(), int(row.get("picked", 0)), ticks, end.attempts
     )
 

@@ -41,7 +41,7 @@ from synpick_warp.exporters.lerobot.layout import (
     part_path,
     split_name,
 )
-from synpick_warp.exporters.lerobot.part import Part, outcome_names
+from synpick_warp.exporters.lerobot.part import LerobotPart, outcome_names
 from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
 from synpick_warp.exporters.writing.notes import describe_lenses
@@ -117,7 +117,7 @@ def _read_tables(
     period = 1.0 / rate
     for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
         name = part_path(source)
-        part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
+        part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), LerobotPart, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
         for levels, pixels in zip(part.levels, (part.frames * math.prod(size) for size in sizes), strict=True):
@@ -129,7 +129,7 @@ def _read_tables(
         yield pa.table({name: _to_array(columns[name], feature) for name, feature in FRAME_FEATURES.items()}, _data_schema())
 
 
-def _make_columns(part: Part, totals: _Totals, period: float) -> dict[str, np.ndarray]:
+def _make_columns(part: LerobotPart, totals: _Totals, period: float) -> dict[str, np.ndarray]:
     """Columns of an episode's frames, with their indices in the whole data set."""
     rows = np.frombuffer(part.rows, ROW)
     frames = np.arange(part.frames)
@@ -151,7 +151,7 @@ def _make_columns(part: Part, totals: _Totals, period: float) -> dict[str, np.nd
     return {name: columns[name].astype(feature.dtype) for name, feature in FRAME_FEATURES.items()}
 
 
-def _add_episode(source: int, part: Part, columns: dict[str, np.ndarray], totals: _Totals, period: float) -> None:
+def _add_episode(source: int, part: LerobotPart, columns: dict[str, np.ndarray], totals: _Totals, period: float) -> None:
     """Add a row of the table of episodes, and the episode's statistics."""
     numbers = {name: describe_numbers(values.reshape(part.frames, -1)) for name, values in columns.items()}
     levels = {name: np.array(own) for name, own in zip(totals.levels, part.levels, strict=True)}

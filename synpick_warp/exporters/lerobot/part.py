@@ -27,7 +27,7 @@ TICK = np.dtype(
 """A frame as it comes from the simulation: cup to world, setpoint of the steps that led to it (NaN: none), suction, load."""
 
 
-class Part(msgspec.Struct):
+class LerobotPart(msgspec.Struct):
     """Schema of an episode's part: its frames, mode, ending, attempts and sentences, until the tables over all episodes are written."""
 
     frames: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]

@@ -29,7 +29,7 @@ LABELS = {
 
 
 @dataclass(frozen=True)
-class ArraySpec:
+class TrajectoryArray:
     """Schema of one array of the store: dimensions, type, unit (1: none), description, names of the values of an enumeration."""
 
     dims: tuple[str, ...]
@@ -51,7 +51,7 @@ class GroupSpec:
     """Schema of a group of arrays: description, arrays by name, and which of them are coordinates (CF conventions)."""
 
     description: str
-    arrays: Mapping[str, ArraySpec] = field(default_factory=dict)
+    arrays: Mapping[str, TrajectoryArray] = field(default_factory=dict)
     coordinates: tuple[str, ...] = ()
     """Names of the group's coordinate variables, as in the attribute `coordinates` of the CF conventions, which xarray reads."""
 
@@ -67,22 +67,26 @@ _LOAD = "Sum of the magnitudes of all contact forces on the body, mean over the 
 TICKS = GroupSpec(
     "One row per frame. An instance keeps its index through the episode. Time, poses and states are those that the frame's pictures show.",
     {
-        "time": ArraySpec(("tick",), "<f8", "s", "Simulated time since the episode's first frame."),
-        "object_id": ArraySpec(("tick", "instance"), "<i4", "1", "obj_id of the instance; -1: it is not in the scene."),
-        "pose": ArraySpec(("tick", "instance", "component"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
-        "fixture_pose": ArraySpec(("tick", "fixture", "component"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
-        "fixture_visible": ArraySpec(("tick", "fixture"), "|b1", "1", "Whether it is in the pictures."),
-        "phase": ArraySpec(("tick",), "<i4", "1", "Phase of the episode.", names(Phase)),
-        "task": ArraySpec(("tick",), "<i4", "1", "Task of the gripper at the frame.", names(Task)),
-        "attempt": ArraySpec(("tick",), "<i4", "1", "Number of the running attempt, or of the one that ended in this tick; -1: none yet."),
-        "outcome": ArraySpec(("tick",), "<i4", "1", "Outcome of the attempt that ended in this tick.", names(Outcome)),
-        "target": ArraySpec(("tick",), "<i4", "1", "Instance that the attempt was to pick; -1: none."),
-        "hits": ArraySpec(("tick",), "<i4", "1", "Rays of the cup that hit an object when the suction of the attempt was switched on."),
-        "engaged": ArraySpec(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
-        "attached": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
-        "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest force of any seal in any step of the tick."),
-        "support": ArraySpec(("tick", "instance", "instance"), "<f4", "N", _SUPPORT),
-        "static_support": ArraySpec(
+        "time": TrajectoryArray(("tick",), "<f8", "s", "Simulated time since the episode's first frame."),
+        "object_id": TrajectoryArray(("tick", "instance"), "<i4", "1", "obj_id of the instance; -1: it is not in the scene."),
+        "pose": TrajectoryArray(("tick", "instance", "component"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
+        "fixture_pose": TrajectoryArray(("tick", "fixture", "component"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
+        "fixture_visible": TrajectoryArray(("tick", "fixture"), "|b1", "1", "Whether it is in the pictures."),
+        "phase": TrajectoryArray(("tick",), "<i4", "1", "Phase of the episode.", names(Phase)),
+        "task": TrajectoryArray(("tick",), "<i4", "1", "Task of the gripper at the frame.", names(Task)),
+        "attempt": TrajectoryArray(
+            ("tick",), "<i4", "1", "Number of the running attempt, or of the one that ended in this tick; -1: none yet."
+        ),
+        "outcome": TrajectoryArray(("tick",), "<i4", "1", "Outcome of the attempt that ended in this tick.", names(Outcome)),
+        "target": TrajectoryArray(("tick",), "<i4", "1", "Instance that the attempt was to pick; -1: none."),
+        "hits": TrajectoryArray(
+            ("tick",), "<i4", "1", "Rays of the cup that hit an object when the suction of the attempt was switched on."
+        ),
+        "engaged": TrajectoryArray(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
+        "attached": TrajectoryArray(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
+        "peak_force": TrajectoryArray(("tick",), "<f4", "N", "Largest force of any seal in any step of the tick."),
+        "support": TrajectoryArray(("tick", "instance", "instance"), "<f4", "N", _SUPPORT),
+        "static_support": TrajectoryArray(
             ("tick", "instance"), "<f4", "N", "Upward force of bin or table on the instance, mean over the tick; with bop.graph only."
         ),
     },
@@ -92,32 +96,32 @@ STEPS = GroupSpec(
     "One row per step of physics. With S steps per tick, rows f S to f S + S - 1 are the steps that led to frame f; the last one is the "
     "state that the frame shows, but for what is put elsewhere after it: a gripper that appears or goes home, objects that leave.",
     {
-        "time": ArraySpec(("step",), "<f8", "s", "Simulated time at the step's end since the episode's first frame."),
-        "pose": ArraySpec(("step", "instance", "component"), "<f4", "m", f"Object to world at the step's end: {_POSE}{_GONE}"),
-        "velocity": ArraySpec(("step", "instance", "axis"), "<f4", "m/s", f"{_COM}{_GONE}"),
-        "angular_velocity": ArraySpec(("step", "instance", "axis"), "<f4", "rad/s", f"{_SPIN}{_GONE}"),
-        "contact_force": ArraySpec(("step", "instance", "axis"), "<f4", "N", f"{_CONTACT}{_GONE}"),
-        "contact_load": ArraySpec(("step", "instance"), "<f4", "N", f"{_LOAD}{_GONE}"),
-        "seal_force": ArraySpec(
+        "time": TrajectoryArray(("step",), "<f8", "s", "Simulated time at the step's end since the episode's first frame."),
+        "pose": TrajectoryArray(("step", "instance", "component"), "<f4", "m", f"Object to world at the step's end: {_POSE}{_GONE}"),
+        "velocity": TrajectoryArray(("step", "instance", "axis"), "<f4", "m/s", f"{_COM}{_GONE}"),
+        "angular_velocity": TrajectoryArray(("step", "instance", "axis"), "<f4", "rad/s", f"{_SPIN}{_GONE}"),
+        "contact_force": TrajectoryArray(("step", "instance", "axis"), "<f4", "N", f"{_CONTACT}{_GONE}"),
+        "contact_load": TrajectoryArray(("step", "instance"), "<f4", "N", f"{_LOAD}{_GONE}"),
+        "seal_force": TrajectoryArray(
             ("step", "instance"), "<f4", "N", f"Tension and shear that the instance's seal bore; 0: none holds it.{_GONE}"
         ),
-        "attached": ArraySpec(("step", "instance"), "|b1", "1", "Whether a seal holds the instance at the step's end."),
-        "gripper_pose": ArraySpec(("step", "link", "component"), "<f4", "m", f"Finger and cup to world at the step's end: {_POSE}"),
-        "gripper_velocity": ArraySpec(("step", "link", "axis"), "<f4", "m/s", _COM),
-        "gripper_angular_velocity": ArraySpec(("step", "link", "axis"), "<f4", "rad/s", _SPIN),
-        "gripper_contact_force": ArraySpec(("step", "link", "axis"), "<f4", "N", _CONTACT),
-        "gripper_contact_load": ArraySpec(("step", "link"), "<f4", "N", _LOAD),
-        "setpoint": ArraySpec(
+        "attached": TrajectoryArray(("step", "instance"), "|b1", "1", "Whether a seal holds the instance at the step's end."),
+        "gripper_pose": TrajectoryArray(("step", "link", "component"), "<f4", "m", f"Finger and cup to world at the step's end: {_POSE}"),
+        "gripper_velocity": TrajectoryArray(("step", "link", "axis"), "<f4", "m/s", _COM),
+        "gripper_angular_velocity": TrajectoryArray(("step", "link", "axis"), "<f4", "rad/s", _SPIN),
+        "gripper_contact_force": TrajectoryArray(("step", "link", "axis"), "<f4", "N", _CONTACT),
+        "gripper_contact_load": TrajectoryArray(("step", "link"), "<f4", "N", _LOAD),
+        "setpoint": TrajectoryArray(
             ("step", "axis"), "<f4", "m", "Setpoint of the wrist (the cup's tilt axis, origin of finger and cup) in the step. NaN: none."
         ),
-        "impedance_force": ArraySpec(
+        "impedance_force": TrajectoryArray(
             ("step", "axis"),
             "<f4",
             "N",
             "Impedance force on the gripper towards the setpoint, held for the step; without gravity compensation.",
         ),
-        "task": ArraySpec(("step",), "|i1", "1", "Task of the gripper in the step.", names(Task)),
-        "cup_force": ArraySpec(
+        "task": TrajectoryArray(("step",), "|i1", "1", "Task of the gripper in the step.", names(Task)),
+        "cup_force": TrajectoryArray(
             ("step", "cup"), "<f4", "N", "Tension and shear that each cup's seals bore; only of a gripper of several cups. 0: no seal."
         ),
     },
@@ -126,33 +130,33 @@ STEPS = GroupSpec(
 ARRANGEMENT = GroupSpec(
     "Which objects the episode has, and how they were first dropped.",
     {
-        "object_id": ArraySpec(("instance",), "<i4", "1", "obj_id of the instance; -1: there is none with this index."),
-        "mass": ArraySpec(("instance",), "<f8", "kg", "Its mass."),
-        "drop_pose": ArraySpec(("instance", "component"), "<f4", "m", f"Object to world where it began to fall: {_POSE}"),
+        "object_id": TrajectoryArray(("instance",), "<i4", "1", "obj_id of the instance; -1: there is none with this index."),
+        "mass": TrajectoryArray(("instance",), "<f8", "kg", "Its mass."),
+        "drop_pose": TrajectoryArray(("instance", "component"), "<f4", "m", f"Object to world where it began to fall: {_POSE}"),
     },
 )
 _UNSEEN = "nothing was seen"
 ATTEMPTS = GroupSpec(
     "One row per attempt to pick, as in attempts.jsonl.",
     {
-        "frame": ArraySpec(("attempt",), "<i4", "1", "Frame from which the target was chosen."),
-        "end_frame": ArraySpec(("attempt",), "<i4", "1", "Frame at which it was judged."),
-        "outcome": ArraySpec(("attempt",), "<i4", "1", "Outcome of the attempt.", names(Outcome)),
-        "target": ArraySpec(("attempt",), "<i4", "1", f"Instance that was chosen; -1: {_UNSEEN}."),
-        "object_id": ArraySpec(("attempt",), "<i4", "1", f"Its obj_id; -1: {_UNSEEN}."),
-        "point": ArraySpec(("attempt", "axis"), "<f8", "m", f"Where the cup's tip was to touch. NaN: {_UNSEEN}."),
-        "normal": ArraySpec(("attempt", "axis"), "<f8", "1", f"Unit normal there, out of the object. NaN: {_UNSEEN}."),
-        "yaw": ArraySpec(("attempt",), "<f8", "rad", f"Yaw of the finger about the vertical. NaN: {_UNSEEN}."),
-        "tilt": ArraySpec(("attempt",), "<f8", "rad", f"Tilt of the cup about the finger's y axis. NaN: {_UNSEEN}."),
-        "rays": ArraySpec(("attempt",), "<i4", "1", "Rays of the cup."),
-        "hits": ArraySpec(("attempt",), "<i4", "1", "Rays that hit an object when the suction was switched on."),
-        "good_seal": ArraySpec(("attempt",), "|b1", "1", "Whether the seals were of full strength."),
-        "engaged": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether a ray hit the instance."),
-        "picked": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether the instance left the scene on the cup."),
-        "peak_force": ArraySpec(
+        "frame": TrajectoryArray(("attempt",), "<i4", "1", "Frame from which the target was chosen."),
+        "end_frame": TrajectoryArray(("attempt",), "<i4", "1", "Frame at which it was judged."),
+        "outcome": TrajectoryArray(("attempt",), "<i4", "1", "Outcome of the attempt.", names(Outcome)),
+        "target": TrajectoryArray(("attempt",), "<i4", "1", f"Instance that was chosen; -1: {_UNSEEN}."),
+        "object_id": TrajectoryArray(("attempt",), "<i4", "1", f"Its obj_id; -1: {_UNSEEN}."),
+        "point": TrajectoryArray(("attempt", "axis"), "<f8", "m", f"Where the cup's tip was to touch. NaN: {_UNSEEN}."),
+        "normal": TrajectoryArray(("attempt", "axis"), "<f8", "1", f"Unit normal there, out of the object. NaN: {_UNSEEN}."),
+        "yaw": TrajectoryArray(("attempt",), "<f8", "rad", f"Yaw of the finger about the vertical. NaN: {_UNSEEN}."),
+        "tilt": TrajectoryArray(("attempt",), "<f8", "rad", f"Tilt of the cup about the finger's y axis. NaN: {_UNSEEN}."),
+        "rays": TrajectoryArray(("attempt",), "<i4", "1", "Rays of the cup."),
+        "hits": TrajectoryArray(("attempt",), "<i4", "1", "Rays that hit an object when the suction was switched on."),
+        "good_seal": TrajectoryArray(("attempt",), "|b1", "1", "Whether the seals were of full strength."),
+        "engaged": TrajectoryArray(("attempt", "instance"), "|b1", "1", "Whether a ray hit the instance."),
+        "picked": TrajectoryArray(("attempt", "instance"), "|b1", "1", "Whether the instance left the scene on the cup."),
+        "peak_force": TrajectoryArray(
             ("attempt", "lift_tick"), "<f8", "N", "Largest force of any seal in each tick since the suction came on. NaN: it is over."
         ),
-        "record": ArraySpec(("byte",), "|u1", "1", "The lines of attempts.jsonl, with what was seen of every object; JSON in UTF-8."),
+        "record": TrajectoryArray(("byte",), "|u1", "1", "The lines of attempts.jsonl, with what was seen of every object; JSON in UTF-8."),
     },
 )
 EPISODE_GROUPS = {"ticks": TICKS, "steps": STEPS, "arrangement": ARRANGEMENT, "attempts": ATTEMPTS}
@@ -161,21 +165,21 @@ EPISODE_GROUPS = {"ticks": TICKS, "steps": STEPS, "arrangement": ARRANGEMENT, "a
 OBJECTS = GroupSpec(
     "The objects of the bake, in the order of their obj_id; `names` in the group's attributes has their names.",
     {
-        "object_id": ArraySpec(("object",), "<i4", "1", "obj_id."),
-        "mass": ArraySpec(("object",), "<f8", "kg", "Mass."),
-        "center_of_mass": ArraySpec(("object", "axis"), "<f8", "m", "Centre of mass in the object's frame."),
-        "inertia": ArraySpec(("object", "axis", "axis"), "<f8", "kg·m²", "Inertia about the centre of mass, in the object's axes."),
-        "diameter": ArraySpec(("object",), "<f8", "m", "Largest distance between two points of the surface."),
-        "volume": ArraySpec(("object",), "<f8", "m³", "Volume of the collision shape."),
+        "object_id": TrajectoryArray(("object",), "<i4", "1", "obj_id."),
+        "mass": TrajectoryArray(("object",), "<f8", "kg", "Mass."),
+        "center_of_mass": TrajectoryArray(("object", "axis"), "<f8", "m", "Centre of mass in the object's frame."),
+        "inertia": TrajectoryArray(("object", "axis", "axis"), "<f8", "kg·m²", "Inertia about the centre of mass, in the object's axes."),
+        "diameter": TrajectoryArray(("object",), "<f8", "m", "Largest distance between two points of the surface."),
+        "volume": TrajectoryArray(("object",), "<f8", "m³", "Volume of the collision shape."),
     },
 )
 CAMERAS = GroupSpec(
     "The cameras, which do not move: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5).",
     {
-        "resolution": ArraySpec(("camera", "width_height"), "<i4", "px", "Width and height."),
-        "matrix": ArraySpec(("camera", "row", "column"), "<f8", "px", "K: camera to image."),
-        "rotation": ArraySpec(("camera", "row", "column"), "<f8", "1", "World to camera."),
-        "translation": ArraySpec(("camera", "axis"), "<f8", "m", "World to camera."),
+        "resolution": TrajectoryArray(("camera", "width_height"), "<i4", "px", "Width and height."),
+        "matrix": TrajectoryArray(("camera", "row", "column"), "<f8", "px", "K: camera to image."),
+        "rotation": TrajectoryArray(("camera", "row", "column"), "<f8", "1", "World to camera."),
+        "translation": TrajectoryArray(("camera", "axis"), "<f8", "m", "World to camera."),
     },
 )
 CONSTANT_GROUPS = {"objects": OBJECTS, "cameras": CAMERAS}

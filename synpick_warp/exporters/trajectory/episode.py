@@ -23,7 +23,7 @@ GROUP = "group"
 
 
 @dataclass(frozen=True)
-class EpisodeSettings:
+class TrajectorySettings:
     """Settings common to all episodes: trajectory settings, duration of a step [s], steps per tick, masses [kg] by obj_id."""
 
     trajectory: Trajectory
@@ -48,7 +48,7 @@ class EpisodeContent:
     """Lines of attempts.jsonl."""
 
 
-def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content: EpisodeContent, settings: EpisodeSettings) -> None:
+def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content: EpisodeContent, settings: TrajectorySettings) -> None:
     """Task: write an episode's group and rename it to its place.
 
     Args:
@@ -80,7 +80,7 @@ def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content:
     sync_folder(place.parent)
 
 
-def _write_rows(group: zarr.Group, rows: np.ndarray, settings: EpisodeSettings) -> None:
+def _write_rows(group: zarr.Group, rows: np.ndarray, settings: TrajectorySettings) -> None:
     """Write the groups `ticks` and `steps`, one array after the other to bound memory."""
     steps = settings.steps_per_tick
     for name, rows_per_tick in (("ticks", 1), ("steps", steps)):
@@ -117,7 +117,7 @@ class _FlattenedSteps:
         return values.reshape(-1, *self.shape[1:])
 
 
-def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: EpisodeSettings) -> None:
+def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: TrajectorySettings) -> None:
     """Write the group of an episode's objects: obj_id, mass and drop pose; NaN where unknown."""
     arrangement = add_group(group, "arrangement", ARRANGEMENT)
     drop_pose = content.drop_pose

@@ -16,7 +16,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
-from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, write_episode
+from synpick_warp.exporters.trajectory.episode import EpisodeContent, TrajectorySettings, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
 from synpick_warp.exporters.writing.files import output_errors
@@ -56,7 +56,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         """See `Exporter`."""
         super().__init__(context)
         settings = context.settings
-        self._settings = EpisodeSettings(
+        self._settings = TrajectorySettings(
             trajectory=settings.trajectory,
             step=settings.physics.step,
             steps_per_tick=settings.physics.steps_per_tick,

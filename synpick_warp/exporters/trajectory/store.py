@@ -13,7 +13,7 @@ from zarr.codecs import ZstdCodec
 
 from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.configs.schema import Physics, Trajectory
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
+from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, GroupSpec, TrajectoryArray
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Catalog, EnvironmentMap
 from synpick_warp.system.processes.threads import ZARR_THREADS
 
@@ -26,7 +26,7 @@ def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping
     return parent.create_group(name, attributes={"description": doc.description, **coordinates, **(attributes or {})})
 
 
-def add_array(group: zarr.Group, name: str, spec: ArraySpec, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
+def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
     """Write an array.
 
     Args:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
+from synpick_warp.exporters.usd.types import EpisodeMetadata, UsdSettings
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
 from synpick_warp.views.frames import TickBatch
 
@@ -78,7 +78,7 @@ def read_ticks(path: Path, instances: int) -> np.ndarray:
     return np.fromfile(path, tick_type(instances))
 
 
-def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMetadata, settings: EpisodeSettings) -> None:
+def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMetadata, settings: UsdSettings) -> None:
     """Task: write an episode's file beside its spool, and rename it to its place.
 
     Args:

@@ -10,7 +10,7 @@ from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import TickSpool, tick_rows, write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
-from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, EpisodeMetadata, EpisodeSettings, bin_asset, object_asset
+from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, EpisodeMetadata, UsdSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import make_bins
@@ -71,10 +71,10 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return (FOLDER / f"{episode:06d}.usdc",)
 
     @cached_property
-    def _settings(self) -> EpisodeSettings:
+    def _settings(self) -> UsdSettings:
         context = self._context
         settings = context.settings
-        return EpisodeSettings(
+        return UsdSettings(
             tick_rate=1.0 / settings.physics.tick_time,
             gravity=settings.physics.gravity,
             bins=tuple(bin_asset(sizes) if sizes.is_visible else None for sizes in settings.bins),

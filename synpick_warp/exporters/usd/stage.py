@@ -16,7 +16,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd.looks import add_looks
 from synpick_warp.exporters.usd.parts import add_label, add_property, set_units
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight, object_asset
+from synpick_warp.exporters.usd.types import EpisodeMetadata, StageLight, UsdSettings, object_asset
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.linear_algebra import dot
@@ -41,7 +41,7 @@ FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f
 BIN = f"{ROOT}/Bin"
 
 
-def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: EpisodeSettings) -> Sdf.Layer:
+def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: UsdSettings) -> Sdf.Layer:
     """Build the layer of an episode.
 
     Args:
@@ -84,7 +84,7 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
     return layer
 
 
-def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSettings) -> None:
+def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: UsdSettings) -> None:
     """Define units, time codes, root prim with metadata, physics scene and groups."""
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
@@ -104,7 +104,7 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
         Usd.ModelAPI(group).SetKind(Kind.Tokens.group)
 
 
-def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: EpisodeSettings) -> tuple[str, int]:
+def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: UsdSettings) -> tuple[str, int]:
     """Add an instance with its labels and ids, or a distractor, which has none; returns its path and its obj_id."""
     visible = ticks["object_id"][:, instance] != -1
     obj_id = int(ticks["object_id"][visible.argmax(), instance])

@@ -66,7 +66,7 @@ def drawn_texture(part: LookPart, index: int) -> str:
 
 
 @dataclass(frozen=True)
-class EpisodeSettings:
+class UsdSettings:
     """Settings common to all episodes: tick rate [1/s], gravity [m/s²], bins, cameras, lights, object names by obj_id."""
 
     tick_rate: float

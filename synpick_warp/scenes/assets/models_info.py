@@ -66,7 +66,7 @@ class _Entry(msgspec.Struct):
 
 
 @dataclass(frozen=True)
-class ModelInfo:
+class FileModelInfo:
     """Diameter, symmetries and bounding box of an entry of models_info.json, converted to metres."""
 
     diameter: float | None = None
@@ -98,7 +98,7 @@ def _raise(error: CatalogError) -> None:
     raise error
 
 
-def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[CatalogError], None] = _raise) -> dict[int, ModelInfo]:
+def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[CatalogError], None] = _raise) -> dict[int, FileModelInfo]:
     """Read models_info.json; an empty dictionary if the file is missing, which is no error.
 
     Args:
@@ -120,7 +120,7 @@ def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[Catalo
     return infos
 
 
-def _convert(entry: Any, obj_id: int, path: Path) -> ModelInfo:
+def _convert(entry: Any, obj_id: int, path: Path) -> FileModelInfo:
     """Validate an entry and convert it to metres."""
     place = f"{path}: object {obj_id}"
     if not isinstance(entry, dict):
@@ -133,7 +133,7 @@ def _convert(entry: Any, obj_id: int, path: Path) -> ModelInfo:
         raise CatalogError(f"{place}: {str(error).replace('`', '')}; needed: {_NEEDED}") from None
 
 
-def check_against_mesh(info: ModelInfo, vertices: np.ndarray, diameter: float) -> tuple[ModelInfo, list[str]]:
+def check_against_mesh(info: FileModelInfo, vertices: np.ndarray, diameter: float) -> tuple[FileModelInfo, list[str]]:
     """Compare an entry with its mesh: is the diameter the bounding box's diagonal, or of another mesh, and do the symmetries hold?
 
     Args:
@@ -153,7 +153,7 @@ def check_against_mesh(info: ModelInfo, vertices: np.ndarray, diameter: float) -
     return info, said + _check_symmetries(info, vertices[:: -(-len(vertices) // _SAMPLES)].astype(np.float64), diameter)
 
 
-def compare_sizes(info: ModelInfo, low: np.ndarray, size: np.ndarray, diameter: float) -> tuple[ModelInfo, list[str]]:
+def compare_sizes(info: FileModelInfo, low: np.ndarray, size: np.ndarray, diameter: float) -> tuple[FileModelInfo, list[str]]:
     """The part of `check_against_mesh` that needs the mesh's bounding box (least coordinates and size, 3 each) and diameter [m] only."""
     said = []
     diagonal = float(norm(size))
@@ -197,7 +197,7 @@ def corrected_entry(entry: Any, own: dict[str, Any]) -> dict[str, Any]:
     return own if any("metres" in line for line in said) else entry | {key: own[key] for key in ("diameter", *_EXTENTS)}
 
 
-def _same_symmetries(one: ModelInfo, other: ModelInfo) -> bool:
+def _same_symmetries(one: FileModelInfo, other: FileModelInfo) -> bool:
     """Whether two entries have the same symmetries, in the same order, up to rounding."""
     pairs = ((one.symmetries_discrete, other.symmetries_discrete), (one.symmetries_continuous, other.symmetries_continuous))
     return all(len(a) == len(b) and np.allclose(np.array(a), np.array(b), atol=1e-9) for a, b in pairs)
@@ -208,9 +208,9 @@ def _near(value: float, expected: float, tolerance: float) -> bool:
     return abs(value - expected) <= tolerance * expected
 
 
-def _scaled(info: ModelInfo, factor: float) -> ModelInfo:
+def _scaled(info: FileModelInfo, factor: float) -> FileModelInfo:
     """Entry with all lengths multiplied by a factor."""
-    return ModelInfo(
+    return FileModelInfo(
         None if info.diameter is None else factor * info.diameter,
         tuple(tuple(value * factor if at in (3, 7, 11) else value for at, value in enumerate(row)) for row in info.symmetries_discrete),
         tuple((axis, (factor * x, factor * y, factor * z)) for axis, (x, y, z) in info.symmetries_continuous),
@@ -218,7 +218,7 @@ def _scaled(info: ModelInfo, factor: float) -> ModelInfo:
     )
 
 
-def _check_symmetries(info: ModelInfo, vertices: np.ndarray, diameter: float) -> list[str]:
+def _check_symmetries(info: FileModelInfo, vertices: np.ndarray, diameter: float) -> list[str]:
     """Name the symmetries that do not map a mesh onto itself, by its extents (support function) in random directions."""
     from trimesh.transformations import rotation_matrix
 
@@ -274,9 +274,9 @@ def _depth(content: Any) -> int:
     return depth
 
 
-def _info(entry: _Entry, place: str) -> ModelInfo:
+def _info(entry: _Entry, place: str) -> FileModelInfo:
     """Convert a validated entry to metres; symmetries that are the identity are left out."""
-    return ModelInfo(
+    return FileModelInfo(
         None if entry.diameter is None else entry.diameter * _MILLIMETRE,
         tuple(
             matrix

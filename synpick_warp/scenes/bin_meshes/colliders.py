@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, QhullError
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import merge_positions
 from synpick_warp.scenes.bin_meshes.compartments import Compartment, enclose
-from synpick_warp.scenes.bin_meshes.inside import Surface, subdivide
+from synpick_warp.scenes.bin_meshes.inside import BinSurface, subdivide
 from synpick_warp.scenes.collision.simplification import hull_piece
 from synpick_warp.scenes.tote import FLOOR_DEPTH, MIN_WALL
 from synpick_warp.scenes.types import ConvexPiece
@@ -63,7 +63,7 @@ class _Faces:
     """Triangles beyond the edges of each."""
 
 
-def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> tuple[ConvexPiece, ...]:
+def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: BinSurface) -> tuple[ConvexPiece, ...]:
     """Build the collision shapes of a mesh.
 
     Args:
@@ -95,7 +95,7 @@ def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: Surface) ->
             )
 
 
-def make_box(surface: Surface, compartments: Sequence[Compartment], opening: np.ndarray) -> tuple[ConvexPiece, ...]:
+def make_box(surface: BinSurface, compartments: Sequence[Compartment], opening: np.ndarray) -> tuple[ConvexPiece, ...]:
     """Build a closed box: floors, walls between floors and opening, whose corners at the rim are given (2, 2), and dividers."""
     low, high = np.stack([enclose([one.span]) for one in compartments], axis=1)
     inner = enclose([one.span for one in compartments])
@@ -128,7 +128,7 @@ def _prism(profile: Sequence[tuple[float, float]], axis: int, ends: Sequence[flo
     return hull_piece(np.array([(at, end, z) if axis == 0 else (end, at, z) for at, z in profile for end in ends]))
 
 
-def _visible_faces(vertices: np.ndarray, faces: np.ndarray, surface: Surface) -> _Faces:
+def _visible_faces(vertices: np.ndarray, faces: np.ndarray, surface: BinSurface) -> _Faces:
     """Triangles in front of which there is the inside of the bin. The rim is the upper side of the prisms behind walls."""
     vertices, faces = merge_positions(vertices.astype(np.float64).round(7), faces)
     corners = vertices[faces]
@@ -191,7 +191,7 @@ def _grow_facets(faces: _Faces, tolerance: float) -> list[list[int]]:
     return facets
 
 
-def _extrude(faces: _Faces, facet: list[int], surface: Surface) -> list[ConvexPiece]:
+def _extrude(faces: _Faces, facet: list[int], surface: BinSurface) -> list[ConvexPiece]:
     """Prisms behind a facet."""
     normal = dot(faces.normal[facet].T, faces.area[facet])
     normal /= norm(normal)
@@ -228,7 +228,7 @@ def _hull_corners(flat: np.ndarray) -> np.ndarray | None:
     return flat[hull.vertices] if hull.volume > 1e-9 else None
 
 
-def _cut(polygons: list[np.ndarray], normal: np.ndarray, frame: np.ndarray, surface: Surface) -> list[list[np.ndarray]]:
+def _cut(polygons: list[np.ndarray], normal: np.ndarray, frame: np.ndarray, surface: BinSurface) -> list[list[np.ndarray]]:
     """Cut a facet, given as polygons (n, 3), until the hull of each part covers no free space."""
     done, waiting = [], [polygons]
     while waiting:
@@ -247,7 +247,7 @@ def _cut(polygons: list[np.ndarray], normal: np.ndarray, frame: np.ndarray, surf
     return done
 
 
-def _blocked_area(part: list[np.ndarray], hull: np.ndarray, normal: np.ndarray, frame: np.ndarray, surface: Surface) -> float:
+def _blocked_area(part: list[np.ndarray], hull: np.ndarray, normal: np.ndarray, frame: np.ndarray, surface: BinSurface) -> float:
     """Area [m²] of a facet's hull that is no part of the facet, and in free space."""
     step = max(surface.cell / 2.0, float(np.ptp(hull, axis=0).max()) / 200.0)
     low, high = hull.min(axis=0), hull.max(axis=0)

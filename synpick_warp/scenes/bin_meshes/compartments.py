@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError
 from trimesh import Trimesh
 from trimesh.intersections import mesh_plane
 
-from synpick_warp.scenes.bin_meshes.inside import HOLE, MIN_DEPTH, Surface, spread_points
+from synpick_warp.scenes.bin_meshes.inside import HOLE, MIN_DEPTH, BinSurface, spread_points
 from synpick_warp.system.linear_algebra import DECIMALS, dot, lstsq
 
 MIN_SIDE = 0.03
@@ -58,7 +58,7 @@ class Compartment(NamedTuple):
     """Whether opening and floor differ."""
 
 
-def find_compartments(surface: Surface) -> list[Compartment]:
+def find_compartments(surface: BinSurface) -> list[Compartment]:
     """Compartments of a surface, by x and y; empty: none is of MIN_SIDE.
 
     They are the components of the inside below a level, the one with most of them, or else the highest.
@@ -78,7 +78,7 @@ def find_compartments(surface: Surface) -> list[Compartment]:
     return sorted(_measure(surface, *one) for one in best)
 
 
-def _measure(surface: Surface, opening: np.ndarray, cells: np.ndarray, level: float) -> Compartment:
+def _measure(surface: BinSurface, opening: np.ndarray, cells: np.ndarray, level: float) -> Compartment:
     """Measure opening and floor of a compartment of cells (nx, ny), whose opening is known to whole cells (2, 2)."""
     floor, flat, height = _find_floor(surface, cells, level)
     span, leans = floor, bool((np.abs(opening - floor) > 0.5 * surface.cell).any())
@@ -99,7 +99,7 @@ def to_rectangle(corners: np.ndarray) -> Rectangle:
     return float(center[0]), float(center[1]), float(sides[0]), float(sides[1])
 
 
-def find_opening(surface: Surface, compartments: list[Compartment]) -> np.ndarray:
+def find_opening(surface: BinSurface, compartments: list[Compartment]) -> np.ndarray:
     """Corners (2, 2) of the box about the inside at the rim [m]."""
     cells = np.argwhere(surface.inside)
     box = surface.low + np.stack([cells.min(axis=0), cells.max(axis=0) + 1]) * surface.cell
@@ -113,7 +113,7 @@ def enclose(rectangles: Sequence[Rectangle]) -> np.ndarray:
     return np.stack([(each[:, :2] - each[:, 2:] / 2.0).min(axis=0), (each[:, :2] + each[:, 2:] / 2.0).max(axis=0)])
 
 
-def _find_floor(surface: Surface, cells: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray, float | None]:
+def _find_floor(surface: BinSurface, cells: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray, float | None]:
     """Corners (2, 2) of the floor among cells (nx, ny), its cells, and its height where it is none but a level between slopes.
 
     The floor is what is flat, no higher than halfway to the rim, and without steps of more than MIN_DEPTH; of several the largest.
@@ -141,7 +141,7 @@ def _find_floor(surface: Surface, cells: np.ndarray, level: float) -> tuple[np.n
     return _largest_rectangle(surface, cells), cells, None
 
 
-def _stretch(surface: Surface, floor: np.ndarray, flat: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _stretch(surface: BinSurface, floor: np.ndarray, flat: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Rectangle (2, 2) from wall to wall through the middle of a floor, along its cells (nx, ny) and up to points (N, 3) of walls."""
     center, half, result = floor.mean(axis=0), (floor[1] - floor[0]) / 2.0, floor.copy()
     for end, axis in np.ndindex(2, 2):
@@ -154,7 +154,7 @@ def _stretch(surface: Surface, floor: np.ndarray, flat: np.ndarray, points: np.n
     return _widen(result, points, surface.cell, MIDDLE)
 
 
-def find_holes(surface: Surface) -> np.ndarray:
+def find_holes(surface: BinSurface) -> np.ndarray:
     """Sides (N, 2) of the largest rectangles in holes of the inside that are wider than HOLE [m]."""
     labels, count = ndimage.label(surface.inside & ~surface.solid)
     # Cells that a hole covers in part belong to its edge.
@@ -174,7 +174,7 @@ def _widen(corners: np.ndarray, points: np.ndarray, cell: float, share: float = 
     return result
 
 
-def _cross_section(surface: Surface, level: float) -> np.ndarray:
+def _cross_section(surface: BinSurface, level: float) -> np.ndarray:
     """Points (N, 3) of walls at a height, at most half a cell apart."""
     walls = Trimesh(surface.walls.reshape(-1, 3), np.arange(surface.walls.size // 3).reshape(-1, 3), process=False)
     if walls.is_empty:
@@ -185,7 +185,7 @@ def _cross_section(surface: Surface, level: float) -> np.ndarray:
     return ((1.0 - shares) * lines[:, 0] + shares * lines[:, 1]).reshape(-1, 3)
 
 
-def _largest_rectangle(surface: Surface, cells: np.ndarray) -> np.ndarray:
+def _largest_rectangle(surface: BinSurface, cells: np.ndarray) -> np.ndarray:
     """Lower and upper corner (2, 2) of the largest axis-aligned rectangle within cells (nx, ny) [m]."""
     best, found = 0, (0, 0, 0, 0)
     used = np.flatnonzero(cells.any(axis=1))
@@ -203,7 +203,7 @@ def _largest_rectangle(surface: Surface, cells: np.ndarray) -> np.ndarray:
     return surface.low + np.array([(x0, y0), (x1, y1)]) * surface.cell
 
 
-def _fit_plane(surface: Surface, rectangle: Rectangle) -> tuple[float, float, float]:
+def _fit_plane(surface: BinSurface, rectangle: Rectangle) -> tuple[float, float, float]:
     """Plane z = a x + b y + c over the floor in a rectangle: a fit by least squares, raised so that none of it lies below the floor.
 
     The floor is what is nearer to the lowest point than to the rim, in the inner part of the rectangle.

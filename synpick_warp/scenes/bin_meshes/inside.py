@@ -50,7 +50,7 @@ class HeightField:
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class BinSurface:
     """Upper envelope of a mesh on a grid, and its inside; z up, in the mesh's own frame [m]."""
 
     low: np.ndarray
@@ -145,7 +145,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.sqrt(squares[0] + squares[1] + squares[2])
 
 
-def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
+def find_inside(corners: np.ndarray, count: int = CELLS) -> BinSurface | None:
     """Height field and inside of triangles (F, 3, 3) [m]; None: they have none. `count`: cells along the longer side."""
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     # Not whole, so that no side of the mesh is on the border of cells: symmetric meshes get symmetric cells.
@@ -186,7 +186,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> Surface | None:
     near = (steepness > 0.5)[owner] & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
     floor = float(points[near, 2].min(initial=floor))
     rim = float(level[inside].max())
-    return Surface(start, cell, height, inside, ground, solid, wall, corners[steep], rim, floor, bool(has_floor))
+    return BinSurface(start, cell, height, inside, ground, solid, wall, corners[steep], rim, floor, bool(has_floor))
 
 
 def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell: float) -> np.ndarray:
@@ -214,7 +214,7 @@ def _flood(height: np.ndarray) -> np.ndarray:
     return level
 
 
-def make_limits(surface: Surface, origin: np.ndarray) -> HeightField:
+def make_limits(surface: BinSurface, origin: np.ndarray) -> HeightField:
     """Field of limits of a surface in the frame at `origin` (3) [m].
 
     Beside the inside, widened by two cells, the limit is the rim; within, BELOW_FLOOR below the lowest surface nearby.

@@ -30,7 +30,7 @@ from synpick_warp.scenes.bin_meshes.compartments import (
     find_turn,
     turned,
 )
-from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, HeightField, Surface, find_inside, make_limits
+from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, BinSurface, HeightField, find_inside, make_limits
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
@@ -143,7 +143,7 @@ def _model(row: BinRow) -> BinModel:
 
 
 def _make_pieces(
-    row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: Surface, places: list[Compartment], holes: np.ndarray
+    row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: BinSurface, places: list[Compartment], holes: np.ndarray
 ) -> tuple[ConvexPiece, ...]:
     """Collision shapes of a bin: those of its mesh, which must agree with it, or a closed box.
 
@@ -241,7 +241,7 @@ def _describe(measured: MeasuredBin, places: list[Compartment], unit: str, piece
     return f"{_millimetres(box[3:] - box[:3])} mm, unit {unit}{turn}; {inner}, {pieces} collision shapes"
 
 
-def _describe_holes(surface: Surface, holes: np.ndarray, row: BinRow) -> list[str]:
+def _describe_holes(surface: BinSurface, holes: np.ndarray, row: BinRow) -> list[str]:
     """Line on a missing floor, or on holes that parts fall through, if there are any."""
     if row.collision == BOX:
         return ["it collides as a closed box; nothing falls through its holes"] if len(holes) else []
@@ -258,7 +258,7 @@ def _millimetres(sides: Iterable[float]) -> str:
     return " x ".join(f"{1e3 * side:.4g}" for side in sides)
 
 
-def _disagreement(corners: np.ndarray, pieces: tuple[ConvexPiece, ...], surface: Surface) -> float:
+def _disagreement(corners: np.ndarray, pieces: tuple[ConvexPiece, ...], surface: BinSurface) -> float:
     """Fraction of vertical rays into the inside for which collision shapes and mesh differ.
 
     A ray that meets the collision shapes at a height between those of the mesh at it and its neighbours agrees: it may be beside a step.

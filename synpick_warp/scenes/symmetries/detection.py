@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from synpick_warp.scenes.symmetries.groups import close_group, find_element
-from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, lstsq, matmul, norm, rotation, solve
 
 MAX_FOLD = 36
@@ -114,7 +114,7 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
         A closed group of discrete symmetries. Rotations about a continuous axis are omitted, as the axis stands for them; beside it there
         is at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
     """
-    surface = Surface(vertices, faces)
+    surface = SampledSurface(vertices, faces)
     turns, missed = _find_turns(surface, diameter, tolerance)
     continuous = sorted((turn for turn in turns if turn.fold == 0), key=lambda turn: turn.deviation)[:1]
     if continuous:
@@ -131,7 +131,7 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
     return Symmetries(*_close(surface, turns, tolerance), (), missed)
 
 
-def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[list[Turn], Turn | None]:
+def _find_turns(surface: SampledSurface, diameter: float, tolerance: float) -> tuple[list[Turn], Turn | None]:
     """Rotations within the tolerance, of continuous axes with fold 0; and the nearest one beyond it, up to twice the tolerance."""
     turns: list[Turn] = []
     missed: Turn | None = None
@@ -164,7 +164,7 @@ def _find_turns(surface: Surface, diameter: float, tolerance: float) -> tuple[li
     return turns, missed
 
 
-def _candidates(surface: Surface, diameter: float, tolerance: float) -> list[tuple[float, np.ndarray, int]]:
+def _candidates(surface: SampledSurface, diameter: float, tolerance: float) -> list[tuple[float, np.ndarray, int]]:
     """(mean distance, axis, fold) of rotations that nearly keep the covariance, and a coarse sample, in place.
 
     Axes are the principal ones, those of coordinates and the normals of flat regions, for all folds; and a grid for small folds.
@@ -190,7 +190,7 @@ def _candidates(surface: Surface, diameter: float, tolerance: float) -> list[tup
     return result
 
 
-def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _refine(surface: SampledSurface, axis: np.ndarray, point: np.ndarray, fold: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Axis and a point on it, next to the given one, about which a rotation of the fold maps the surface best onto itself: ICP with
     point-to-plane distances (Chen and Medioni, 1992), from `count` points."""
     center, rows = surface.center, slice(None, None, len(surface.points) // count)
@@ -218,18 +218,18 @@ def _refine(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, co
     return axis, center + lstsq(np.eye(3) - matrix[:3, :3], shift - axis * dot(axis, shift), 1e-3)
 
 
-def _turn(surface: Surface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:
+def _turn(surface: SampledSurface, axis: np.ndarray, point: np.ndarray, fold: int, limit: float = np.inf) -> Turn:
     """Rotation by a fold's angle with a lower bound of its distance, from subsamples."""
     axis = _upward(axis)
     return Turn(axis, point, fold, surface.rough_deviation(turn_matrix(axis, point, 2.0 * np.pi / fold), limit))
 
 
-def _confirmed(surface: Surface, turn: Turn, limit: float) -> Turn:
+def _confirmed(surface: SampledSurface, turn: Turn, limit: float) -> Turn:
     """The rotation, beyond the limit if any point is; without a limit with its distance from all points."""
     return replace(turn, deviation=surface.deviation(turn.matrix(), limit))
 
 
-def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
+def _snap(surface: SampledSurface, turn: Turn, tolerance: float) -> Turn:
     """Snap a rotation to the nearest coordinate axis and to the origin if its distance stays as small: most parts are modelled so."""
     options = [turn.axis]
     near = int(np.argmax(np.abs(turn.axis)))
@@ -244,7 +244,7 @@ def _snap(surface: Surface, turn: Turn, tolerance: float) -> Turn:
     return turn
 
 
-def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
+def _all_folds(surface: SampledSurface, turn: Turn, tolerance: float) -> list[Turn]:
     """All folds of an axis within the tolerance; if all are, one rotation of fold 0 with the largest distance."""
     result = [turn]
     for fold in range(2, MAX_FOLD + 1):
@@ -259,7 +259,7 @@ def _all_folds(surface: Surface, turn: Turn, tolerance: float) -> list[Turn]:
     return [replace(_confirmed(surface, worst, np.inf), fold=0)]
 
 
-def _flip(surface: Surface, main: Turn, turn: Turn) -> Turn:
+def _flip(surface: SampledSurface, main: Turn, turn: Turn) -> Turn:
     """Half turn about an axis that is made exactly perpendicular to a continuous one; of all of these, the one nearest to x or y."""
     beside = np.eye(3)[int(np.argmin(np.abs(main.axis)))]
     axis = beside - main.axis * dot(main.axis, beside)
@@ -267,7 +267,7 @@ def _flip(surface: Surface, main: Turn, turn: Turn) -> Turn:
     return _turn(surface, axis / norm(axis), point, 2)
 
 
-def _ball(surface: Surface, tolerance: float) -> tuple[Turn, ...]:
+def _ball(surface: SampledSurface, tolerance: float) -> tuple[Turn, ...]:
     """Three continuous axes through the centroid, if each is within the tolerance; else nothing."""
     found = [
         each for axis in np.eye(3) for each in _all_folds(surface, _turn(surface, axis, surface.center, 2), tolerance) if each.fold == 0
@@ -275,7 +275,7 @@ def _ball(surface: Surface, tolerance: float) -> tuple[Turn, ...]:
     return tuple(found) if len(found) == 3 else ()
 
 
-def _close(surface: Surface, turns: list[Turn], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def _close(surface: SampledSurface, turns: list[Turn], tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Largest group of discrete symmetries (N, 4, 4) that the rotations generate, best first, with all products within the tolerance;
     without the identity, and their distances (N)."""
     group, offs, used = np.eye(3)[None], np.zeros(1), []

@@ -10,10 +10,10 @@ import numpy as np
 from synpick_warp.configs.episodes.objects import DETECT, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshFile
-from synpick_warp.scenes.assets.models_info import ModelInfo, check_against_mesh
+from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh
 from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_axes, find_symmetries, turn_matrix
 from synpick_warp.scenes.symmetries.groups import MAX_ELEMENTS, close_transforms
-from synpick_warp.scenes.symmetries.surface import Surface
+from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.system.linear_algebra import dot, norm
 
 _MAX_SHOWN = 4
@@ -21,8 +21,8 @@ _MAX_SHOWN = 4
 
 
 def add_symmetries(
-    info: ModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str
-) -> tuple[ModelInfo, list[str]]:
+    info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str
+) -> tuple[FileModelInfo, list[str]]:
     """Add the symmetries of the object's row to its entry, or detect them if neither has any and the settings ask for it.
 
     Args:
@@ -50,12 +50,14 @@ def add_symmetries(
     ]
 
 
-def _declared(info: ModelInfo, found: MeshFile, diameter: float, row: ObjectRow, strict: bool, origin: str) -> tuple[ModelInfo, list[str]]:
+def _declared(
+    info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow, strict: bool, origin: str
+) -> tuple[FileModelInfo, list[str]]:
     """The entry with the symmetries of a row, moved with the mesh, and closed under composition."""
-    center = Surface(found.mesh.vertices, found.mesh.faces).center
+    center = SampledSurface(found.mesh.vertices, found.mesh.faces).center
     matrices = [_matrix(values, found.moved, center) for values in row.symmetries_discrete]
     axes = [_axis(values, values[3:], found.moved, center) for values in row.symmetries_continuous]
-    _, said = check_against_mesh(_with(ModelInfo(), matrices, axes), found.mesh.vertices, diameter)
+    _, said = check_against_mesh(_with(FileModelInfo(), matrices, axes), found.mesh.vertices, diameter)
     line = f"{origin}: its row of the object table gives {'; '.join(said)}"
     if said and strict:
         raise CatalogError(line)
@@ -82,7 +84,7 @@ def _axis(values: Sequence[float], offset: Sequence[float], moved: np.ndarray, c
     return axis, np.array(offset) + moved if len(offset) else center - axis * dot(axis, center)
 
 
-def _with(info: ModelInfo, matrices: Sequence[np.ndarray] | np.ndarray, axes: Sequence[tuple[np.ndarray, np.ndarray]]) -> ModelInfo:
+def _with(info: FileModelInfo, matrices: Sequence[np.ndarray] | np.ndarray, axes: Sequence[tuple[np.ndarray, np.ndarray]]) -> FileModelInfo:
     """The entry with these symmetries, rounded to 1e-9: further digits depend on the machine, and the catalog's digest on all of them."""
     return replace(
         info,

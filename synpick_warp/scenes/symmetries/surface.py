@@ -37,7 +37,7 @@ _QUANTILES = 64
 _ALIKE = 0.025
 
 
-class Surface:
+class SampledSurface:
     """Dense sample of a mesh's surface (area-weighted, with a fixed seed) for nearest-point distances."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:

@@ -51,7 +51,7 @@ class BinaryBvh:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class BvhLevel:
     """One level of a wide BVH in breadth-first order: the children of each of its nodes."""
 
     child: np.ndarray
@@ -84,7 +84,7 @@ def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
     return result
 
 
-def build_levels(shape: TriangleMesh) -> tuple[BinaryBvh, list[Level]]:
+def build_levels(shape: TriangleMesh) -> tuple[BinaryBvh, list[BvhLevel]]:
     """Build the binary and the wide BVH of a mesh: by the surface area heuristic, or by medians if that tree is too deep for the stack.
 
     Raises:
@@ -111,13 +111,13 @@ def build_binary_bvh(shape: TriangleMesh, constructor: str) -> BinaryBvh:
     return BinaryBvh(low, high, children.numpy().copy(), triangle.numpy().copy(), int(root.numpy()[0]))
 
 
-def collapse(binary: BinaryBvh) -> list[Level]:
+def collapse(binary: BinaryBvh) -> list[BvhLevel]:
     """Collapse a binary BVH into a wide one, level by level: a node's inner child of largest surface area is replaced by its own two
     children, until there are WIDTH (Wald, Benthin and Boulos, 2008)."""
     edges = binary.upper - binary.lower
     area = edges[:, 0] * edges[:, 1] + edges[:, 1] * edges[:, 2] + edges[:, 2] * edges[:, 0]
     weight = np.append(np.where(binary.leaf, -1.0, area), -1.0)  # The last entry is that of ABSENT.
-    levels: list[Level] = []
+    levels: list[BvhLevel] = []
     nodes = np.array([binary.root])
     while len(nodes):
         child = np.full((len(nodes), int(WIDTH)), ABSENT, np.int64)
@@ -129,12 +129,12 @@ def collapse(binary: BinaryBvh) -> list[Level]:
             opens = weight[opened] >= 0.0
             child[rows[opens], slot] = binary.children[opened[opens], 1]
             child[rows[opens], largest[opens]] = binary.children[opened[opens], 0]
-        levels.append(Level(child, weight[child] >= 0.0))
+        levels.append(BvhLevel(child, weight[child] >= 0.0))
         nodes = child[levels[-1].inner]
     return levels
 
 
-def needed_stack(levels: list[Level]) -> int:
+def needed_stack(levels: list[BvhLevel]) -> int:
     """Worst-case depth of the traversal stack. Absent children count, because rounding lets rays from afar enter inverted boxes."""
     below = np.zeros(0, np.int64)
     for level in reversed(levels):
@@ -144,13 +144,13 @@ def needed_stack(levels: list[Level]) -> int:
     return int(below[0])
 
 
-def leaf_order(binary: BinaryBvh, levels: list[Level]) -> np.ndarray:
+def leaf_order(binary: BinaryBvh, levels: list[BvhLevel]) -> np.ndarray:
     """Triangle indices in leaf order (triangle) int32."""
     leaves = np.concatenate([level.child[level.leaf] for level in levels])
     return binary.triangle[-1 - binary.children[leaves, 0]]
 
 
-def encode_nodes(binary: BinaryBvh, levels: list[Level], first_node: int, first_triangle: int) -> np.ndarray:
+def encode_nodes(binary: BinaryBvh, levels: list[BvhLevel], first_node: int, first_triangle: int) -> np.ndarray:
     """Records of nodes (4 node, 4) uint32, as `WideBvh.node`; `first_node` and `first_triangle` are added to all indices."""
     child, inner, leaf = (np.concatenate([getattr(level, name) for level in levels]) for name in ("child", "inner", "leaf"))
     origin, exponent, low, high = quantize_boxes(binary, child)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.validation.run import Options, Summary, validate
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.harness.exporter_contract import FRAMES, ExporterContract
@@ -69,5 +69,7 @@ def test_it_opens_by_episode(folders):
 
 
 def test_validation_finds_the_same_in_both_layouts(folders):
-    multi, classic = ({found.rule for found in validate(folder, Options(sample=0, images=False), Summary())} for folder in folders)
+    multi, classic = (
+        {found.rule for found in validate(folder, ValidationOptions(sample=0, images=False), Summary())} for folder in folders
+    )
     assert multi <= classic

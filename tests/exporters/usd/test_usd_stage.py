@@ -15,7 +15,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 from synpick_warp.exporters.usd.episode import TickSpool, read_ticks, tick_rows
 from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
 from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
-from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
+from synpick_warp.exporters.usd.types import EpisodeMetadata, UsdSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import map_directions, resize_map
@@ -44,7 +44,7 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
     stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
     metadata = EpisodeMetadata(0, 0, len(rows), "emptied")
     layer = make_episode_layer(
-        rows, metadata, EpisodeSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"}, {})
+        rows, metadata, UsdSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"}, {})
     )
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):

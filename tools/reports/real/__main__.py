@@ -20,9 +20,9 @@ import numpy as np
 try:
     import torch  # pyright: ignore[reportMissingImports]
 
-    from tools.reports.real.scores import Scores, draw_overlay, predict, score, score_pool
+    from tools.reports.real.scores import NetworkScores, draw_overlay, predict, score, score_pool
     from tools.reports.real.training import BLOCK, Recipe, Trained, train
-    from tools.reports.real.views import Pool, Source, hold_out
+    from tools.reports.real.views import ViewPool, ViewSource, hold_out
 except ModuleNotFoundError as missing:
     raise SystemExit(f"reports.real: {missing.name} is not installed; pip install torch") from None
 
@@ -33,7 +33,7 @@ from synpick_warp.configs.cell.rig import resized
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
-from tools.options import Row, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
+from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
 from tools.reports.real_frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
@@ -72,12 +72,12 @@ OWN = {
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class TrainingOutcome:
     """Result of one seed: trained network, scores on photographs and on held-out synthetic views."""
 
     trained: Trained
-    real: Scores
-    synthetic: Scores
+    real: NetworkScores
+    synthetic: NetworkScores
     overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
     """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
 
@@ -98,7 +98,7 @@ def recipe_of(options: argparse.Namespace) -> Recipe:
     return Recipe(**{name: value for name, value in vars(options).items() if name in Recipe.__dataclass_fields__})
 
 
-def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
+def source_of(options: argparse.Namespace, seed: int, device: Any) -> ViewSource:
     """Source of the training views of a seed.
 
     Raises:
@@ -113,16 +113,16 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> Source:
     for width, height in config.rig.sizes:
         if width % (2 * BLOCK) or height % (2 * BLOCK):
             raise ConfigError(f"images of {width}x{height} px cannot be augmented by JPEG; use multiples of {2 * BLOCK}")
-    return Source(config, TRAINING, options.stride, tuple(options.cameras or ()) or None)
+    return ViewSource(config, TRAINING, options.stride, tuple(options.cameras or ()) or None)
 
 
-def measure(trained: Trained, frames: list[RealFrame], held: Pool, device: torch.device) -> Outcome:
+def measure(trained: Trained, frames: list[RealFrame], held: ViewPool, device: torch.device) -> TrainingOutcome:
     """Scores of a network on real frames, which it sees at the size of the held-out views, and on these."""
     height, width = held.tensors()[0].shape[2:]
     found = [predict(trained.network, frame.color, (int(width), int(height)), device) for frame in frames]
     real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
     overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
-    return Outcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
+    return TrainingOutcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
 
 
 def interval(values: Sequence[float]) -> str:
@@ -133,11 +133,11 @@ def interval(values: Sequence[float]) -> str:
     return f"({np.mean(values) - reach:.3g} to {np.mean(values) + reach:.3g})"
 
 
-def rows_of(outcomes: list[Outcome]) -> list[Row]:
+def rows_of(outcomes: list[TrainingOutcome]) -> list[MeasuredRow]:
     """Rows of the report: means over seeds, for all frames, by object and by frame."""
 
-    def row(name: str, values: list[float], unit: str = "", part: str = "") -> Row:
-        return Row(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
+    def row(name: str, values: list[float], unit: str = "", part: str = "") -> MeasuredRow:
+        return MeasuredRow(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
 
     rows = []
     for where, scores in (("real frames", [one.real for one in outcomes]), ("synthetic, held out", [one.synthetic for one in outcomes])):
@@ -180,7 +180,7 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
     few = replace(source.config, bake=replace(source.config.bake, worlds=min(options.worlds, FEW_WORLDS)))
     held = hold_out(replace(source, config=few, episodes=HELD_OUT, cameras=None), options.held_out)
     check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])
-    target, outcomes = torch.device(device.alias), list[Outcome]()
+    target, outcomes = torch.device(device.alias), list[TrainingOutcome]()
     for seed in range(options.first_seed, options.first_seed + options.seeds):
         trained = train(source_of(options, seed, device), recipe_of(options), 1 + MODELS, target, seed)
         outcomes.append(measure(trained, frames, held, target))
@@ -191,7 +191,7 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
     print_rows(Console(), "", "photographs", rows_of(outcomes))
 
 
-def _line(seed: int, outcome: Outcome) -> str:
+def _line(seed: int, outcome: TrainingOutcome) -> str:
     """Summary of a seed, as a line."""
     trained, real = outcome.trained, outcome.real
     return (
@@ -201,7 +201,7 @@ def _line(seed: int, outcome: Outcome) -> str:
     )
 
 
-def by_seed(outcomes: list[Outcome]) -> list[dict[str, Any]]:
+def by_seed(outcomes: list[TrainingOutcome]) -> list[dict[str, Any]]:
     """Scores and facts of each seed, for JSON."""
     real = [{name: getattr(one.real, name) for name in ("mean_iou", "found", "background", "instances")} for one in outcomes]
     facts = ("losses", "seconds", "stream_seconds", "views", "samples")

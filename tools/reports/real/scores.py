@@ -16,7 +16,7 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from tools.reports.real.views import Pool
+from tools.reports.real.views import ViewPool
 
 FOUND_IOU = 0.5
 """IoU above which an instance counts as found."""
@@ -27,7 +27,7 @@ SCORED = 16
 
 
 @dataclass(frozen=True, eq=False)
-class Scores:
+class NetworkScores:
     """Scores of a network on annotated views."""
 
     iou: dict[int, float]
@@ -59,7 +59,7 @@ def predict(network: nn.Module, color: np.ndarray, size: tuple[int, int], device
     return logits[0].argmax(0).to(torch.uint8).cpu().numpy()
 
 
-def score(predictions: Iterable[tuple[str, np.ndarray, np.ndarray]], classes: int, least: int = 1) -> Scores:
+def score(predictions: Iterable[tuple[str, np.ndarray, np.ndarray]], classes: int, least: int = 1) -> NetworkScores:
     """Scores of predictions: name of the view, predicted and true obj_ids (H, W) uint8; `least`: pixels of an instance that counts."""
     total, instances = np.zeros((classes, classes), np.int64), []
     views: dict[str, float] = {}
@@ -73,7 +73,7 @@ def score(predictions: Iterable[tuple[str, np.ndarray, np.ndarray]], classes: in
             views[name] = float(np.mean([iou for _, _, iou in here]))
     ious, occurs = _ious(total), total.sum(axis=1) > 0
     background = float(total[0, 1:].sum() / max(1, total[0].sum()))
-    return Scores({index: float(ious[index]) for index in range(1, classes) if occurs[index]}, tuple(instances), background, views)
+    return NetworkScores({index: float(ious[index]) for index in range(1, classes) if occurs[index]}, tuple(instances), background, views)
 
 
 def _ious(table: np.ndarray) -> np.ndarray:
@@ -82,7 +82,7 @@ def _ious(table: np.ndarray) -> np.ndarray:
     return table.diagonal() / np.maximum(union, 1)
 
 
-def score_pool(network: nn.Module, pool: Pool, classes: int) -> Scores:
+def score_pool(network: nn.Module, pool: ViewPool, classes: int) -> NetworkScores:
     """Scores of a network on the views of a pool, at their own size."""
     images, classified = pool.tensors()
 

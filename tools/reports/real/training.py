@@ -20,7 +20,7 @@ from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
 from tools.examples.train_online import LEARNING_RATE, WARM_UP
-from tools.reports.real.views import Pool, Source
+from tools.reports.real.views import ViewPool, ViewSource
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
@@ -267,7 +267,7 @@ class _Trainer:
         left = max(self.recipe.seconds - self.waited, 1.0)
         return max(len(self.losses) / self.total, (time.perf_counter() - self.started - self.waited) / left)
 
-    def step(self, pool: Pool) -> None:
+    def step(self, pool: ViewPool) -> None:
         """Train on a batch drawn from the pool, in mixed precision, and append its loss to `losses`."""
         done = self.progress
         factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
@@ -283,13 +283,13 @@ class _Trainer:
         self.losses.append(loss.detach())
 
 
-def train(source: Source, recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
+def train(source: ViewSource, recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
     """Train a network on views of a stream. Training starts when a first part of the pool is filled; the rest is filled during training.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
-    pool, trainer = Pool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
+    pool, trainer = ViewPool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     batches = source.batches(recipe.views)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
     first, pace = pool.seen, min(PACE, recipe.passes)

@@ -17,7 +17,7 @@ from synpick_warp.online.dataset import StreamDataset
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class ViewSource:
     """Stream of training views: its settings, episodes, and which frames are taken."""
 
     config: Config
@@ -39,7 +39,7 @@ class Source:
 
 
 @dataclass(eq=False)
-class Pool:
+class ViewPool:
     """Replay buffer of views on the device; once full, new ones replace random ones.
 
     Attributes:
@@ -103,12 +103,12 @@ class Pool:
         return self.images, self.classes
 
 
-def hold_out(source: Source, views: int) -> Pool:
+def hold_out(source: ViewSource, views: int) -> ViewPool:
     """Held-out views of a stream to measure on: the first that come, so those of the piles that settle soonest.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
-    pool = Pool(views, 0)
+    pool = ViewPool(views, 0)
     pool.fill(source.batches(views), views)
     return pool

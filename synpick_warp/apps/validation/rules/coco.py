@@ -8,7 +8,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.registry import Findings, rule
-from synpick_warp.apps.validation.scene_files import Mask
+from synpick_warp.apps.validation.scene_files import StoredMask
 from synpick_warp.apps.validation.schemas import Annotation
 from synpick_warp.apps.validation.subjects import CocoFile, SceneSubject, ViewSubject
 from synpick_warp.exporters.writing.rle import find_run_boundaries
@@ -124,7 +124,7 @@ def check_ignore(view: ViewSubject) -> Findings:
             yield coco.file, f"image {view.image}, annotation {annotation.id}: ignore is {shown}, visib_fract {fraction:.4g}"
 
 
-def run_lengths(mask: Mask) -> list[int]:
+def run_lengths(mask: StoredMask) -> list[int]:
     """Run lengths of a mask in COCO's order: by columns, false pixels first."""
     runs = find_run_boundaries(mask.crop.view(np.uint8), mask.top, mask.left).runs_of(1)
     return runs.counts(mask.size[1], mask.size[0]).tolist()
@@ -135,14 +135,14 @@ def _has_masks(view: ViewSubject) -> bool:
     return "mask_visib" in view.masks and None not in view.masks["mask_visib"] and bool(view.scene.cocos)
 
 
-def _visible(view: ViewSubject) -> Iterator[tuple[int, Mask | None, Mask]]:
+def _visible(view: ViewSubject) -> Iterator[tuple[int, StoredMask | None, StoredMask]]:
     """(index, amodal mask, visible mask) of the instances that have an annotation."""
     for index, visible in enumerate(view.masks.get("mask_visib", ())):
         if visible is not None and visible.box is not None:
             yield index, view.masks["mask"][index] if "mask" in view.masks else None, visible
 
 
-def _matched(view: ViewSubject) -> Iterator[tuple[CocoFile, Annotation, Mask | None, Mask, int]]:
+def _matched(view: ViewSubject) -> Iterator[tuple[CocoFile, Annotation, StoredMask | None, StoredMask, int]]:
     """(file, annotation, amodal mask, visible mask, index) of annotations that correspond to instances one to one."""
     instances = list(_visible(view)) if _has_masks(view) else []
     for coco in view.scene.cocos if instances else ():
@@ -152,7 +152,7 @@ def _matched(view: ViewSubject) -> Iterator[tuple[CocoFile, Annotation, Mask | N
                 yield coco, annotation, amodal, visible, index
 
 
-def _explain(counts: list[int], mask: Mask) -> str:
+def _explain(counts: list[int], mask: StoredMask) -> str:
     """Text on how run lengths differ from those of the mask: size, order, inversion, or number of pixels."""
     width, height = mask.size
     if sum(counts) != width * height or max(mask.size) > MAX_SIDE:

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject
 from synpick_warp.apps.validation.registry import Findings, rule
-from synpick_warp.apps.validation.schemas import Truth
+from synpick_warp.apps.validation.schemas import TruthSchema
 from synpick_warp.apps.validation.subjects import SceneSubject
 from synpick_warp.dataset.annotations import GraphEntry
 
@@ -95,7 +95,7 @@ class _Hulls:
                 yield vertices[hull.vertices], np.unique(hull.equations[:, :3].round(3), axis=0)
 
 
-def relative_pose(one: Truth, other: Truth) -> np.ndarray:
+def relative_pose(one: TruthSchema, other: TruthSchema) -> np.ndarray:
     """Pose of `other` in the frame of `one` (3, 4): rotation matrix times 100 mm, so that turns count as motions, and translation [mm]."""
     turn, move = np.reshape(one.cam_R_m2c, (3, 3)), np.subtract(other.cam_t_m2c, one.cam_t_m2c)
     return np.column_stack((100.0 * turn.T @ np.reshape(other.cam_R_m2c, (3, 3)), turn.T @ move))

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
 from synpick_warp.apps.validation.rules.records import EMPTY, box_sides
-from synpick_warp.apps.validation.scene_files import Mask
+from synpick_warp.apps.validation.scene_files import StoredMask
 from synpick_warp.apps.validation.schemas import Info
 from synpick_warp.apps.validation.subjects import ViewSubject
 
@@ -75,14 +75,14 @@ COUNT_SLACK, COUNT_FRACTION = 2, 1e-3
 """Largest difference of a count from the mask's: pixels, or a fraction of them (the acceptance bound of reference renderers)."""
 
 
-def _all_masks(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask]]:
+def _all_masks(view: ViewSubject, kind: str) -> Iterator[tuple[int, StoredMask]]:
     """Yield (index, mask) of the masks that exist and have the view's size."""
     for index, mask in enumerate(view.masks.get(kind, ())):
         if mask is not None and mask.size == view.size:
             yield index, mask
 
 
-def _pairs(view: ViewSubject, kind: str) -> Iterator[tuple[int, Mask, Info]]:
+def _pairs(view: ViewSubject, kind: str) -> Iterator[tuple[int, StoredMask, Info]]:
     """Yield (index, mask, info) of each instance whose mask of this kind could be read; nothing without infos."""
     for index, mask in _all_masks(view, kind) if view.infos else ():
         yield index, mask, view.infos[index]
@@ -117,7 +117,7 @@ def check_inside(view: ViewSubject) -> Findings:
             yield Deviation(visible.file, text, view.truths[index].obj_id, value, count > 0)
 
 
-def _farthest(visible: Mask, amodal: Mask) -> float:
+def _farthest(visible: StoredMask, amodal: StoredMask) -> float:
     """Directed Hausdorff distance of a visible mask to an amodal one [px]: of the pixel that is farthest from it."""
     width, height = visible.size
     if amodal.box is None:
@@ -209,7 +209,7 @@ def _farthest_side(box: list[int], seen: tuple[int, int, int, int], sides: Itera
     return float(max((abs(stated[side] - found[side]) for side in sides), default=0))
 
 
-def wrong_sides(box: list[int], mask: Mask) -> list[int]:
+def wrong_sides(box: list[int], mask: StoredMask) -> list[int]:
     """Sides, as in `box_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
 
     A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
@@ -233,7 +233,7 @@ def bop_box(box: tuple[int, int, int, int]) -> list[int]:
     return [box[0], box[1], box[2] - 1, box[3] - 1]
 
 
-def _touched_sides(mask: Mask) -> set[int]:
+def _touched_sides(mask: StoredMask) -> set[int]:
     """Borders of the image that a silhouette reaches, as in `box_sides`; all, if it is empty and may lie outside."""
     if mask.box is None:
         return {0, 1, 2, 3}

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
-from synpick_warp.apps.validation.schemas import Camera, Info, Truth
+from synpick_warp.apps.validation.schemas import CameraSchema, Info, TruthSchema
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 ROTATION_TOLERANCE = 1e-3
@@ -236,13 +236,13 @@ def _outline(info: Info) -> int:
     return 2 * (max(info.bbox_obj[2], 0) + max(info.bbox_obj[3], 0) + 2)
 
 
-def _cameras(scene: SceneSubject) -> Iterator[tuple[str, str, Camera]]:
+def _cameras(scene: SceneSubject) -> Iterator[tuple[str, str, CameraSchema]]:
     """Yield (file, place for messages, entry) of each image in scene_camera.json."""
     record = scene.record("camera")
     yield from ((record.where(image), f"image {image}", entry) for image, entry in scene.cameras.items())
 
 
-def _truths(scene: SceneSubject) -> Iterator[tuple[str, str, int, int, Truth]]:
+def _truths(scene: SceneSubject) -> Iterator[tuple[str, str, int, int, TruthSchema]]:
     """Yield (file, place for messages, image, index, entry) of each instance in scene_gt.json."""
     record = scene.record("gt")
     for image, entries in scene.truths.items():

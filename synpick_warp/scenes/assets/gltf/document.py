@@ -52,7 +52,7 @@ class Buffer(_Struct):
     uri: str | None = None
 
 
-class View(_Struct):
+class BufferView(_Struct):
     """glTF buffer view: a range of bytes of a buffer."""
 
     buffer: Index
@@ -126,7 +126,7 @@ class Skin(_Struct):
     inverseBindMatrices: Index | None = None  # noqa: N815
 
 
-class Scene(_Struct):
+class GltfScene(_Struct):
     """glTF scene: its root nodes."""
 
     nodes: list[Index] = []
@@ -203,7 +203,7 @@ class MaterialExtensions(_Struct):
     glossiness: Glossiness | None = msgspec.field(name=GLOSSINESS, default=None)
 
 
-class Material(_Struct):
+class GltfMaterial(_Struct):
     """glTF material: PBR parameters, extensions, and textures that are reported but not used."""
 
     pbrMetallicRoughness: Pbr | None = None  # noqa: N815
@@ -221,17 +221,17 @@ class Gltf(_Struct):
     extensionsUsed: list[str] = []  # noqa: N815
     extensionsRequired: list[str] = []  # noqa: N815
     buffers: list[Buffer] = []
-    bufferViews: list[View] = []  # noqa: N815
+    bufferViews: list[BufferView] = []  # noqa: N815
     accessors: list[Accessor] = []
     images: list[Image] = []
     samplers: list[Sampler] = []
     textures: list[Texture] = []
-    materials: list[Material] = []
+    materials: list[GltfMaterial] = []
     meshes: list[Mesh] = []
     nodes: list[Node] = []
     skins: list[Skin] = []
     animations: list[Any] = []
-    scenes: list[Scene] = []
+    scenes: list[GltfScene] = []
     scene: Index = 0
 
 

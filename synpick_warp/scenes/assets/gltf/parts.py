@@ -33,15 +33,15 @@ from synpick_warp.scenes.assets.gltf.document import (
     WEBP,
     WIDTHS,
     Accessor,
+    BufferView,
     Document,
     Glossiness,
-    Material,
+    GltfMaterial,
     Node,
     Pbr,
     Primitive,
     Skin,
     TextureInfo,
-    View,
     item_at,
     read_document,
     read_uri,
@@ -235,7 +235,7 @@ class _Reader:
 
     def rows(self, view_index: int, offset: int, count: int, width: int, kind: np.dtype) -> np.ndarray:
         """Rows of a buffer view, a view of its bytes."""
-        view: View = item_at(self.gltf.bufferViews, view_index, "buffer view", self.path)
+        view: BufferView = item_at(self.gltf.bufferViews, view_index, "buffer view", self.path)
         size = kind.itemsize * width
         stride = view.byteStride or size
         if count and offset + stride * (count - 1) + size > view.byteLength:
@@ -253,7 +253,7 @@ class _Reader:
             self.materials[index] = self.gloss(gloss) if gloss else self.pbr(material.pbrMetallicRoughness or Pbr())
         return self.materials[index]
 
-    def note_ignored(self, material: Material) -> None:
+    def note_ignored(self, material: GltfMaterial) -> None:
         """Note the features of a material beyond base colour, metallic and roughness, which are not used."""
         self.notes.ignored += [name for name in ("normalTexture", "occlusionTexture") if getattr(material, name) is not None]
         if material.emissiveTexture is not None or any(material.emissiveFactor):
