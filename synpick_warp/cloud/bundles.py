@@ -1,4 +1,4 @@
-"""Archive format of index files, the inputs of the indices over all episodes: one tar.gz per episode.
+"""Archives of index files in an object store: a tar.gz per episode with the inputs of the indices over all episodes.
 
 What an episode adds to lists of lines is made by its worker: the last worker only appends it to the parts of the lists, below LINES.
 """

@@ -239,7 +239,7 @@ class ThroughputMeter:
         )
 
     def _count_delivered(self) -> None:
-        """Add the episodes that ended since the last report: a tick's work does not grow with the episodes before."""
+        """Count the episodes that ended since the last report; the work of a tick is independent of the number of earlier episodes."""
         for row in self.summary.episodes[self.counted :]:
             if row.ending.delivers:
                 self.delivered += 1

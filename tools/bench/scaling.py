@@ -236,7 +236,7 @@ def _measure_like_parts(pile: Variant) -> Iterator[MeasuredRow]:
 
 
 def _memory_in_use(device: wp.Device) -> int:
-    """Memory of Warp's arrays on a GPU, or peak memory of the process [bytes]."""
+    """Memory in use: of Warp's pool on a GPU, or the peak resident set of the process [bytes]."""
     if device.is_cuda:
         wp.synchronize_device(device)
         return int(wp.get_mempool_used_mem_current(device))

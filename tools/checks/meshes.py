@@ -1,4 +1,4 @@
-"""Sweep over mesh files of others: which load, which load with a warning, which are refused and why.
+"""Batch import of third-party mesh files: which load, which load with a warning, which are refused and why.
 
 Each file is read in a process of its own with a time limit, since readers of damaged files may crash or hang.
 

@@ -24,7 +24,7 @@ _MISSING = ("ModuleNotFoundError", "PackageNotFoundError", "ImportError")
 
 @dataclass
 class Result:
-    """Row of the table of clients: name, version, what it read, agreement, remarks, and whether the check holds."""
+    """Result of one client library: name, version, what it read, agreement, remarks, and whether the check holds."""
 
     client: str
     version: str = ""

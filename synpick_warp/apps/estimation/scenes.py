@@ -53,7 +53,7 @@ class ImageSelection:
 
 
 def plan_scenes(data_set: DataSet, selection: ImageSelection) -> tuple[list[ScenePlan], bool]:
-    """List the scenes of a data set and the frames of each that are estimated.
+    """Scenes of a data set, and the frames of each for pose estimation.
 
     Returns:
         Scenes with at least one frame, in order; and whether these are all images of the data set.

@@ -119,7 +119,7 @@ def _assign(image: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def _medoids(points: np.ndarray) -> np.ndarray:
-    """Of each set of points (n, k, 3), the one with the least total distance to the others (n, 3)."""
+    """Medoid of each point set (n, k, 3): the point with the least total distance to the others (n, 3)."""
     total = np.linalg.norm(points[:, :, None] - points[:, None], axis=3).sum(axis=2)
     return points[np.arange(len(points)), np.argmin(total, axis=1)]
 
@@ -218,7 +218,7 @@ class AlphaSweep:
     """Score of each mode's estimates as they came (M,) float64."""
 
     def best(self, mode: str) -> tuple[float, float]:
-        """Alpha with the highest score of a mode, and this score; among equal scores the largest alpha, which lags least."""
+        """Best smoothing factor alpha of a mode, and its score; among ties the largest alpha, which lags least."""
         row = self.scores[self.modes.index(mode)]
         column = int(np.flatnonzero(row == row.max())[-1])
         return self.alphas[column], float(row[column])

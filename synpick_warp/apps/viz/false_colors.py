@@ -15,7 +15,7 @@ from synpick_warp.dataset.view import read_layer
 from synpick_warp.dataset.view_files import SceneFiles
 
 _RANGE = (1.0, 99.0)
-"""Percentiles of the depths that map to the first and the last colour, where no bin gives the range."""
+"""Depth percentiles at the ends of the colour map, if no bin defines its range."""
 _EVERY = 7
 """Every n-th pixel counts for percentiles."""
 MM = 1000.0

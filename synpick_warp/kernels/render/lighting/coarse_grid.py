@@ -151,7 +151,7 @@ def interleaved_pixel(coarse: CoarseGrid, index: int) -> tuple[int, int, int]:
 
 @wp.struct
 class CoarseSurface:
-    """Hit, position, direction to the camera and footprint at the middle pixel of a coarse pixel."""
+    """Shading point of a coarse pixel: hit, position, view direction and footprint at its middle pixel."""
 
     hit: Hit
     position: wp.vec3
