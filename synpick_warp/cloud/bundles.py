@@ -23,6 +23,7 @@ from synpick_warp.exporters.base import Exporter
 from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import index_lines
 from synpick_warp.exporters.writing.files import LINES
+from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.paths import path_inside
 
 MAX_BUNDLE = 1 << 30
@@ -90,7 +91,7 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
                     raise DatasetError(f"{source} is damaged: it has {info.name[:80]!r}; {_ADVICE}")
                 path = folder / info.name if is_lines else path_inside(folder, info.name, source, DatasetError)
                 if not os.path.exists(path):
-                    path.parent.mkdir(parents=True, exist_ok=True)
+                    make_folder(path.parent)
                 with open(path, "ab" if is_lines else "wb") as file:
                     file.write(content.read())
     except OSError as error:

@@ -110,7 +110,7 @@ def _gather(ledger: Ledger, work: Path) -> list[int]:
     (work / CONFIG_FILE).write_text(config_to_toml(ledger.config))
     constants = parse_checksums(store.get(f"{CONSTANTS}.sha256", MAX_JSON), work, work / f"{CONSTANTS}.sha256", "resume the bake")
     for name in filter(indexed.fullmatch, constants):
-        (work / name).parent.mkdir(parents=True, exist_ok=True)
+        make_folder((work / name).parent)
         (work / name).write_bytes(store.get(name, MAX_JSON))
     episodes = list(heapq.merge(*layout.plan()))
     with ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:

@@ -41,6 +41,7 @@ from synpick_warp.dataset.commit.manifest import (
 from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
+from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 from synpick_warp.system.inputs.paths import path_inside
@@ -90,7 +91,7 @@ class Copier:
             return True
         part = path.with_name(f".{path.name}.part")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(path.parent)
             with part.open("wb") as file:
                 for block in self.store.blocks(name, limit):
                     state.update(block)

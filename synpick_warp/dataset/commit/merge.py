@@ -40,6 +40,7 @@ from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, check_output_folder, output_error, remove_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.system.folders import make_folder
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.urls import store_url
 
@@ -163,7 +164,8 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
     work = out / PARTIAL
     names: list[str] = []
     try:
-        (work / ENTRIES).mkdir(parents=True)
+        make_folder(work)
+        (work / ENTRIES).mkdir()
         lock = lock_folder(out)
         try:
             _stage(work, sources, config, manifest, lock)
@@ -203,7 +205,7 @@ def _link(source: Path, target: Path) -> None:
         DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
         OSError: The target cannot be written, or exists: it may be a hard link, so that it is never written to.
     """
-    target.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(target.parent)
     try:
         handle = open_regular(source)
     except FileNotFoundError:
