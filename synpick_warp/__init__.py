@@ -8,6 +8,7 @@
         ...
     env = synpick_warp.make_env(task="pick", num_envs=8)      # the same worlds, and you choose the picks
     images = synpick_warp.render([("part.stl", pose)], [camera])    # your meshes at your poses
+    scores = synpick_warp.evaluate("DATA", ["method_set-test.csv"])     # also: validate, convert
 
 Importing this package loads neither simulator, NumPy nor OpenCV; the functions import them when they are called.
 """
@@ -35,6 +36,8 @@ from synpick_warp.system.inputs.urls import parse_place
 from synpick_warp.system.processes.garbage import collection_paused
 
 if TYPE_CHECKING:
+    from synpick_warp.apps.conversion.run import Converted
+    from synpick_warp.apps.validation.registry import Violation
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.environment.vector import PickingVectorEnv
@@ -55,11 +58,14 @@ __all__ = [
     "SynpickError",
     "__version__",
     "bake",
+    "convert",
+    "evaluate",
     "load_config",
     "make_env",
     "open",
     "render",
     "stream",
+    "validate",
 ]
 
 _DOORS = ("pytorch", "webdataset")
@@ -326,3 +332,91 @@ def open(folder: Path | str) -> DataSet:
     from synpick_warp.dataset.reading import open_data_set
 
     return open_data_set(place)
+
+
+def evaluate(
+    data: Path | str,
+    results: Sequence[Path | str],
+    *,
+    min_visibility: float = 0.1,
+    top: int = -1,
+    vertices: int = 0,
+    alpha: float | None = None,
+    targets: Path | str | None = None,
+    split: str | None = None,
+) -> dict[str, Any]:
+    """Score pose estimates, BOP result files of one method each: AUC of ADD, ADD-S and ADD(-S). `synpick-warp eval` does the same.
+
+    Args:
+        data: A data set in the format bop or shards.
+        results: Result files.
+        min_visibility: Smallest visible fraction of an instance that is to be found.
+        top: Estimates that count per image and object, by score; -1: as many as instances to be found; 0: all.
+        vertices: Vertices of a model that errors are averaged over; 0: all.
+        alpha: Weight of the new estimate in the tracking filter of the SynPick paper, which scores each method once more; None: no filter.
+        targets: Target list, such as BOP's test_targets_bop19.json; None: all images.
+        split: Only the episodes of this split; None: all.
+
+    Returns:
+        What `eval --format json` writes: see `synpick_warp/apps/evaluation/README.md`.
+
+    Raises:
+        SynpickError: An error that the user can correct.
+    """
+    import json
+
+    from synpick_warp.apps.evaluation.run import score_files
+    from synpick_warp.apps.evaluation.tables import render as render_table
+
+    data_set = open(data) if split is None else open(data).split(split)
+    chosen = None if targets is None else Path(targets)
+    scored = score_files(data_set, list(map(Path, results)), min_visibility, top, vertices, alpha, chosen)
+    return json.loads(render_table(scored.rows, scored.truth, scored.scores, "json"))
+
+
+def validate(
+    data: Path | str,
+    *,
+    sample: int | None = 200,
+    images: bool = True,
+    tolerance: tuple[float, float] | None = None,
+    threads: int = 0,
+) -> list[Violation]:
+    """Check a BOP data set, ours or not, by all rules: the violations. `synpick-warp validate` does the same.
+
+    Args:
+        data: Folder that contains train_pbr, models, ...
+        sample: Views that are rendered again to check poses, spread evenly; None: all.
+        images: Whether images are read; otherwise only files, annotations, models and target lists are checked.
+        tolerance: Of a measured data set: deviations of depth [mm] and of outlines [px] that are no errors.
+        threads: Number of processes; 0: one per core.
+
+    Raises:
+        DatasetError: The folder is not a BOP data set.
+    """
+    from synpick_warp.apps.validation.registry import Tolerance
+    from synpick_warp.apps.validation.run import Summary, ValidationOptions
+    from synpick_warp.apps.validation.run import validate as check
+    from synpick_warp.system.hardware.cores import count_cores
+
+    bounds = None if tolerance is None else Tolerance(*tolerance)
+    return list(check(Path(data), ValidationOptions(sample, images, threads or count_cores(), bounds), Summary()))
+
+
+def convert(data: Path | str, out: Path | str, formats: Sequence[str], *, split: str | None = None, threads: int = 0) -> Converted:
+    """Convert a data set to other formats, into a data set of its own. `synpick-warp convert` does the same.
+
+    Args:
+        data: A data set; its committed episodes are converted.
+        out: Folder of the converted one: new, empty, or of an interrupted conversion.
+        formats: Names of formats, such as ("coco", "shards").
+        split: Split to convert, of a BOP data set from another source; None: the only one.
+        threads: Number of processes; 0: one per core.
+
+    Raises:
+        SynpickError: An error that the user can correct. The same call resumes the conversion.
+    """
+    from synpick_warp.apps.conversion.run import convert as run_conversion
+    from synpick_warp.system.progress import ignore_progress
+
+    return run_conversion(Path(data), Path(out), formats, threads, ignore_progress, split)

@@ -38,7 +38,7 @@ def test_everything_offered_exists():
 def test_no_module_takes_the_name_of_a_function():
     """Importing a submodule sets an attribute of its package, which would replace the function."""
     functions = [name for name in synpick_warp.__all__ if isinstance(getattr(synpick_warp, name), types.FunctionType)]
-    assert functions == ["bake", "load_config", "make_env", "open", "render", "stream"]
+    assert functions == ["bake", "convert", "evaluate", "load_config", "make_env", "open", "render", "stream", "validate"]
     modules = {path.stem for path in (ROOT / "synpick_warp").iterdir()}
     assert modules.isdisjoint(functions)
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+import synpick_warp
 from synpick_warp.apps.conversion.run import check_formats, convert
 from synpick_warp.cli.main import main
 from synpick_warp.configs.schema import Config, Split
@@ -95,7 +96,7 @@ def test_converted_sets_equal_baked_ones_byte_for_byte(sets, tmp_path, assets, s
 
 
 def test_several_formats_are_converted_at_once(sets, tmp_path):
-    convert(sets["source"], tmp_path / "out", ("shards", "lerobot"), 2, lambda *_: None)
+    synpick_warp.convert(sets["source"], tmp_path / "out", ("shards", "lerobot"), threads=2)
     for name in ("test_web/shard-000003.tar", "lerobot/meta/stats.json", "lerobot/parts/000001.json"):
         baked = sets["lerobot" if name.startswith("lerobot") else "shards"]
         assert (tmp_path / "out" / name).read_bytes() == (baked / name).read_bytes()

@@ -16,8 +16,9 @@ import pytest
 
 import synpick_warp
 from synpick_warp.apps.evaluation.results import write_results
+from synpick_warp.apps.evaluation.run import method_names
 from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.cli.commands.evaluate import method_names, toolkit_command
+from synpick_warp.cli.commands.evaluate import toolkit_command
 from synpick_warp.cli.main import main
 from synpick_warp.system.codecs.charts import SCALE, WIDTH
 from tests.worlds.evaluation_set import moved, write_evaluation_set
@@ -58,7 +59,9 @@ def test_methods_stand_beside_each_other(folder, files, capsys, repeated):
 def test_other_styles_keep_the_standard_output_clean(folder, files, capsys):
     assert run("--data", folder, "--results", files[1], "--format", "json", "--visib-min", "0", "--top", "0", "--vertices", "5") == 0
     output, error = capsys.readouterr()
-    assert json.loads(output)["methods"][0]["rows"][-1]["targets"] == 96
+    table = json.loads(output)
+    assert table["methods"][0]["rows"][-1]["targets"] == 96
+    assert synpick_warp.evaluate(folder, files[1:], min_visibility=0.0, top=0, vertices=5) == table
     assert "eval_bop19_pose.py" in error
 
 

@@ -15,9 +15,9 @@ import synpick_warp
 from synpick_warp.apps.evaluation.models import read_models
 from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.results import ResultFile
+from synpick_warp.apps.evaluation.run import make_methods
 from synpick_warp.apps.evaluation.tracking import filter_poses
 from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
-from synpick_warp.cli.commands.evaluate import make_methods
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 from tests.harness.fuzz import fuzz_examples

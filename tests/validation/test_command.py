@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 
+import synpick_warp
 from synpick_warp.apps.validation import run as running
 from synpick_warp.apps.validation.registry import load_rules
 from synpick_warp.cli.main import main
@@ -65,6 +66,7 @@ def test_json_lines(copy, capsys):
     code, lines, _ = run(capsys, copy, "--json", "--fast")
     records = [json.loads(line) for line in lines]
     assert code == 1
+    assert [each._asdict() | {"cure": records[0]["cure"]} for each in synpick_warp.validate(copy, images=False)][:1] == records[:1]
     assert records[0] == {
         "level": "error",
         "file": f"{SCENE}/scene_gt_info.json",

@@ -129,3 +129,8 @@ def select_targets(truth: Truth, targets: TargetList) -> Truth:
     keys = zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), truth.poses.object_id.tolist(), strict=True)
     rows = np.array([(ids := objects.get((scene, image), nothing)) is None or object_id in ids for scene, image, object_id in keys], bool)
     return replace(truth.select(rows), images=truth.images[images])
+
+
+def targets_file(results: Path) -> Path:
+    """Target list beside a result file: the images and objects that were estimated."""
+    return results.with_name(f"{results.stem}-targets.json")

@@ -98,7 +98,7 @@ def run_method(
     from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
     from synpick_warp.apps.estimation.scenes import plan_scenes
     from synpick_warp.apps.evaluation.results import write_results
-    from synpick_warp.apps.evaluation.targets import encode_targets, in_layout
+    from synpick_warp.apps.evaluation.targets import encode_targets, in_layout, targets_file
     from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.exporters.writing.files import output_errors, write_atomically
@@ -184,17 +184,14 @@ def parse_indices(option: str, text: str) -> tuple[int, ...]:
     return tuple(sorted(indices))
 
 
-def targets_file(out: Path) -> Path:
-    """File beside the results that lists what was estimated."""
-    return out.with_name(f"{out.stem}-targets.json")
-
-
 def check_output(out: Path, selection: ImageSelection) -> None:
     """Check the output before anything is read.
 
     Raises:
         OutputError: Its folder does not exist, it or the list beside it is a folder, or it would replace the list that is read.
     """
+    from synpick_warp.apps.evaluation.targets import targets_file
+
     if out.is_dir() or not out.absolute().parent.is_dir() or targets_file(out).is_dir():
         raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
     given = selection.targets

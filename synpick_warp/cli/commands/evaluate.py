@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TextIO
 
@@ -18,8 +18,6 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, 
 
 if TYPE_CHECKING:
     from synpick_warp.apps.evaluation.figures import Method
-    from synpick_warp.apps.evaluation.poses import CameraMotion, PoseTable
-    from synpick_warp.apps.evaluation.results import ResultFile
     from synpick_warp.apps.evaluation.scoring import Scores
     from synpick_warp.apps.evaluation.truth import Truth
     from synpick_warp.dataset.reading import DataSet
@@ -148,58 +146,19 @@ def make_table(
         The table, and file name -> PNG file.
     """
     from synpick_warp.apps.evaluation.figures import Settings, draw_figures
-    from synpick_warp.apps.evaluation.models import read_models
-    from synpick_warp.apps.evaluation.results import check_results, read_results
-    from synpick_warp.apps.evaluation.scoring import score
-    from synpick_warp.apps.evaluation.tables import GROUPS, render, summarize
-    from synpick_warp.apps.evaluation.targets import read_targets, select_targets
-    from synpick_warp.apps.evaluation.truth import read_truth
+    from synpick_warp.apps.evaluation.run import score_files
+    from synpick_warp.apps.evaluation.tables import render
 
-    # Result files first: their mistakes are the likely ones, and quick to find.
-    files = [read_results(path) for path in results]
-    truth = read_truth(data_set)
-    models = read_models(data_set.folder, truth.poses.object_id.tolist(), vertices)
-    for file in files:
-        check_results(file, truth, set(data_set.models_info) | set(models))
-    if targets is not None:
-        truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.sensors))
-    if not truth.shown(visib_min).any():
-        raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
-    print(*describe_gaps(files, truth, listed=targets is not None), sep="", end="", file=sys.stderr)
-    methods = make_methods(results, files, alpha, truth.motion)
-    scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
-    # Modes are those of a bake.
-    groups = [group for group in GROUPS if group != "mode" or data_set.found is None]
-    table = render(summarize(truth, scores, object_names(data_set), groups), truth, scores, style, convention)
+    def remark(line: str) -> None:
+        print(escape(line), file=sys.stderr)
+
+    scored = score_files(data_set, results, visib_min, top, vertices, alpha, targets, remark)
+    table = render(scored.rows, scored.truth, scored.scores, style, convention)
     if plots is None:
         return table, {}
-    pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, attempt_frames(data_set))
-    return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
-
-
-def describe_gaps(files: Sequence[ResultFile], truth: Truth, *, listed: bool) -> Iterator[str]:
-    """A line for each result file without any estimate in an image that has targets. `listed`: images are those of a target list."""
-    from synpick_warp.cli.commands.estimate import targets_file
-
-    wanted = set(zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), strict=True))
-    for file in files:
-        missing = len(wanted - set(zip(file.poses.scene.tolist(), file.poses.image.tolist(), strict=True)))
-        own = targets_file(file.path)
-        advice = f"; --targets {own} scores those that were estimated" if not listed and own.is_file() else ""
-        if missing:
-            text = f"{file.path} has no estimate in {missing:,} of {len(wanted):,} images, whose objects count as missed{advice}"
-            yield f"{escape(text)}\n"
-
-
-def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None, motion: CameraMotion) -> list[Method]:
-    """Named estimates of each file, with the filtered ones, by their motion in the world, if there is a weight `alpha`."""
-    from synpick_warp.apps.evaluation.figures import Method
-    from synpick_warp.apps.evaluation.tracking import filter_poses
-
-    def filtered(poses: PoseTable) -> PoseTable | None:
-        return None if alpha is None else motion.to_camera(filter_poses(motion.to_world(poses), alpha))
-
-    return [Method(name, file.poses, filtered(file.poses), alpha) for name, file in zip(method_names(results), files, strict=True)]
+    settings = Settings(scored.models, visib_min, top)
+    pictures = draw_figures(scored.truth, scored.methods, scored.scores, settings, track, attempt_frames(data_set))
+    return table, pictures | draw_failure_sheets(data_set, scored.truth, scored.methods, scored.scores)
 
 
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
@@ -207,6 +166,7 @@ def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Metho
     from synpick_warp.apps.estimation.failures import draw_failures, find_failures
     from synpick_warp.apps.estimation.gicp import read_object_models
     from synpick_warp.apps.evaluation.figures import file_names
+    from synpick_warp.apps.evaluation.run import object_names
     from synpick_warp.exporters.writing.png import encode_png
     from synpick_warp.system.hardware.device import pick_device
 
@@ -307,20 +267,6 @@ def write_table(out: Path, table: str) -> None:
 
     with output_errors(out):
         write_atomically(out, table.encode("utf-8"))
-
-
-def object_names(data_set: DataSet) -> dict[int, str]:
-    """Names of objects by obj_id, which the trajectory store has; empty without."""
-    return {item.object_id: item.name for item in data_set.objects} if data_set.has_store else {}
-
-
-def method_names(results: Sequence[Path]) -> list[str]:
-    """Name of each method: its file's up to the first underscore, as BOP has it; the whole path where two would be equal."""
-    stems = [escape(path.stem) for path in results]
-    short = [stem.partition("_")[0] or stem for stem in stems]
-    if len(set(short)) == len(short):
-        return short
-    return stems if len(set(stems)) == len(stems) else [escape(str(path)) for path in results]
 
 
 def toolkit_name(data_set: DataSet) -> str:
