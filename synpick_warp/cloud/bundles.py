@@ -23,8 +23,7 @@ from synpick_warp.exporters.base import Exporter
 from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import index_lines
 from synpick_warp.exporters.writing.files import LINES
-from synpick_warp.system.folders import make_folder
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.paths import make_folder, path_inside
 
 MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""

@@ -29,8 +29,8 @@ from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.sizes import count_writers
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.json import MAX_JSON
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.stores.store import SMALL
 
 AHEAD = 256

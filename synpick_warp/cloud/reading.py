@@ -41,10 +41,9 @@ from synpick_warp.dataset.commit.manifest import (
 from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.paths import make_folder, path_inside
 from synpick_warp.system.inputs.toml import MAX_TOML
 from synpick_warp.system.inputs.urls import SCHEMES
 from synpick_warp.system.progress import Report, ignore_progress

@@ -19,8 +19,7 @@ from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.system.codecs.depth_png import max_data_bytes
 from synpick_warp.system.processes.shared_memory import shared_bytes
-from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.views.masks import WORD_BYTES, most_words
+from synpick_warp.views.frames import WORD_BYTES, EpisodeEnd, FrameBatch, TickBatch, most_words
 from synpick_warp.views.picks import PickBatch
 
 PIXEL_BYTES = (3, 2, 1)

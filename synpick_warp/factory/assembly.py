@@ -28,13 +28,12 @@ from synpick_warp.factory.memory_plan import check_memory, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
-from synpick_warp.scenes.bins import Bin, make_bins
+from synpick_warp.scenes.bins import Bin, make_bins, make_fixtures
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
 from synpick_warp.scenes.capacities import FEW, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fills import check_fill
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.grippers.registry import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
@@ -50,7 +49,7 @@ from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, 
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.processes.garbage import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
-from synpick_warp.views.masks import most_words
+from synpick_warp.views.frames import most_words
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.meshes import read_mesh
-from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.modelling import Patch, make_mesh
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh

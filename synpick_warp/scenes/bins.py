@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from synpick_warp.configs.cell.bins import TOTE, BinRow, Tote
 from synpick_warp.configs.cell.extents import DIVIDER, BinSizes, Point
+from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bin_meshes.reading import bin_material, read_bin
 from synpick_warp.scenes.collision.simplification import simplify_hull
+from synpick_warp.scenes.grippers.mechanism import finger_fixture
+from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.scenes.modelling import Patch, at_height, join, make_mesh, solid
 from synpick_warp.scenes.tote import box_piece, tote_colliders, tote_fixture
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
@@ -140,3 +143,8 @@ def guide_walls(sizes: BinSizes, height: float) -> tuple[ConvexPiece, ...]:
         box_piece((-far_x, y, low), (far_x, far_y, high)),
         box_piece((-far_x, -far_y, low), (far_x, -y, high)),
     )
+
+
+def make_fixtures(bins: Sequence[Bin], gripper: Gripper) -> tuple[Fixture, ...]:
+    """Create the visual meshes and materials of all bins, the gripper shaft and the gripper head, in this order."""
+    return (*(one.fixture for one in bins), finger_fixture(gripper), make_head(gripper).fixture)

@@ -12,8 +12,8 @@ from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.visibility.masks import InstanceMasks
 from synpick_warp.kernels.state import FramePoses, Frames, Snapshots
 from synpick_warp.stages.arrays import allocate, array_group, bundle, device_array
+from synpick_warp.views.frames import most_words
 from synpick_warp.views.layers import LAYER_TABLE, Layer
-from synpick_warp.views.masks import most_words
 
 FIXTURES = ("tote", "finger", "cup")
 """Order of the dimension "fixture"; finger: the gripper shaft."""

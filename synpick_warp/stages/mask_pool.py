@@ -19,7 +19,7 @@ from synpick_warp.scenes.cameras import CAMERA_KEYS
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.system.linear_algebra import matmul
-from synpick_warp.views.masks import most_words
+from synpick_warp.views.frames import most_words
 
 SHARE = 32
 """Pool size per view, in full-image masks: 32 bits a pixel."""

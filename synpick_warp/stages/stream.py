@@ -21,8 +21,7 @@ from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing
-from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch
-from synpick_warp.views.masks import most_words
+from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch, most_words
 
 OWN_ARRAYS = 6
 """Arrays that a report copies before those of its namespaces: of `WorldStatus`, then objects and poses."""

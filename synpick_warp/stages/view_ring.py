@@ -25,7 +25,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import LENSES, PlacedCameras, allocate_view_cameras, make_views, place_cameras, place_lenses
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
-from synpick_warp.views.masks import WORD_BYTES, most_words
+from synpick_warp.views.frames import WORD_BYTES, most_words
 
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20

@@ -1,4 +1,5 @@
-"""Schema of the host-side batches from stages to exporters: rendered views, simulation frames (ticks), and ends of episodes.
+"""Schema of the host-side batches from stages to exporters: rendered views with their amodal masks, simulation frames (ticks), and ends of
+episodes.
 
 A tick is one output frame of simulated time (`physics.steps_per_tick` physics steps); a view is one camera's image of it.
 """
@@ -10,6 +11,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
+
+from synpick_warp.codes import MASK_ROWS
 
 
 class Images(Protocol):
@@ -44,7 +47,7 @@ class FrameBatch:
     """Segmentation id of the nearest surface: 0 none, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
     mask_words: np.ndarray | Images
     """Amodal masks: a bit a pixel for each instance in its own box, set where the pixel's ray hits it, hidden or not (B, W) uint32; see
-    `synpick_warp.views.masks`."""
+    `synpick_warp.views.frames`."""
     mask_first: np.ndarray
     """Index of the first word of each mask (B, I) int32."""
     mask_box: np.ndarray
@@ -214,3 +217,35 @@ class EpisodeEnd:
     def images(self) -> Sequence[int]:
         """BOP's im_id of each frame."""
         return range(self.frames) if self.image_ids is None else self.image_ids
+
+
+WORD_BYTES = 4
+"""Bytes of a word."""
+
+
+def most_words(width: int, height: int) -> int:
+    """Words of a mask as large as an image [px]."""
+    return width * -(-height // MASK_ROWS)
+
+
+def paint_masks(words: np.ndarray, first: np.ndarray, box: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Masks of a view as images (I, H, W) bool, from its words, the first of each mask (I) and the boxes (I, 4)."""
+    masks = np.zeros((len(first), height, width), bool)
+    for mask, index, (left, top, right, bottom) in zip(masks, first.tolist(), box.tolist(), strict=True):
+        mask[top : bottom + 1, left : right + 1] = unpack_mask(words, index, np.array((left, top, right, bottom)))
+    return masks
+
+
+def unpack_mask(words: np.ndarray, first: int, box: np.ndarray) -> np.ndarray:
+    """Mask of an instance within its box (rows, columns) bool.
+
+    Args:
+        words: Words of the view (W) uint32.
+        first: Index of the first of this mask.
+        box: x_min, y_min, x_max, y_max, inclusive [px]; x_max < x_min: empty.
+    """
+    columns, rows = (max(0, int(past) - int(start) + 1) for start, past in zip(box[:2], box[2:], strict=True))
+    bands = -(-rows // MASK_ROWS)
+    own = words[first : first + bands * columns].astype("<u4", copy=False).reshape(bands, columns, 1)
+    bits = np.unpackbits(own.view(np.uint8), axis=-1, bitorder="little")
+    return bits.swapaxes(1, 2).reshape(bands * MASK_ROWS, columns)[:rows].astype(bool)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.kernels.newton_patches import contact_matching as kernels
-from synpick_warp.newton_patches.contact_matching import MAX_DISTANCE
+from synpick_warp.newton_patches.narrow_phase import MAX_DISTANCE
 from synpick_warp.stages.sim import physics
 
 PAIR_BITS = 3

@@ -14,8 +14,8 @@ import pytest
 from synpick_warp.cli.main import main
 from synpick_warp.scenes.collision.shapes import _save
 from synpick_warp.scenes.types import ConvexPiece
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.hardware.caches import link_files
+from synpick_warp.system.inputs.paths import make_folder
 from tests.builders import mistake
 from tests.harness.scripted_bake import bake, settings
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene

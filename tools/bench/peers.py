@@ -16,9 +16,8 @@ from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer

@@ -23,11 +23,10 @@ from synpick_warp.configs.episodes.objects import Counts
 from synpick_warp.configs.schema import LAYERED, Cameras, Config
 from synpick_warp.factory.assembly import fit_to_catalog, make_renderer
 from synpick_warp.factory.memory_plan import plan_memory
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.build import build_model, find_drawn
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.arrays import allocate

@@ -22,10 +22,9 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
@@ -35,7 +34,7 @@ from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.views.masks import paint_masks
+from synpick_warp.views.frames import paint_masks
 from tools.options import configure, fail, make_parser, write_json
 
 OWN = {

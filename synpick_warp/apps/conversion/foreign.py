@@ -42,9 +42,9 @@ from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.progress import Report
 from synpick_warp.views.frames import EpisodeEnd
 

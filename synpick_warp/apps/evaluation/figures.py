@@ -23,7 +23,7 @@ from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.errors import ConfigError, OutputError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.codecs.charts import Spec, render_charts
-from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.paths import make_folder
 
 Track = tuple[int, int]
 """Scene and instance."""

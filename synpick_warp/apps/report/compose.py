@@ -34,7 +34,7 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
-from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.progress import Report
 
 SUFFIXES = (".html", ".htm")

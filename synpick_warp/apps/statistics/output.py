@@ -18,7 +18,7 @@ from synpick_warp.apps.statistics.tables import PAPER, TIMELINE, make_tables
 from synpick_warp.errors import OutputError, escape
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.system.codecs.tables import Table, to_csv, to_text
-from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.paths import make_folder
 
 NEAR = 50
 """Load from which a seal is near its limit [% of its break force]."""

@@ -40,8 +40,8 @@ from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, check_output_folder, output_error, remove_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.inputs.urls import store_url
 
 MAX_EPISODES = 10_000_000

@@ -68,8 +68,8 @@ from synpick_warp.exporters.writing.files import (
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.files import check_regular_file
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.inputs.toml import MAX_TOML
 from synpick_warp.views.frames import EpisodeEnd
 

@@ -25,9 +25,8 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.linear_algebra import matmul
 from synpick_warp.views.bins import bin_record
-from synpick_warp.views.frames import FrameBatch
+from synpick_warp.views.frames import FrameBatch, most_words, unpack_mask
 from synpick_warp.views.layer_codec import encode_layer
-from synpick_warp.views.masks import most_words, unpack_mask
 
 ANNOTATIONS = "annotations"
 """Spool file of a staged scene: the annotation blocks of its views, in order of arrival; see `annotation_block`.

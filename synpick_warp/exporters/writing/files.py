@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from synpick_warp.errors import OutputError
-from synpick_warp.system.folders import make_folder
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.inputs.urls import store_url
 
 PARTIAL = ".partial"

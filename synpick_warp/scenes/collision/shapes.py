@@ -23,9 +23,9 @@ from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.hardware.caches import USER_VARIABLE, user_cache
 from synpick_warp.system.inputs.files import check_regular_file
+from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 MAX_CACHE_FILE = 2**26

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.images.mask_runs import (
 from synpick_warp.kernels.tuning import RUN_LANES
 from synpick_warp.stages.arrays import device_array
 from synpick_warp.stages.buffers import ViewBuffers, masks_of
-from synpick_warp.views.masks import WORD_BYTES
+from synpick_warp.views.frames import WORD_BYTES
 
 BOUNDARIES_PER_COLUMN = 24
 """Least capacity of a list, as a mean over the columns of an image: three times the run boundaries of a tote with 14 objects. Of many

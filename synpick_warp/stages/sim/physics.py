@@ -18,8 +18,7 @@ from synpick_warp.kernels.sim import arrangement, gripper, rest
 from synpick_warp.kernels.state import Contacts
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
-from synpick_warp.newton_patches.contact_matching import complete_matching
-from synpick_warp.newton_patches.narrow_phase import resize_blocks
+from synpick_warp.newton_patches.narrow_phase import complete_matching, resize_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import bundle

@@ -1,7 +1,9 @@
-"""Path containment: names read from a file, resolved inside a folder (prevention of path traversal, CWE-22)."""
+"""Path containment: names read from a file, resolved inside a folder (prevention of path traversal, CWE-22); and folders of any depth."""
 
 from __future__ import annotations
 
+import os
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 
 from synpick_warp.errors import SynpickError
@@ -44,3 +46,14 @@ def _quote(name: str) -> str:
     """Name in quotes for a message: cut to 80 characters, unprintable ones escaped."""
     shown = name if len(name) <= 80 else f"{name[:79]}…"
     return f'"{shown.encode("unicode_escape").decode() if not shown.isprintable() else shown}"'
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder with its parents, unless it exists: `mkdir -p`. `Path.mkdir` calls itself for each parent, which ends at 1,000.
+
+    Raises:
+        OSError: As `Path.mkdir`; FileExistsError: it is a file.
+    """
+    missing = list(takewhile(lambda each: not os.path.lexists(each), (folder, *folder.parents)))
+    for each in reversed(missing or [folder]):
+        each.mkdir(exist_ok=True)

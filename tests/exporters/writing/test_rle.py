@@ -11,7 +11,7 @@ from pycocotools import mask as coco
 
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.exporters.writing.rle import RunBoundaries, Runs, find_run_boundaries, find_runs, split_listed_runs
-from synpick_warp.views.masks import most_words, unpack_mask
+from synpick_warp.views.frames import most_words, unpack_mask
 from tests.twins.masks import pack_masks
 
 SIDE = st.integers(1, 12)

@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.render import denoised
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.views.masks import most_words
+from synpick_warp.views.frames import most_words
 from tests.harness.trace_probe import trace_gbuffer
 from tests.twins.annotate import count_pixels
 from tests.twins.raycast import cast_scene

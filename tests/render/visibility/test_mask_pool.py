@@ -18,7 +18,7 @@ from synpick_warp.stages.mask_pool import SHARE, MaskBounds, share_words, split_
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing
-from synpick_warp.views.masks import most_words, paint_masks
+from synpick_warp.views.frames import most_words, paint_masks
 from tests.worlds.dense_views import dense_toy
 from tests.worlds.toy_scene import DOWN, ToyScene, build_scene, camera, make_renderer, render_gbuffer, snapshot, with_render
 

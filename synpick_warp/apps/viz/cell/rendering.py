@@ -15,10 +15,9 @@ from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import build_smallest, compiling_if_cold, make_renderer
-from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.catalog import read_objects
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, RawObject
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, allocate_view_buffers

@@ -21,9 +21,8 @@ from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
-from synpick_warp.system.folders import make_folder
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.paths import make_folder, path_inside
 from synpick_warp.views.layer_codec import layer_notes
 
 MODEL_FOLDERS = ("models", "models_eval")
