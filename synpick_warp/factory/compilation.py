@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 
 import warp as wp
 
 from synpick_warp.codes import Status
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory.assembly import build_smallest
-from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kernel
 from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.newton_patches.narrow_phase import slow_builds
-from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, read_tick
-from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
-from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, build_of, compilation_lock, list_binaries
+from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, build_of, compilation_lock
 from synpick_warp.system.progress import Progress
 
 
@@ -78,58 +69,3 @@ def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
         for views in stream.render(record.snapshot, report):
             len(views)
     wp.synchronize_device(simulation.device)
-
-
-@dataclass(frozen=True)
-class WarmUp:
-    """Result of a warm-up: number of modules compiled (the others were in the cache), and duration [s]."""
-
-    compiled: int
-    """Modules that were compiled; the others were in the cache."""
-    seconds: float
-    """Duration [s]."""
-
-
-def check_caches() -> None:
-    """Check that kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost at its end.
-
-    Raises:
-        CacheError: A cache cannot be written.
-    """
-    caches = (
-        ("kernel", kernel_cache(wp.config.version), KERNEL_VARIABLE),
-        ("shape", default_cache_dir() if user_cache() else None, USER_VARIABLE),
-    )
-    for name, folder, variable in caches:
-        reason = "the user has no home" if folder is None else find_fault(folder)
-        if reason is not None:
-            raise CacheError(
-                f"the {name} cache {folder or '~/.cache'} cannot be written ({reason}), so that a warm-up would be lost; "
-                f"set {variable} to a folder that can be written"
-            )
-
-
-def warm_up(config: Config, progress: Progress) -> WarmUp:
-    """Compile the kernels of a bake or stream with these settings, then run two ticks and one rendering in the fewest worlds of the device.
-
-    Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats).
-
-    Args:
-        progress: Receives the stages and the progress of the compilation.
-
-    Raises:
-        SynpickError: As `synpick_warp.bake`.
-    """
-    started = time.perf_counter()
-    needs = Needs.of(config)
-    device = pick_device(config.bake.device)
-    with sole_compiler(progress):
-        before = list_binaries()
-        with make_compiler(device, progress) as compiler:
-            submit_slow(compiler, device)
-            compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
-            factory = build_smallest(config, device, progress, needs.physics, needs.images)
-            stream = factory.stream if needs.views else None
-            submit_launches(compiler, factory.simulation, stream)
-        launch_all(factory.simulation, stream)
-    return WarmUp(len(list_binaries() - before), time.perf_counter() - started)

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
-from synpick_warp.kernels.sim.choices import list_choices_kernel
+from synpick_warp.kernels.sim.trials import list_choices_kernel
 from synpick_warp.kernels.state import Attempts, Worlds
 from synpick_warp.kernels.structs import CatalogData
 from synpick_warp.stages.launch import launch

@@ -13,10 +13,13 @@ Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z
 import warp as wp
 
 from synpick_warp.kernels.sim.cup_rays import CUP, tcp_pose
-from synpick_warp.kernels.state import Control, Motion, Seals, Worlds
+from synpick_warp.kernels.state import Contacts, Control, Motion, Seals, Worlds
 from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
+
+# Gap that disables a contact [m]: ten times CONTACT_GAP of stages.sim.physics, beyond which the solver skips contacts.
+APART = wp.constant(1.0)
 
 
 @wp.struct
@@ -273,3 +276,40 @@ def apply_seal_forces_kernel(
             else:
                 push_object(wrench.force, wrench.torque + wp.cross(object_arm, wrench.force), control_inout.joint_f, first_dof)
                 pull_gripper(wrench.force, wrench.torque, tcp.wrist_arm, tcp.wrist_axis, control_inout.joint_f, gripper_dof)
+
+
+@wp.func
+def is_attached(layout: LayoutData, world: int, body: int, body_slot: wp.array2d[int], attached: wp.array2d[int]) -> bool:
+    """True if a seal holds the body, which must not be the gripper's."""
+    result = bool(False)
+    slot = body - world * layout.bodies - layout.gripper_bodies
+    for instance in range(layout.instances):
+        if attached[world, instance] != 0 and body_slot[world, instance] == slot:
+            result = True
+    return result
+
+
+@wp.kernel
+def ignore_attached_contacts_kernel(layout: LayoutData, contacts_inout: Contacts, state: Worlds, seals: Seals):
+    """Disable contacts between a gripper head and its attached objects, which would fight the seal: set their margin to -APART.
+
+    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it has
+    stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds into one
+    pair of bodies, and the solver's time grows with the square of a pair's contacts. Launched over contact.
+    """
+    contact = wp.tid()
+    if contact >= contacts_inout.count[0] or contacts_inout.shape0[contact] < 0 or contacts_inout.shape1[contact] < 0:
+        return
+    a = contacts_inout.shape_body[contacts_inout.shape0[contact]]
+    b = contacts_inout.shape_body[contacts_inout.shape1[contact]]
+    if a < 0 or b < 0:
+        return
+    cup = a
+    other = b
+    if b % layout.bodies == CUP:
+        cup = b
+        other = a
+    if cup % layout.bodies != CUP:
+        return
+    if is_attached(layout, cup // layout.bodies, other, state.body_slot, seals.attached):
+        contacts_inout.margin0[contact] = -APART

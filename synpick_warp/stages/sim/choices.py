@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
-from synpick_warp.kernels.sim.choices import list_choices_kernel
+from synpick_warp.kernels.sim.trials import list_choices_kernel
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State

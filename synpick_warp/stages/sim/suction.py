@@ -1,6 +1,4 @@
-"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, vacuum, seal, seal_array
-and seal_contacts.
-"""
+"""Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, vacuum, seal and seal_array."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.kernels.sim import cup_rays, seal, seal_array, seal_contacts, vacuum
+from synpick_warp.kernels.sim import cup_rays, seal, seal_array, vacuum
 from synpick_warp.scenes.collision.hulls import plane_table
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
@@ -75,7 +73,7 @@ class SuctionHold:
     def ignore_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         threads, contacts = physics.contacts.rigid_contact_max, contact_arrays(physics)
-        launch(seal_contacts.ignore_attached_contacts_kernel, threads, scene, state, seals, contacts=contacts)
+        launch(seal.ignore_attached_contacts_kernel, threads, scene, state, seals, contacts=contacts)
 
 
 class ArrayHold(SuctionHold):
