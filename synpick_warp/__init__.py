@@ -105,7 +105,7 @@ def bake(
         claim: Whether this is one of several equal workers, on any number of machines, which share out the episodes of a prefix among them.
         engine: "ray" or "ray://HOST:PORT": claiming workers on a Ray cluster; empty: on this machine.
         workers: Number of the engine's workers; 0: as many as its cluster has room for.
-        progress: Receives stages, counts and notes; None: silent. See `synpick_warp.system.progress`.
+        progress: Receives stages, counts and notes; None: the logger `synpick_warp`. See `synpick_warp.system.progress`.
 
     Returns:
         How every episode and attempt ended, and how long it took.
@@ -117,7 +117,7 @@ def bake(
     with collection_paused():
         from synpick_warp.configs.schema import Config
         from synpick_warp.factory.pipeline import run_bake
-        from synpick_warp.system.progress import SilentProgress
+        from synpick_warp.system.progress import LoggedProgress
 
     if not isinstance(config, Config):
         config = load_config(config, settings, splits=bool(splits))
@@ -130,10 +130,10 @@ def bake(
         from synpick_warp.cloud.workers import Job, start_bake
 
         given = {"claim": claim, "engine": engine, "workers": workers}
-        return start_bake(Job(config, out), progress or SilentProgress(), shard, splits, devices, **given)
+        return start_bake(Job(config, out), progress or LoggedProgress(), shard, splits, devices, **given)
     if claim or engine:
         raise ConfigError("claiming workers share out the episodes of a prefix in an object store; name one as the place of the data set")
-    return run_bake(config, out, progress if progress is not None else SilentProgress(), shard, splits, devices)
+    return run_bake(config, out, progress or LoggedProgress(), shard, splits, devices)
 
 
 def stream(
@@ -176,7 +176,7 @@ def stream(
         splits: Only episodes of these splits of the settings; empty: all.
         cameras: Indices of the cameras to render; None: all.
         stride: Every n-th frame of an episode; the others are simulated only. Above 1, colours are those of `render.history` 0.
-        progress: Receives stages and notes; None: silent.
+        progress: Receives stages and notes; None: the logger `synpick_warp`.
 
     Raises:
         SynpickError: An error that the user can correct, before the first batch or while one is made.
@@ -184,13 +184,13 @@ def stream(
     with collection_paused():
         from synpick_warp.online.settings import resolve_settings
         from synpick_warp.online.stream import Selection, open_stream
-        from synpick_warp.system.progress import SilentProgress
+        from synpick_warp.system.progress import LoggedProgress
 
     given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
     given |= {"resolution": resolution, "layers": layers, "batch": batch}
     resolved = resolve_settings(config, settings or {}, given, bool(splits))
     selection = Selection(cameras, stride)
-    progress = progress if progress is not None else SilentProgress()
+    progress = progress or LoggedProgress()
     return open_stream(resolved, progress, episodes=episodes, shard=shard, splits=splits, selection=selection)
 
 
@@ -234,7 +234,7 @@ def make_env(
         max_steps: Steps after which an episode is truncated; None: 30 attempts, or 600 ticks.
         piles: Number of different piles that episodes are drawn from; None: 2^31 - 1, so that repeats are rare.
         course: Course of a whole pick: "attempt", as in a bake, or "trial", as in the format picks, which takes a third of the ticks.
-        progress: Receives stages and notes; None: silent.
+        progress: Receives stages and notes; None: the logger `synpick_warp`.
 
     Raises:
         SynpickError: An error that the user can correct.

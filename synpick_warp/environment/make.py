@@ -35,7 +35,7 @@ from synpick_warp.stages.environment.twist import TwistLaw
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
 from synpick_warp.stages.sim.trials import TrialLaw, make_course
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.system.progress import LoggedProgress, Progress, SilentProgress
 
 NO_WRITERS = 0
 """Writer processes in the memory plan: none."""
@@ -74,7 +74,7 @@ def make_picking(
     Raises:
         SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.
     """
-    progress = progress or SilentProgress()
+    progress = progress or LoggedProgress()
     config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
     if choice.course == TRIAL:
         config = config.with_values({"pick.lift_height": config.picks.lift_height})

@@ -1,7 +1,8 @@
-"""Progress reporting: the observer interface of a bake, a silent observer, and the callback of a pass over a data set."""
+"""Progress reporting: the observer interface of a bake, observers that are silent or log, and the callback of a pass over a data set."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -53,6 +54,16 @@ class SilentProgress:
 
     def note(self, text: str) -> None:
         """Do nothing."""
+
+
+class LoggedProgress(SilentProgress):
+    """Observer that logs to `synpick_warp`: stages as INFO, notes as WARNING, which Python prints by default."""
+
+    def stage(self, text: str) -> None:
+        logging.getLogger("synpick_warp").info(text)
+
+    def note(self, text: str) -> None:
+        logging.getLogger("synpick_warp").warning(text)
 
 
 class ForwardingProgress(SilentProgress):
