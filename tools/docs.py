@@ -95,19 +95,21 @@ def _allowed(item: Setting) -> str:
 
 def validation_reference() -> str:
     """The README of the validation with its table of rules; the rest is as committed."""
-    rows = [f"| `{item.name}` | {item.level} | {item.unit} | {item.sentence} |" for item in load_rules().values()]
-    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level | unit | what holds |", "|---|---|---|---|", *rows])
+    units = {name: f" [{item.unit}]" if item.unit else "" for name, item in load_rules().items()}
+    rows = [f"| `{name}` | {item.level}{units[name]} | {item.sentence} |" for name, item in load_rules().items()]
+    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level [unit] | what holds |", "|---|---|---|", *rows])
 
 
 def formats_reference() -> str:
     """The README of the exporters with the columns of picks; the rest is as committed."""
     lines = []
     for title, columns in ("trials", COLUMNS), ("states", STATES):
-        lines += [*[""] * bool(lines), f"| column of {title} | type | unit | content |", "|---|---|---|---|"]
+        lines += [*[""] * bool(lines), f"| column of {title} | type [unit] | content |", "|---|---|---|"]
         for column in columns:
             codes = f" Codes from 0: {', '.join(f'`{name}`' for name in names(column.codes))}." if column.codes else ""
+            unit = "" if column.unit == "1" else f" [{column.unit}]"
             kind = f"{np.dtype(column.dtype).name}" + (f" x {column.size}" if column.size > 1 else "")
-            lines.append(f"| `{column.name}` | {kind} | {column.unit if column.unit != '1' else ''} | {column.meaning}{codes} |")
+            lines.append(f"| `{column.name}` | {kind}{unit} | {column.meaning}{codes} |")
     return _with_table(FORMATS, _COLUMNS_BEGIN, lines)
 
 
