@@ -41,7 +41,8 @@ _SETTINGS_HEAD = """# Reference of the settings
 
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
 
-What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out.
+What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out. Paths in
+a file are relative to it.
 """
 _RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
 _COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
@@ -84,10 +85,12 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
 
 
 def _allowed(item: Setting) -> str:
-    """What a setting allows: an interval with its unit, or words."""
+    """What a setting allows, beyond what its default shows: an interval with its unit, or words."""
     low, high, above = (None if bound is None else f"{bound:.10g}" for bound in (item.bounds.low, item.bounds.high, item.bounds.above))
+    if (item.kind in (bool, str) and not item.choices) or item.path:
+        return "a path" if item.path else ""
     if item.allowed or (low or high or above) is None:
-        return describe_allowed(item) + (f" [{item.unit}]" if item.unit else "")
+        return describe_allowed(item) + f" [{item.unit}]" * bool(item.unit)
     interval = f"({above}" if above is not None else f"[{low}" if low is not None else "(-∞"
     interval += f", {high}]" if high is not None else ", ∞)"
     return f"{interval} {item.unit}".rstrip() + (" or distribution" if isinstance(item.default, Distribution) else "")
@@ -95,8 +98,7 @@ def _allowed(item: Setting) -> str:
 
 def validation_reference() -> str:
     """The README of the validation with its table of rules; the rest is as committed."""
-    units = {name: f" [{item.unit}]" if item.unit else "" for name, item in load_rules().items()}
-    rows = [f"| `{name}` | {item.level}{units[name]} | {item.sentence} |" for name, item in load_rules().items()]
+    rows = [f"| `{name}` | {item.level}{f' [{item.unit}]' * bool(item.unit)} | {item.sentence} |" for name, item in load_rules().items()]
     return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level [unit] | what holds |", "|---|---|---|", *rows])
 
 
@@ -107,9 +109,8 @@ def formats_reference() -> str:
         lines += [*[""] * bool(lines), f"| column of {title} | type [unit] | content |", "|---|---|---|"]
         for column in columns:
             codes = f" Codes from 0: {', '.join(f'`{name}`' for name in names(column.codes))}." if column.codes else ""
-            unit = "" if column.unit == "1" else f" [{column.unit}]"
-            kind = f"{np.dtype(column.dtype).name}" + (f" x {column.size}" if column.size > 1 else "")
-            lines.append(f"| `{column.name}` | {kind}{unit} | {column.meaning}{codes} |")
+            kind = np.dtype(column.dtype).name + f" x {column.size}" * (column.size > 1) + f" [{column.unit}]" * (column.unit != "1")
+            lines.append(f"| `{column.name}` | {kind} | {column.meaning}{codes} |")
     return _with_table(FORMATS, _COLUMNS_BEGIN, lines)
 
 
@@ -120,11 +121,7 @@ def _with_table(path: Path, begin: str, lines: list[str]) -> str:
 
 
 def figures_reference() -> str:
-    """The README of the tools with its tables of figures; the rest is as committed.
-
-    Raises:
-        KeyError: It has a table for which there are no results.
-    """
+    """The README of the tools with its tables of figures; the rest is as committed. Raises KeyError for a table without results."""
     return _with_results(FIGURES, figures_tables(read_runs()))
 
 
