@@ -1,13 +1,20 @@
-"""An own cell end to end: a bin as STL with a sloped floor and a divider, a part as STL in millimetres, all formats."""
+"""What users bring, end to end: a bin and a part as STL in all formats, catalogs at the ends of what fits, materials, light maps."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 import zarr
+from PIL import Image
 from pxr import Usd, UsdGeom
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.apps.viz.explain import write_explanation
@@ -15,13 +22,20 @@ from synpick_warp.apps.viz.preview import write_contact_sheet
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import FORMATS
 from synpick_warp.dataset.reading import DataSet
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.lights import MAX_RADIANCE
+from synpick_warp.scenes.types import Material
+from synpick_warp.stages.render.scene import build_render_scene, pack_texels
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import PICKING
 from tests.harness.bake_server import TINY
 from tests.worlds.bin_meshes import bracket, sloped_bin
+from tests.worlds.model_files import box, glb, put
+from tests.worlds.small_worlds import QUICK
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, even_light, render, sheet, sun
 
 CELL = """preset = "smoke"
 [bins]
@@ -105,3 +119,108 @@ def test_all_formats_are_valid_explained_and_have_the_mesh(baked):
         assert write.stat().st_size > 10_000
     for name in ("train", "train_web", "usd", "trajectory.zarr", "lerobot", "coco", "yolo"):
         assert any((baked / "set" / name).rglob("*")), name
+
+
+# ---- catalogs of one or two objects ----
+
+
+class Notes(SilentProgress):
+    """Keeps notes."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
+
+
+IN_WAY, ASIDE = [0.1, 0.1, 0.6], [0.0, 0.6, 1.0]
+"""Positions of cameras [m]."""
+AROUND = {"cameras.positions": [IN_WAY, ASIDE, IN_WAY]}
+
+
+def bake_models(folder: Path, mode: str, *sizes: tuple[float, float, float], **more: object) -> tuple[BakeSummary, list[str]]:
+    """Bake an episode of boxes with these sides [m] under the budget and the capacity of `smoke`, 3 litres and 24 objects; with notes."""
+    quick = {key: value for key, value in (QUICK | PICKING | TINY).items() if not key.startswith("arrangement.")}
+    quick |= {"bake.worlds": 1, "bake.episodes": 1, "bake.formats": ["bop"], "render.layers": [], "bake.mode": mode}
+    for index, size in enumerate(sizes):
+        put(folder / "models" / f"box_{index}.ply", box(*size))
+    notes = Notes()
+    config = load_config("smoke", quick | {"bake.models": str(folder / "models")} | more)
+    summary = run_bake(config, folder / "out", notes)
+    assert [row.ending.delivers for row in summary.episodes] == [True]
+    assert summary.views > 0
+    return summary, notes.lines
+
+
+@pytest.mark.parametrize(
+    ("mode", "sizes"),
+    [
+        ("move", [(0.1, 0.1, 0.1)]),
+        ("target", [(0.1, 0.1, 0.1), (0.1, 0.1, 0.1)]),
+        ("move", [(0.003, 0.003, 0.003)]),
+        ("pick", [(0.144, 0.144, 0.144)]),
+    ],
+    ids=["a litre", "twins", "3 mm", "the whole budget"],
+)
+@pytest.mark.slow
+def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
+    """Fault 4: with cubes of 100 mm, all 20 arrangements needed more body slots than a world had."""
+    assert bake_models(tmp_path, mode, *sizes)[0].resampled == 0
+
+
+def test_plates_of_a_millimetre_come_to_rest(tmp_path):
+    """All 20 arrangements had more contacts than the solver has capacity for by default: 24 plates have 700."""
+    summary, notes = bake_models(tmp_path, "move", (0.1, 0.08, 0.001), **AROUND)
+    assert [row.objects for row in summary.episodes] == [24]
+    assert not any("more contacts arose" in line or "in the gripper's way" in line for line in notes)
+    assert sum("thin objects: capacity for" in line for line in notes) == 1
+
+
+def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
+    """There was one object in the tote, and no word."""
+    summary, notes = bake_models(tmp_path, "pick", (0.1, 0.1, 0.1), **AROUND)
+    assert [row.objects for row in summary.episodes] == [3]
+    assert [line.split(" stands")[0] for line in notes if "in the gripper's way" in line] == ["camera camera_0", "camera camera_2"]
+    assert "1 objects take 0.001 of 0.003 m³ together, so that they repeat in an episode" in notes
+
+
+# ---- materials and light maps ----
+
+
+def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
+    """Factors times the mean of the picture that glTF keeps roughness (green) and metalness (blue) in."""
+    rough = np.zeros((4, 6, 3), np.uint8)
+    rough[:, :3], rough[:, 3:] = (9, 100, 200), (9, 200, 240)
+    material = PBRMaterial(
+        baseColorFactor=(255, 128, 0, 255),
+        baseColorTexture=Image.new("RGB", (5, 3), (200, 100, 50)),
+        metallicFactor=0.5,
+        roughnessFactor=0.8,
+        metallicRoughnessTexture=Image.fromarray(rough),
+    )
+    mesh = trimesh.creation.box((0.1, 0.08, 0.06))
+    mesh.visual = TextureVisuals(uv=np.random.default_rng(0).random((8, 2)), material=material)
+    put(tmp_path / "models" / "box.glb", glb(mesh))
+    config = load_config(None, {"bake.models": str(tmp_path / "models")})
+    catalog = load_catalog(config, tmp_path / "cache")
+    toy = ToyScene([], [], (camera(8, 8, 8.0, (0.0, 0.0, 1.0)),))
+    surfaces = build_render_scene(config.render, -config.tote.wall, catalog, toy.fixtures, toy.cameras, (even_light(),), device).surfaces
+    assert surfaces.metallic.numpy()[0] == pytest.approx(0.5 * 220 / 255, abs=1e-3)
+    assert surfaces.roughness.numpy()[0] == pytest.approx(0.8 * 150 / 255, abs=1e-3)
+    # glTF's factor is linear, as are the renderer's colours.
+    assert surfaces.color.numpy()[0] == pytest.approx((1.0, 128 / 255, 0.0), abs=2e-3)
+    assert surfaces.texture_size.numpy()[0].tolist() == [5, 3]
+    assert surfaces.texel.numpy()[0] == pack_texels(np.array([[[200, 100, 50]]], np.uint8))[0]
+
+
+def test_a_picture_does_not_depend_on_the_unit_of_its_light_map(device):
+    """Up to the largest radiance that is allowed: exposure is automatic, and nothing overflows."""
+    dim, pictures = sun((0.3, 0.2, 1.0)), []
+    body = entry(sheet(0.2, 0.2), Material((0.6, 0.5, 0.4), None, 0.0, 0.5))
+    for gain in (1.0, 0.99 * MAX_RADIANCE / dim.radiance.max()):
+        light = replace(dim, radiance=(dim.radiance * np.float32(gain)))
+        toy = ToyScene([body], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (camera(24, 24, 60.0, (0.0, 0.0, 1.0)),), lights=(light,))
+        pictures.append(render(toy, device).color.astype(int))
+    assert pictures[0].mean() > 50
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2

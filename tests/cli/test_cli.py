@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pickle
@@ -10,25 +11,27 @@ import subprocess
 import sys
 import tomllib
 import types
-from pathlib import Path
 
 import pytest
-import trimesh
 import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from synpick_warp import __version__
 from synpick_warp.cli.commands import doctor, forecast
 from synpick_warp.cli.main import app, main
-from synpick_warp.cli.options import EXAMPLES
+from synpick_warp.cli.options import EXAMPLES, MAX_LINE, one_line, parse_resolution, parse_shard
 from synpick_warp.codes import Ending
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import load_config, preset_names
-from synpick_warp.errors import DatasetError, DeviceError, OutputError, SynpickError
+from synpick_warp.errors import ConfigError, DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
 from synpick_warp.factory.memory_plan import Term
 from synpick_warp.stages import timing
 from tests.builders import mistake
-from tests.system.test_pool import refuse  # Writer processes import its module, which imports little.
+from tests.harness.fuzz import fuzz_examples
+from tests.system.test_processes import refuse  # Writer processes import its module, which imports little.
 
 
 def finished(number: int) -> BakeSummary:
@@ -74,10 +77,19 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
     assert "4 of 4 episodes and 120 views in 0:02 (60.0 views/s); arrangements resampled: 1" in printed
 
 
-def test_bake_passes_devices_and_automatic_sizes_on(tmp_path, bakes):
-    assert main(["bake", "--out", str(tmp_path), "--devices", "cpu, cpu", "--worlds", "auto", "--writers", "auto"]) == 0
-    [(config, *_)] = bakes.calls
-    assert (config.bake.worlds, config.bake.writers, bakes.devices) == (0, 0, ("cpu", "cpu"))
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--devices", "cpu, cpu", "--worlds", "auto", "--writers", "auto"], {"worlds": 0, "writers": 0, "devices": ("cpu", "cpu")}),
+        (["--device=cpu", "--formats=zarr, bop", "--shard=1/3"], {"formats": ("zarr", "bop"), "shard": (1, 3)}),
+        (["--device=cpu", "--split=train, test", "--shard=1/300"], {"shard": (1, 300), "splits": ("train", "test"), "episodes": 300}),
+    ],
+)
+def test_lists_shares_and_automatic_sizes_are_passed_on(tmp_path, bakes, options, expected):
+    assert main(["bake", f"--out={tmp_path}", *options]) == 0
+    [(config, _, shard, splits)] = bakes.calls
+    passed = vars(config.bake) | {"shard": shard, "splits": splits, "devices": bakes.devices}
+    assert {name: passed[name] for name in expected} == expected
 
 
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
@@ -91,17 +103,22 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
     ("arguments", "said"),
     [
         (["--worlds=-1"], "bake.worlds is -1 on the command line; allowed: at least 0, at most 65536"),
-        (["--worlds", "many"], '--worlds is "many"; allowed: a whole number in decimal digits, such as 8'),
+        (["--worlds", "9" * 30], "bake.worlds is 9999999999"),
+        (["--worlds", "65537"], "bake.worlds is 65537"),
+        (
+            ["--formats", "bop,obj"],
+            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, picks, lerobot, coco, yolo',
+        ),
+        (["--shard=3"], '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
+        (["--shard=4/4"], "--shard is 4/4; allowed: i/n with i from 0 to n - 1, such as 0/4"),
+        (["--shard=4/8"], "--shard 4/8 has none of 4 episodes; use fewer shards"),
         (["--resolution", "0x0"], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         (["--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--resolution", "640x-1"], '--resolution is "640x-1"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--mode", "juggle"], 'bake.mode is "juggle" on the command line; allowed: pick, target, move, mixed'),
         (["--mode", "mixed", "--set", "bake.mix=pick"], 'bake.mix is "pick" on the command line; allowed: 3 numbers in a list'),
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
-        (
-            ["--models", "no-such"],
-            "there is no models folder no-such; --models takes a folder of BOP models or of PLY, OBJ, glTF",
-        ),
+        (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of PLY, OBJ, glTF"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
         (
             ["--config", "no-such.toml"],
@@ -141,35 +158,6 @@ def test_a_missing_option_is_named_with_a_word_too_many(words, said):
     assert mistake("eval", *words) == f"eval needs --results{said}; see synpick-warp eval --help"
 
 
-def test_formats_and_share_are_passed_on(tmp_path, bakes):
-    assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--formats=zarr, bop", "--shard=1/3"]) == 0
-    [(config, _, shard, _)] = bakes.calls
-    assert config.bake.formats == ("zarr", "bop")
-    assert shard == (1, 3)
-
-
-def test_splits_are_passed_on(bakes, tmp_path):
-    assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--split=train, test", "--shard=1/300"]) == 0
-    [(config, _, shard, splits)] = bakes.calls
-    assert (shard, splits, config.bake.episodes) == ((1, 300), ("train", "test"), 300)
-
-
-@pytest.mark.parametrize(
-    ("option", "said"),
-    [
-        (
-            "--formats=bop,obj",
-            'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr, picks, lerobot, coco, yolo',
-        ),
-        ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
-        ("--shard=4/4", "--shard is 4/4; allowed: i/n with i from 0 to n - 1, such as 0/4"),
-        ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
-    ],
-)
-def test_formats_and_shares_that_are_not_there(tmp_path, bakes, option, said):
-    assert mistake("bake", "--device=cpu", f"--out={tmp_path}", option) == said
-
-
 def test_a_profile_is_a_table_and_a_trace_beside_the_data_set(tmp_path, bakes, capsys, monkeypatch):
     run = bakes.run_bake
 
@@ -203,26 +191,29 @@ def test_a_trace_is_never_written_into_the_data_set(tmp_path, bakes):
 
 
 def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
-    bakes.result = finished(4)
-    bakes.result.stopped = 2
-    assert main(["bake", "--device=cpu", f"--out={tmp_path}"]) == 130
-    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are complete; the same command completes the data set\n")
+    for result, said in (
+        (finished(4), ": 4 of 4 episodes are complete; the same command completes the data set"),
+        (KeyboardInterrupt(), ""),
+    ):
+        bakes.result = result
+        bakes.result.stopped = 2
+        assert main(["bake", "--device=cpu", f"--out={tmp_path / 'data'}"]) == 130
+        assert capsys.readouterr().err.endswith(f"synpick-warp: interrupted{said}\n")
 
 
-def test_output_folder_that_is_not_empty(tmp_path, bakes):
-    (tmp_path / "mine.txt").write_text("precious")
-    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path))
-    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to resume"
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-    assert not bakes.calls
-
-
-def test_output_folder_that_is_a_file(tmp_path, bakes):
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        (".", "{here} is not empty; --out takes a new or an empty folder, or a data set to resume"),
+        ("file", "{here}/file is a file; --out takes a new or an empty folder"),
+        ("file/data", "cannot write {here}/file/data: Not a directory; "),
+    ],
+)
+def test_output_folders_that_cannot_be_used(tmp_path, bakes, out, said):
     (tmp_path / "file").write_text("precious")
-    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path / "file"))
-    assert said == f"{tmp_path / 'file'} is a file; --out takes a new or an empty folder"
-    said = mistake("bake", "--device", "cpu", "--out", str(tmp_path / "file" / "data"))
-    assert said.startswith(f"cannot write {tmp_path / 'file' / 'data'}: Not a directory; ")
+    assert mistake("bake", "--device", "cpu", "--out", tmp_path / out).startswith(said.format(here=tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert not bakes.calls
 
 
 def test_output_folder_that_cannot_be_written(tmp_path, bakes):
@@ -234,26 +225,9 @@ def test_output_folder_that_cannot_be_written(tmp_path, bakes):
 
 def test_a_mistake_found_while_baking_takes_empty_folders_away_again(tmp_path, bakes):
     bakes.result = OutputError("the disk\nis full")
-    assert mistake("bake", "--device", "cpu", "--out", str(tmp_path / "a" / "b")) == "the disk is full"
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_empty_folder_is_used_and_kept(tmp_path, bakes):
-    bakes.result = OutputError("no")
-    mistake("bake", "--device", "cpu", "--out", str(tmp_path))
-    assert tmp_path.is_dir()
-
-
-def test_interrupt(tmp_path, bakes, capsys):
-    bakes.result = KeyboardInterrupt()
-    assert main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")]) == 130
-    assert capsys.readouterr().err == "synpick-warp: interrupted\n"
-
-
-def test_a_fault_of_ours_keeps_its_traceback(tmp_path, bakes):
-    bakes.result = ZeroDivisionError()
-    with pytest.raises(ZeroDivisionError):
-        main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")])
+    for out in (tmp_path / "a" / "b", tmp_path):  # An empty folder that was there is kept.
+        assert mistake("bake", "--device", "cpu", "--out", out) == "the disk is full"
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_fault_of_ours_in_a_writer_process_shows_its_traceback(tmp_path, bakes, capsys):
@@ -371,66 +345,68 @@ def test_doctor_says_how_many_multiprocessors_can_be_reserved_or_why_none(monkey
     assert doctor._describe_partition(gpu) == f"none of which can be reserved for physics ({failure})"
 
 
-COMMAND = [sys.executable, "-m", "synpick_warp"]
-
-
 def test_version():
-    result = subprocess.run([*COMMAND, "--version"], capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-m", "synpick_warp", "--version"], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == __version__
 
 
-PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+# ---- values of options ----
+
+WRONG = ["1.6", "2.0", "1e3", "0x10", "0b1", "1_000", " 7", "7 ", "٣", "", "many", "9" * 5000, "nan", "--7", "1\n2"]
+PLACES = [
+    ("--worlds", "bake --out gone/set --device cpu"),
+    ("--episodes", "bake --out gone/set --device cpu"),
+    ("--seed", "bake --out gone/set --device cpu"),
+    ("--writers", "bake --out gone/set --device cpu"),
+    ("--worlds", "doctor"),
+    ("--views", "preview gone"),
+    ("--episode", "explain gone"),
+    ("--attempt", "explain gone --episode 0"),
+]
 
 
-@pytest.mark.parametrize(
-    "ply",
-    [
-        PLY_HEAD.format(comment="") + "end_header\n0 0 0\n9 0 0\n0 9 0\n",
-        PLY_HEAD.format(comment="comment TextureFile gone.png\n")
-        + "property float texture_u\nproperty float texture_v\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-        + "0 0 0 0 0\n9 0 0 1 0\n0 9 0 0 1\n3 0 1 2\n",
-    ],
-    ids=["no faces", "no texture file"],
-)
-def test_models_that_cannot_be_used(tmp_path, ply):
-    models = tmp_path / "models"
-    models.mkdir()
-    (models / "models_info.json").write_text('{"1": {"diameter": 12.7}}')
-    (models / "obj_000001.ply").write_text(ply)
-    said = mistake("bake", "--config", "smoke", "--device", "cpu", "--models", str(models), "--out", str(tmp_path / "data"))
-    assert "obj_000001.ply" in said
-    assert not (tmp_path / "data").exists()
+@pytest.mark.parametrize("text", WRONG)
+@pytest.mark.parametrize(("option", "command"), PLACES)
+def test_integer_options_take_decimal_digits_only(option, command, text):
+    """Fault 7: `--worlds 1.6 --episodes 2.6 --seed 7.6` were rounded."""
+    line = mistake(*command.split(), f"{option}={text}")
+    assert line.startswith(f'{option} is "')
+    assert line.endswith("allowed: a whole number in decimal digits, such as 8")
 
 
-def boxes(folder: Path, *sides: float) -> None:
-    """A folder of cubes with these sides [m], as OBJ files."""
-    folder.mkdir()
-    for number, side in enumerate(sides):
-        (folder / f"cube_{number}.obj").write_bytes(trimesh.creation.box((side, side, side)).export(file_type="obj").encode())
+SMOKE = load_config("smoke", {})
+TEXT = st.text(st.sampled_from("0123456789xX/.-+e_ ²٣\n")) | st.text(max_size=20)
 
 
-STRICT = "[objects]\nstrict = true\n"
-"""Objects that cannot be used end a bake; by default they are left out."""
+@settings(max_examples=fuzz_examples(100))
+@given(text=TEXT)
+def test_any_text_is_a_resolution_or_a_shard_or_one_line(text):
+    for parse in (parse_resolution, lambda shard: DataLayout.of(SMOKE).plan_shard((), parse_shard(shard), "--shard")):
+        message = "accepted"
+        try:
+            parse(text)
+        except ConfigError as error:
+            message = str(error)
+        assert message.isprintable()
 
 
-@pytest.mark.parametrize(
-    ("sides", "settings", "said"),
-    [
-        ((), "", "models folder {models}: it contains no models; "),
-        ((0.05, 0.6), STRICT, "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, diameter 1.039 m, but the tote's opening is "),
-        ((0.05, 50.0), STRICT, "cube_1: too large for the tote: 50 x 50 x 50 m, "),
-        ((0.25, 0.2), "", "arrangement.volume is 0.003 m³, but the smallest object, cube_1, takes 0.008 m³; make it larger"),
-        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 0\n', "object_rows[0].mass is 0 in {file}; "),
-        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 1e-30\n', "cube_0: mass 1e-30 kg in its row "),
-        ((0.05,), "[objects]\ndensity = 1e-12\n", "cube_0: mass 1.25e-16 kg by objects.density; "),
-    ],
-    ids=["empty", "too large", "millimetres", "over budget", "no mass", "hardly a mass", "hardly a density"],
-)
-def test_objects_that_cannot_be_baked(tmp_path, sides, settings, said):
-    """One line, before anything is simulated, and nothing in the data set's place."""
-    models, file, out = tmp_path / "models", tmp_path / "my.toml", tmp_path / "deep" / "data"
-    boxes(models, *sides)
-    file.write_text(f'preset = "smoke"\n{settings}')
-    heard = mistake("bake", "--config", str(file), "--device", "cpu", "--models", str(models), "--out", str(out))
-    assert heard.startswith(said.format(models=models, file=file))
-    assert not out.parent.exists()
+@settings(max_examples=fuzz_examples(100))
+@given(text=st.text(st.characters()))
+def test_any_message_is_one_printable_line(text):
+    assert one_line(text).isprintable()
+    assert len(one_line(text * 100)) <= MAX_LINE
+
+
+WORDS = st.sampled_from(["bake", "config", "verify", "merge", "preview", "explain", "--out", "gone", "--set", "--config", "--help", "--"])
+
+
+@settings(max_examples=fuzz_examples(50))
+@given(arguments=st.lists(WORDS | st.text(st.characters(exclude_characters="\0"), max_size=6), max_size=6))
+def test_any_command_line_ends_with_an_exit_code(tmp_path_factory, arguments):
+    with contextlib.chdir(tmp_path_factory.mktemp("empty")), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("synpick_warp.cli.main._bake", lambda *_: 0)
+        assert main(arguments) in (0, 1, 2)
+
+
+def test_terminal_sequences_in_names_are_escaped():
+    assert r"there is no file \x1b[2Jgone.toml" in mistake("config", "--config", "\x1b[2Jgone.toml")

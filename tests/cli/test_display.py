@@ -16,7 +16,7 @@ from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress,
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.factory import episodes
 from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome, ThroughputMeter
-from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.system.progress import Progress
 
 
 def row(episode: int, arrangement: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeOutcome:
@@ -29,12 +29,26 @@ def printed(summary: BakeSummary) -> str:
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def test_a_short_bake_lists_every_episode():
-    rows = [row(0, 0, Ending.FINISHED, 120, 61.0), row(1, 2, Ending.FINISHED, 119, 3661.0)]
-    text = printed(BakeSummary(len(rows), rows, views=717, wall_seconds=10.0))
-    assert "1:01 " in text
-    assert "1:01:01" in text
-    assert text.count(Ending.FINISHED.sentence) == 2
+@pytest.mark.parametrize(
+    ("summary", "said"),
+    [
+        (BakeSummary(), "data set: data\n"),
+        (
+            BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.PERCEPTION_OVERFLOW: "raise contour_points (16)"}),
+            "\nperception overflow: raise contour_points (16)\n",
+        ),
+        (
+            BakeSummary(3, [row(number, 0, Ending.FINISHED, 10, 1.0) for number in range(3)], views=30, wall_seconds=10.0, resumed=2),
+            "3 of 3 episodes (2 of them before) and 30 views in 0:10 (3.0 views/s)",
+        ),
+        (BakeSummary(1, [row(0, 0, Ending.FINISHED, 120, 61.0)]), "1:01 "),
+        (BakeSummary(1, [row(0, 0, Ending.FINISHED, 119, 3661.0)]), "1:01:01"),
+    ],
+)
+def test_a_summary_says_what_is_there(summary, said):
+    text = printed(summary)
+    assert said in text
+    assert text.count(Ending.FINISHED.sentence) == len(summary.episodes)
     assert "attempts" not in text
     assert "picked" not in text
 
@@ -54,23 +68,12 @@ def test_a_bake_that_picked_tells_of_attempts():
     assert expected in text.splitlines()
 
 
-def test_a_bake_that_others_have_finished_says_where_it_is():
-    assert printed(BakeSummary()) == "data set: data\n"
-
-
 @pytest.mark.parametrize("many", [False, True])
 def test_endings_are_those_of_the_bin(many):
     given = EpisodeOutcome(0, 0, Ending.EMPTIED, 9, 1.0, "pick", 3, 3, 3, 0, 0, bin={"name": "kanban"})
     text = printed(BakeSummary(100, [given] * (100 if many else 1)))
     assert "no object is left in the bin" in text
     assert "tote" not in text
-
-
-def test_a_summary_names_the_settings_that_cure_its_endings():
-    text = printed(
-        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.PERCEPTION_OVERFLOW: "raise perception.contour_points (16)"})
-    )
-    assert "perception overflow: raise perception.contour_points (16)" in text.splitlines()
 
 
 def test_a_long_bake_lists_counts_and_failures():
@@ -115,20 +118,6 @@ def test_the_remaining_time_is_shown_from_the_first_views_on(monkeypatch):
     summary.views = 100
     shown.show(2)
     assert left == [None, pytest.approx(10.0)]
-
-
-def test_silence():
-    with SilentProgress() as progress:
-        progress.stage("a")
-        progress.update(episodes_done=0, episodes=1, worlds_active=1, views=0, views_per_s=0.0, seconds_left=None)
-        progress.note("b")
-
-
-def test_what_was_there_before_is_told_apart():
-    text = printed(
-        BakeSummary(3, [row(number, 0, Ending.FINISHED, 10, 1.0) for number in range(3)], views=30, wall_seconds=10.0, resumed=2)
-    )
-    assert "3 of 3 episodes (2 of them before) and 30 views in 0:10 (3.0 views/s)" in text
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -41,11 +41,11 @@ ROS = (
 )
 
 
-def opencv(path: Path, distortion=FIVE, matrix=K) -> Path:
+def opencv(path: Path, distortion=FIVE) -> Path:
     """A calibration as OpenCV writes it."""
     path.parent.mkdir(exist_ok=True)
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for name, value in (("image_width", 320), ("image_height", 240), ("camera_matrix", matrix)):
+    for name, value in (("image_width", 320), ("image_height", 240), ("camera_matrix", K)):
         storage.write(name, value)
     storage.write("distortion_coefficients", np.array([distortion]))
     storage.release()
@@ -85,8 +85,7 @@ def test_a_cell_without_options_is_complete(tmp_path, monkeypatch):
 
 def test_commands_are_quoted_where_the_folder_needs_it(tmp_path, monkeypatch, drawn):
     monkeypatch.chdir(tmp_path)
-    ran = run("new-cell", "Zelle ö 1")
-    assert ran.out.endswith("bake it: synpick-warp bake --config 'Zelle ö 1/cell.toml' --out DATA\n")
+    assert run("new-cell", "Zelle ö 1").out.endswith("bake it: synpick-warp bake --config 'Zelle ö 1/cell.toml' --out DATA\n")
     assert "preview --cell 'Zelle ö 1/cell.toml'" in Path("Zelle ö 1/cell.toml").read_text()
 
 
@@ -243,12 +242,7 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["set/cell"], "DIR is set/cell, among the files of the data set"),
         (["c", "--calibration", "gone.yaml"], "there is no file gone.yaml"),
         (["c", "--calibration", "empty.yaml"], "empty.yaml is no calibration file"),
-        (["c", "--calibration", "skew.yaml"], "skew.yaml (OpenCV): the camera matrix has skew"),
         (["c", "--calibration", "folds.yaml"], "folds.yaml: distortion "),
-        (
-            ["c", "--calibration", "swapped.yaml"],
-            "swapped.yaml: camera[0].matrix is ",
-        ),
         (["c", "--calibration", "zivid.json"], "zivid.json does not say the image's size; add --resolution WIDTHxHEIGHT"),
         (["c", "--lens", "fish"], '--lens is "fish"; allowed: pinhole, fisheye; did you mean fisheye?'),
         (["c", "--resolution", "0x0"], "--resolution is 0x0; allowed: each side at least 1, at most 8192 [px]"),
@@ -262,11 +256,7 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["c", "--bin", "0.6x0.4x0.001"], "--bin is 0.6 x 0.4 x 0.001 m; allowed"),
         (["c", "--bin", "in"], '--bin is "in"; allowed: LENGTHxWIDTHxHEIGHT in metres, or as 600x400x220mm, or a mesh file'),
         (["c", "--bin", "gone.stl"], "gone.stl cannot be read (No such file or directory)"),
-        (["c", "--bin", "void.stl"], "void.stl: "),
-        (
-            ["c", "--bin", "bin.stl"],
-            "bin.stl is 408 x 308 x 204 m, unit m; allowed: a longest side of 0.02 to 10 m; did you mean --bin-u",
-        ),
+        (["c", "--bin", "bin.stl"], "bin.stl is 408 x 308 x 204 m, unit m; allowed: a longest side of 0.02 to 10 m; did you mean --bin-u"),
         (["c", "--bin", "bin.stl", "--bin-unit", "mm", "--bin-up", "x"], "bin.stl has no inside as seen from above, with up = x"),
         (["c", "--bin", "bin.stl", "--bin-unit", "inch"], '--bin-unit is "inch"; allowed: m, cm, mm, in'),
         (["c", "--bin", "bin.stl", "--bin-up", "w"], '--bin-up is "w"; allowed: z, -z, y, -y, x, -x'),
@@ -291,7 +281,6 @@ def test_a_bin_is_that_of_its_mesh(tmp_path, drawn, file, options, up, kept):
         (["c", "--part", "nut.stl", "--density", "nan"], '--density is "nan"; allowed: '),
         (["c", "--part", "nut.stl", "--part", "in/nut.stl", "--unit", "mm"], '--part names "nut" 2 times'),
         (["c", "--part", "nut.stl", "--part", "in", "--unit", "mm"], "--part names a folder beside other parts"),
-        (["c", "--part", "flat.stl", "--unit", "mm"], "flat: all vertices lie in one plane"),
         (["c", "--part", "void.stl"], "c/parts/void.stl: "),
     ],
 )
@@ -306,11 +295,8 @@ def test_mistakes_are_one_line_and_leave_nothing(tmp_path, monkeypatch, drawn, a
     kanban.apply_scale(1e3)
     for name in ("bin.stl", "b\udcff.stl"):
         put(tmp_path / name, exported(kanban, "stl"))
-    put(tmp_path / "flat.stl", exported(trimesh.Trimesh(np.eye(3) * 10.0, [(0, 1, 2), (0, 2, 1)]), "stl"))
     put(tmp_path / "zivid.json", json.dumps({"CameraIntrinsics": ZIVID}).encode())
-    opencv(tmp_path / "skew.yaml", matrix=K + np.array([[0.0, 3.0, 0.0], [0.0] * 3, [0.0] * 3]))
     opencv(tmp_path / "folds.yaml", [-2.0, 0.0, 0.0, 0.0, 0.0])
-    opencv(tmp_path / "swapped.yaml", matrix=K[:, [2, 1, 0]] * 0 + [[163.3, 0, 375.0], [0, 117.0, 274.6], [0, 0, 1]])
     before = sorted(tmp_path.rglob("*"))
     assert mistake("new-cell", *arguments).startswith(said)
     assert sorted(tmp_path.rglob("*")) == before
