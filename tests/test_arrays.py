@@ -1,20 +1,24 @@
-"""Array declarations: allocation and memory table agree with them."""
+"""Declarations of arrays, with which allocation and memory table agree; arguments of launches and members of structs, found by names."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.stages.arrays import Row, StructArrays, allocate, allocate_struct, device_array, dry_run, struct_arrays
+from synpick_warp.kernels.structs import ModeData
+from synpick_warp.stages.arrays import Row, StructArrays, allocate, allocate_struct, array_group, device_array, dry_run, struct_arrays
 from synpick_warp.stages.buffers import view_buffer_sizes
+from synpick_warp.stages.constants import fill
 from synpick_warp.stages.host_copies import HostImages
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
@@ -80,11 +84,6 @@ def test_a_dry_run_is_that_of_its_thread_and_ends(device):
         raise ZeroDivisionError
     assert isinstance(allocate(Sample, sizes, device).pose, wp.array)
     assert not arrays
-
-
-def test_a_missing_extent_is_an_error(device):
-    with pytest.raises(KeyError, match="cup"):
-        allocate(Sample, {"world": 3}, device)
 
 
 def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
@@ -169,24 +168,30 @@ def test_coarse_pixels_cover_the_image(cell, width, shape):
 
 
 @pytest.mark.parametrize(
-    ("cell", "width", "paths"), [(0, 320, 2), (0, 480, 2), (0, 481, 1), (0, 640, 1), (0, 960, 2), (0, 1920, 2), (1, 1920, 1)]
-)
-def test_paths_per_coarse_pixel_depend_on_the_resolution(cell, width, paths):
-    assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell).render, width) == paths
-    assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell, render__coarse_paths=5).render, width) == 5
-
-
-@pytest.mark.parametrize(
     ("cell", "width", "histories", "columns", "paths"),
-    [(0, 1920, 3, 480, 1), (0, 1920, 0, 384, 2), (0, 960, 3, 480, 2), (0, 640, 3, 640, 1), (0, 320, 3, 320, 2), (5, 1920, 3, 384, 2)],
+    [
+        (0, 320, 0, 320, 2),
+        (0, 480, 0, 480, 2),
+        (0, 481, 0, 481, 1),
+        (0, 640, 0, 640, 1),
+        (0, 960, 0, 480, 2),
+        (0, 1920, 0, 384, 2),
+        (1, 1920, 0, 1920, 1),
+        (0, 1920, 3, 480, 1),
+        (0, 960, 3, 480, 2),
+        (0, 640, 3, 640, 1),
+        (0, 320, 3, 320, 2),
+        (5, 1920, 3, 384, 2),
+    ],
 )
-def test_histories_narrow_coarse_pixels(cell, width, histories, columns, paths):
+def test_coarse_pixels_and_their_paths_depend_on_the_resolution_and_on_histories(cell, width, histories, columns, paths):
     render = settings(render__coarse_pixel=cell).render
     assert scratch_sizes(render, width, 6, histories)["cell_column"] == columns
     assert paths_per_coarse_pixel(render, width, histories) == paths
+    assert paths_per_coarse_pixel(replace(render, coarse_paths=5), width, histories) == 5
     assert first_frame_paths(render, width, histories) == (FIRST_FRAME_PATHS if histories else paths)
     # Without accumulation they are those of single views.
-    alone = settings(render__coarse_pixel=cell, render__history=0).render
+    alone = replace(render, history=0)
     assert scratch_sizes(alone, width, 6, histories) == scratch_sizes(render, width, 6)
     assert first_frame_paths(alone, width, histories) == paths_per_coarse_pixel(render, width)
 
@@ -204,7 +209,8 @@ def test_the_path_traced_reference_has_no_coarse_grid():
 
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
-def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
+def test_a_bake_has_the_arrays_of_perception_if_it_may_pick(mode):
+    assert kinds_of(device_arrays(settings(bake__mode="mixed", bake__mix=[0, 0, 1]))) == BASE
     config = settings(bake__worlds=WORLDS, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
@@ -216,16 +222,13 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     assert [name for name, *_ in rows].count("GBuffer.depth") == 4
 
 
-def test_a_mixture_without_picking_has_no_arrays_of_perception():
-    config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert kinds_of(device_arrays(config)) == BASE
-
-
-def test_fields_left_out_are_neither_allocated_nor_counted(device):
+def test_fields_left_out_are_neither_allocated_nor_counted_and_a_missing_extent_is_an_error(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device, only=("pose",))
     assert (made.gap, made.flag) == (None, None)
     assert made.pose.shape == (3,)
     assert table_of(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
+    with pytest.raises(KeyError, match="cup"):
+        allocate(Sample, {"world": 3}, device)
 
 
 def test_the_memory_table_lists_the_layers_of_the_settings():
@@ -234,3 +237,79 @@ def test_the_memory_table_lists_the_layers_of_the_settings():
     assert rows["LayerBuffers.flow"][1] == "px"
     assert "BodyMotions.rotation" in rows
     assert not any(name.startswith("BodyMotions") for name, *_ in device_arrays(settings(render__layers=["nocs"])))
+
+
+# ---- launches ----
+
+
+@wp.kernel
+def add_kernel(first: wp.array[int], count: int, second_inout: wp.array[int], first_out: wp.array[int]):
+    index = wp.tid()
+    second_inout[index] += count
+    first_out[index] = first[index] + count
+
+
+@wp.struct
+class Pair:
+    left: wp.array[int]
+    right: wp.array[int]
+
+
+@wp.kernel
+def swap_kernel(pair_inout: Pair):
+    index = wp.tid()
+    left = pair_inout.left[index]
+    pair_inout.left[index] = pair_inout.right[index]
+    pair_inout.right[index] = left
+
+
+class PairArrays(array_group(Pair, "place")):
+    """The arrays of `Pair`."""
+
+
+def numbers(*values: int) -> wp.array:
+    return wp.array(values, dtype=wp.int32, device="cpu")
+
+
+def test_arguments_are_found_by_name_and_outputs_in_their_object():
+    one, two, out = SimpleNamespace(first=numbers(1, 2)), SimpleNamespace(second=numbers(5, 6)), SimpleNamespace(first=numbers(0, 0))
+    launch(add_kernel, 2, one, two, out=out, count=10)
+    assert [array.numpy().tolist() for array in (one.first, two.second, out.first)] == [[1, 2], [15, 16], [11, 12]]
+    launch(add_kernel, 2, one, count=1, second_inout=two.second, first_out=out.first)
+    assert [array.numpy().tolist() for array in (one.first, two.second, out.first)] == [[1, 2], [16, 17], [2, 3]]
+
+
+def test_structs_are_groups_of_arrays_or_bundles_of_attributes():
+    group = PairArrays(numbers(1, 2), numbers(3, 4))
+    launch(swap_kernel, 2, SimpleNamespace(left=numbers(7, 7)), group)
+    assert [array.numpy().tolist() for array in (group.left, group.right)] == [[3, 4], [1, 2]]
+    halves = SimpleNamespace(left=group.left), SimpleNamespace(right=group.right)
+    launch(swap_kernel, 1, *halves)
+    assert [array.numpy().tolist() for array in (group.left, group.right)] == [[1, 4], [3, 2]]
+    with pytest.raises(TypeError, match=r"swap_kernel: no source has Pair\.right"):
+        launch(swap_kernel, 1, halves[0])
+
+
+def test_missing_ambiguous_and_unknown_arguments_are_errors():
+    one, both = SimpleNamespace(first=numbers(1)), SimpleNamespace(first=numbers(1), second=numbers(2))
+    for sources, given, message in (
+        ((one,), {}, "0 sources have second"),
+        ((one, both), {}, "2 sources have first"),
+        ((both,), {"other": 1}, "no parameter other"),
+    ):
+        with pytest.raises(TypeError, match=message):
+            launch(add_kernel, 1, *sources, count=1, **given)
+
+
+def test_derived_values_come_before_sections_and_earlier_sections_before_later():
+    first, second = SimpleNamespace(first=0, pick_share=0.25, cycle=0), SimpleNamespace(pick_share=0.5, pick_or_target_share=0.75)
+    result = fill(ModeData, first, second)
+    assert (float(result.pick_share), float(result.pick_or_target_share)) == (0.25, 0.75)
+    assert float(fill(ModeData, first, second, pick_share=1.0).pick_share) == 1.0
+
+
+def test_missing_and_unknown_members_are_errors():
+    with pytest.raises(AttributeError, match=r"no value for ModeData\.pick_or_target_share"):
+        fill(ModeData, first=0, pick_share=0.5, cycle=0)
+    with pytest.raises(TypeError, match="wrong_name"):
+        fill(ModeData, first=0, pick_share=0.5, pick_or_target_share=0.5, cycle=0, wrong_name=1)

@@ -1,27 +1,31 @@
-"""Records of attempts from scripted ticks: each attempt once, with what was seen before it and what came of it."""
+"""Records of attempts from scripted ticks, each once, with what was seen before it and what came of it; codes and rows of episodes."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import fields, is_dataclass, replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Measure, Mode, Outcome, Task
+from synpick_warp.apps.viz.explain_record import read_attempts
+from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Task
 from synpick_warp.configs.dataset.splits import may_pick
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.annotations import check_content
+from synpick_warp.dataset.records import Row
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.factory.episodes import EpisodeOutcome, remedy
+from synpick_warp.views.bins import bin_record
 from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, ROOM, Ticks, World, bits, new_world, play, report, run
 from tests.worlds.small_worlds import settings
 
 
 def every_outcome(world: World) -> Ticks:
     """Five attempts; one object is picked with the target, another alone, one is lost on the way, one is left."""
-    world.settle(5, 0, Mode.PICK, [2, 0, 1, 1])
-    yield
-    world.first_frame()
-    world.look(1)
-    yield
+    yield from world.begin(5, 0, Mode.PICK, [2, 0, 1, 1], 1)
     yield from world.attempt(
         0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, engaged=bits(0, 1), attached=bits(1), catalog_index=[2, -1, 1, 1]
     )
@@ -49,22 +53,14 @@ def every_outcome(world: World) -> Ticks:
 
 def redrawn(world: World) -> Ticks:
     """An arrangement that fails in the middle of its second attempt; then one of the same episode that moves on; then another episode."""
-    world.settle(6, 0, Mode.PICK, [0, 1, -1, -1])
-    yield
-    world.first_frame()
-    world.look(0)
-    yield
+    yield from world.begin(6, 0, Mode.PICK, [0, 1, -1, -1], 0)
     yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, engaged=1, attached=1, catalog_index=[-1, 1, -1, -1])
     world.look(1)
     yield
     world.frame(task=Task.APPROACH, attempt=1)
     world.over(Ending.SOLVER_OVERFLOW)
     yield
-    world.settle(6, 1, Mode.PICK, [1, 1, 1, -1])
-    yield
-    world.first_frame()
-    world.look(2)
-    yield
+    yield from world.begin(6, 1, Mode.PICK, [1, 1, 1, -1], 2)
     yield from world.attempt(0, [0.0, 4.0], outcome=Outcome.DROPPED, hits=RAYS, engaged=bits(2), attached=0)
     world.over(Ending.GAVE_UP)
     yield
@@ -98,33 +94,20 @@ def by_number(found: dict[tuple[int, int], EpisodeRecord]) -> dict[int, EpisodeR
     return {episode: record for (_, episode), record in found.items()}
 
 
-def test_every_attempt_has_its_outcome_once(mixed):
-    attempts = by_number(mixed)[5].attempts
-    assert [(one.attempt, one.outcome) for one in attempts] == list(
-        enumerate(
-            (
-                Outcome.TARGET_PICKED,
-                Outcome.DROPPED,
-                Outcome.OTHER_PICKED,
-                Outcome.NOTHING_CAUGHT,
-                Outcome.NOTHING_SEEN,
-            )
-        )
-    )
-    # An attempt begins in the frame in which the one before ended.
-    assert [one.frame for one in attempts] == [0, 6, 11, 18, 23]
-    assert [one.end_frame for one in attempts] == [6, 11, 18, 23, 24]
-    assert [one.peak_force for one in attempts] == [(0.0, 9.0, 8.0), (0.0, 3.0), (0.0, 2.0, 1.0, 1.0), (0.0, 0.0), ()]
-    assert {(one.episode, one.mode, one.rays) for one in attempts} == {(5, "pick", RAYS)}
-
-
-def test_caught_and_picked_are_the_attempts_own(mixed):
-    attempts = by_number(mixed)[5].attempts
-    assert [one.engaged for one in attempts] == [(0, 1), (0,), (0, 2), (), ()]
-    assert [one.picked for one in attempts] == [(1,), (), (2,), (), ()]
-    assert [one.hits for one in attempts] == [RAYS, RAYS - 2, 1, 0, 0]
-    assert [one.good_seal for one in attempts] == [True, False, False, False, False]
-    assert [(one.target, one.object_id) for one in attempts] == [(1, 3), (0, 21), (0, 21), (3, 8), (None, None)]
+def test_every_attempt_is_there_once_with_what_it_caught_and_picked(mixed):
+    """An attempt begins in the frame in which the one before ended."""
+    assert [
+        (one.outcome, one.frame, one.end_frame, one.peak_force, one.engaged, one.picked, one.hits, one.good_seal, one.target, one.object_id)
+        for one in by_number(mixed)[5].attempts
+    ] == [
+        (Outcome.TARGET_PICKED, 0, 6, (0.0, 9.0, 8.0), (0, 1), (1,), RAYS, True, 1, 3),
+        (Outcome.DROPPED, 6, 11, (0.0, 3.0), (0,), (), RAYS - 2, False, 0, 21),
+        (Outcome.OTHER_PICKED, 11, 18, (0.0, 2.0, 1.0, 1.0), (0, 2), (2,), 1, False, 0, 21),
+        (Outcome.NOTHING_CAUGHT, 18, 23, (0.0, 0.0), (), (), 0, False, 3, 8),
+        (Outcome.NOTHING_SEEN, 23, 24, (), (), (), 0, False, None, None),
+    ]
+    found = [(one.episode, one.attempt, one.mode, one.rays) for one in by_number(mixed)[5].attempts]
+    assert found == [(5, number, "pick", RAYS) for number in range(5)]
 
 
 def test_with_a_vacuum_an_attempt_has_the_break_force_of_what_it_engaged(device, mixed):
@@ -172,10 +155,7 @@ def test_an_arrangement_that_is_drawn_again_leaves_no_attempt(mixed):
 
 
 def one_attempt(world: World, **found: object) -> Ticks:
-    world.settle(0, 0, Mode.PICK, [0, 1, 2, 0] + [-1] * (world.room - ROOM))
-    world.first_frame()
-    world.look(0)
-    yield
+    yield from world.begin(0, 0, Mode.PICK, [0, 1, 2, 0] + [-1] * (world.room - ROOM), 0)
     yield from world.attempt(0, [0.0], **found)
     world.over(Ending.GAVE_UP)
     yield
@@ -265,3 +245,218 @@ def test_worlds_do_not_disturb_each_other(device, plans):
 def test_which_bakes_may_pick(mode, mix, expected):
     config = settings(bake__mode=mode, bake__mix=mix)
     assert may_pick(config.bake, config.splits) is expected
+
+
+# ---- a record, field by field ----
+
+
+def see_a_pair(world: World) -> None:
+    """Instances 1 and 3 are in the scene, 3 on top of 1, with numbers that need rounding; 0 and 2 have what an earlier pile left."""
+    seen, plan = world.observation, world.plan
+    for arrays in (seen, plan):
+        for array in vars(arrays).values():
+            array[:] = 7
+    seen.visible[0, [1, 3]] = 120, 0
+    seen.visible_fraction[0, [1, 3]] = 1.0 / 3.0, 0.0
+    seen.pole[0, [1, 3]] = (10.0, 20.0), (-1.0, -1.0)
+    seen.centroid[0, [1, 3]] = (12.3456789, 21.0), (-1.0, -1.0)
+    seen.midpoint[0, [1, 3]] = (11.17283945, 20.5), (-1.0, -1.0)
+    seen.distances[0, [1, 3]] = (5.0, 4.4721359, -0.0), (0.0, 0.0, 0.0)
+    seen.grasp_pixel[0, [1, 3]] = (11, 21), (-1, -1)
+    seen.depth[0, [1, 3]] = 1.98765432, 0.0
+    seen.votes[0][np.ix_([1, 3], [1, 3])] = [[0.0, 12.3], [0.1, 0.0]]
+    seen.above[0, [1, 3], 0] = bits(3), 0
+    seen.ancestors[0, [1, 3], 0] = bits(0, 3), 0
+    plan.target[0] = 1
+    plan.point[0] = 0.1, -0.2, 0.0345678912
+    plan.normal[0] = -3.0e-9, 0.6, 0.8
+    plan.yaw[0], plan.tilt[0] = -1.23456789, 0.0
+
+
+def pick_one(world: World) -> Ticks:
+    """Settle for two ticks; one attempt on instance 1, which comes away with 3 behind it; the tote is empty."""
+    for _ in range(2):
+        world.settle(7, 2, Mode.TARGET, [-1, 2, -1, 0])
+        yield
+    world.first_frame()
+    see_a_pair(world)
+    yield
+    yield from world.attempt(
+        0,
+        [0.0, 5.00004, 4.99996, 3.5],
+        outcome=Outcome.TARGET_PICKED,
+        hits=RAYS - 1,
+        engaged=bits(1, 3),
+        attached=bits(1, 3),
+        catalog_index=[-1] * ROOM,
+    )
+    world.over(Ending.EMPTIED)
+    yield
+
+
+@pytest.fixture(scope="module")
+def picked(device) -> EpisodeRecord:
+    world = new_world(device)
+    found = run((world, pick_one(world)))
+    assert list(found) == [(9, 7)]
+    return found[9, 7]
+
+
+OBSERVATION = {
+    "resolution": [64, 48],
+    "instances": [
+        {
+            "instance": 1,
+            "object_id": 21,
+            "visible": 120,
+            "visible_fraction": 0.333333,
+            "pole": [10.0, 20.0],
+            "centroid": [12.3457, 21.0],
+            "midpoint": [11.1728, 20.5],
+            "distances": [5.0, 4.47214, 0.0],
+            "grasp_pixel": [11, 21],
+            "depth": 1.98765,
+            "above": [3],
+            "ancestors": [0, 3],
+        },
+        {
+            "instance": 3,
+            "object_id": 3,
+            "visible": 0,
+            "visible_fraction": 0.0,
+            "pole": [-1.0, -1.0],
+            "centroid": [-1.0, -1.0],
+            "midpoint": [-1.0, -1.0],
+            "distances": [0.0, 0.0, 0.0],
+            "grasp_pixel": [-1, -1],
+            "depth": 0.0,
+            "above": [],
+            "ancestors": [],
+        },
+    ],
+    "votes": [[1, 3, 12.3], [3, 1, 0.1]],
+}
+LINE = {
+    "episode": 7,
+    "attempt": 0,
+    "mode": "target",
+    "frame": 0,
+    "end_frame": 7,
+    "outcome": "target_picked",
+    "sentence": Outcome.TARGET_PICKED.sentence,
+    "target": 1,
+    "object_id": 21,
+    "point": [0.1, -0.2, 0.034568],
+    "normal": [0.0, 0.6, 0.8],
+    "yaw": -1.23457,
+    "tilt": 0.0,
+    "rays": RAYS,
+    "hits": RAYS - 1,
+    "good_seal": True,
+    "engaged": [1, 3],
+    "picked": [1, 3],
+    "peak_force": [0.0, 5.0, 5.0, 3.5],
+    "observation": OBSERVATION,
+}
+
+
+def test_a_line_says_all_that_was_seen_and_done(picked):
+    """Two ticks of settling, the look, three on the way and three of lifting come before; keys are in the order of the format."""
+    assert (picked.mode, picked.objects, picked.picked, picked.lost, picked.left) == ("target", 2, 2, 0, 0)
+    (attempt,) = picked.attempts
+    assert attempt.line() == json.dumps(LINE) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [(None, "in the tote"), ("tote", "in the tote"), ("pallet", "on the pallet"), ("kanban", "in the bin")]
+)
+def test_a_line_names_the_bin_of_its_episode(picked, name, place):
+    unseen = replace(picked.attempts[0], outcome=Outcome.NOTHING_SEEN)
+    record = None if name is None else {"name": name, "position": [0.0, 0.0, 0.0], "yaw": 0.0}
+    assert json.loads(unseen.line(record))["sentence"] == f"no object {place} is visible"
+
+
+def test_explain_reads_what_is_written(picked, tmp_path):
+    (attempt,) = picked.attempts
+    (tmp_path / "attempts.jsonl").write_text(attempt.line())
+    (read,) = read_attempts(tmp_path, 7, None)
+    for name in ("mode", "frame", "end_frame", "target", "tilt", "rays", "hits", "good_seal"):
+        assert getattr(read, name) == getattr(attempt, name), name
+    for name in ("engaged", "picked", "peak_force"):
+        assert tuple(getattr(read, name)) == getattr(attempt, name), name
+    assert (read.attempt, read.sentence, read.observation.resolution) == (0, attempt.outcome.sentence, (64, 48))
+    assert [one.instance for one in read.seen] == [1], "3 was not visible"
+    assert read.seen[0].distances == attempt.observation.instances[0].distances
+    assert read.votes == {(1, 3): 12.3, (3, 1): 0.1}
+
+
+def test_what_is_not_finite_does_not_become_json(device):
+    world = new_world(device)
+    world.plan.tilt[0] = np.nan
+    (record,) = run((world, one_attempt(world, outcome=Outcome.DROPPED))).values()
+    with pytest.raises(ValueError, match="JSON"):
+        record.attempts[0].line()
+
+
+# ---- episodes ----
+
+
+DEFAULTS = Config()
+SECTIONS = (DEFAULTS.physics, DEFAULTS.perception, DEFAULTS.arrangement, DEFAULTS.settle)
+OVERFLOWS = (Ending.SOLVER_OVERFLOW, Ending.CONTACT_OVERFLOW, Ending.PAIR_OVERFLOW)
+CURED = {Ending.UNSETTLED, Ending.ARRANGEMENT_OVERFLOW, Ending.PERCEPTION_OVERFLOW, *OVERFLOWS}
+
+
+def setting_values(config: Config) -> dict[str, object]:
+    """Value of every setting by its key, section.name."""
+    sections = {item.name: getattr(config, item.name) for item in fields(config) if is_dataclass(getattr(config, item.name))}
+    return {f"{name}.{item.name}": getattr(section, item.name) for name, section in sections.items() for item in fields(section)}
+
+
+@pytest.mark.parametrize("ending", Ending)
+def test_a_remedy_names_settings_with_their_values(ending):
+    text = remedy(ending, *SECTIONS)
+    assert bool(text) == (ending in CURED)
+    values = setting_values(Config())
+    named = [word for word in text.split() if "." in word and "(" not in word]
+    assert all(f"{name} ({values[name]:g})" in text for name in named)
+    assert len(named) == {Ending.SOLVER_OVERFLOW: 2, Ending.UNSETTLED: 2}.get(ending, int(bool(text)))
+
+
+def test_each_capacity_of_physics_is_named_after_one_overflow():
+    capacities = [name for name in setting_values(Config()) if name.endswith("_per_world")]
+    assert [sum(f"{name} (" in remedy(ending, *SECTIONS) for ending in OVERFLOWS) for name in capacities] == [1] * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("", "in the tote"), ("tote", "in the tote"), ("table", "on the table"), ("kanban", "in the bin")]
+)
+def test_rows_of_episodes_have_their_bin_unless_it_is_a_tote_in_its_place(name, place):
+    record = bin_record(name, np.array([0.1, -0.2, 0.0, 0.0, 0.0, -0.5, np.sqrt(0.75)], np.float32)) if name else None
+    assert record is None or record == {"name": name, "position": [0.1, -0.2, 0.0], "yaw": pytest.approx(-np.pi / 3, abs=1e-6)}
+    row = EpisodeOutcome(3, 1, Ending.EMPTIED, 10, 0.6, "pick", 3, 3, 3, 0, 0, "val", bin=record)
+    line = row.as_json()
+    assert ("bin" in line) == bool(name)
+    assert line["sentence"] == f"no object is left {place}"
+    assert EpisodeOutcome.from_json(line) == row
+    assert check_content(json.loads(json.dumps(line)), Row, "a line").split == "val"
+
+
+@pytest.mark.parametrize("kind", [Ending, Outcome])
+def test_every_code_has_a_sentence_of_its_own(kind):
+    sentences = [code.sentence for code in kind]
+    assert len(set(sentences)) == len(sentences)
+    for sentence in sentences:
+        assert sentence[0].islower()
+        assert sentence[-1].isalnum()
+        assert "\n" not in sentence
+
+
+def test_what_codes_stand_for():
+    delivering = [ending for ending in Ending if ending.delivers]
+    assert delivering == [Ending.FINISHED, Ending.EMPTIED, Ending.GAVE_UP]
+    # `delivers` of kernels.sim.endings relies on their being consecutive.
+    assert delivering == list(range(delivering[0], delivering[-1] + 1))
+    assert [outcome for outcome in Outcome if outcome.succeeded] == [Outcome.TARGET_PICKED, Outcome.OTHER_PICKED]
+    # In a new array nothing has ended.
+    assert (Ending(0), Outcome(0), Task(0), Phase(0)) == (Ending.RUNNING, Outcome.NONE, Task.NONE, Phase.EMPTY)

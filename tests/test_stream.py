@@ -26,14 +26,7 @@ from synpick_warp.stages.render.mask_runs import FIELDS, boundary_sizes
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
-from synpick_warp.stages.stream import (
-    FrameStream,
-    LightTable,
-    TickReport,
-    name_lights,
-    read_tick,
-    tick_batch,
-)
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick, tick_batch
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, views_per_batch
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch
@@ -108,7 +101,7 @@ def copied(batch: FrameBatch) -> dict[str, Any]:
     return arrays | {"layers": {name: value.copy() for name, value in batch.layers.items()}, "length": len(batch)}
 
 
-@pytest.mark.parametrize("live", [[1, 1, 1, 1, 1], [0, 1, 0, 1, 1], [0, 0, 0, 0, 1]])
+@pytest.mark.parametrize("live", [[1, 1, 1, 1, 1], [0, 1, 0, 1, 1], [0, 0, 0, 0, 1], [0, 0, 0, 0, 0]])
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 7, 100])
 def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch):
     batches, renderer = rendered(device, live, batch)
@@ -154,20 +147,6 @@ def test_layers_come_if_they_are_asked_for_each_with_its_views(device):
             assert all((array[view] == expected).all() for array in layers.values())
 
 
-def test_layers_make_batches_smaller():
-    gpu = SimpleNamespace(is_cuda=True)
-    large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
-    count = batch_of(settings(**large, render__layers=list(LAYERS)), gpu)
-    pixel = view_ring.PIXEL_BYTES + view_ring.MASK_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2 + 1 + 1 + 2
-    assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
-
-
-def test_no_live_world_gives_no_batch(device):
-    batches, renderer = rendered(device, [0] * WORLDS, 4)
-    assert batches == []
-    assert renderer.calls == []
-
-
 def test_what_a_batch_says_of_its_views(device):
     (made,), _ = rendered(device, [0, 1, 0, 0, 1], 100)
     config = config_of()
@@ -182,14 +161,8 @@ def test_what_a_batch_says_of_its_views(device):
     np.testing.assert_array_equal(made["object_id"], ids[world])
     assert ids.min() == -1
     assert {made[name].dtype.name for name in ("episode", "camera", "frame", "object_id", "pixels", "boxes")} == {"int32"}
-    assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "mask_words")] == [
-        "float64",
-        "float32",
-        "uint8",
-        "uint16",
-        "uint8",
-        "uint32",
-    ]
+    kinds = {"time": "float64", "pose": "float32", "color": "uint8", "depth": "uint16", "instance": "uint8", "mask_words": "uint32"}
+    assert {name: made[name].dtype.name for name in kinds} == kinds
     assert made["light_name"].tolist() == ["even"] * 3 + ["lamp"] * 3
     np.testing.assert_allclose(made["light_yaw"], 0.5 * world)
     np.testing.assert_allclose(made["light_exposure"], 0.1 * world, rtol=1e-6)
@@ -266,10 +239,10 @@ def test_batch_sizes():
     assert batch_of(config_of(render__views_per_batch=17), cpu) == 17
     gpu = SimpleNamespace(is_cuda=True)
     assert batch_of(config_of(), gpu) == 3 * WORLDS
-    huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
-    count = batch_of(huge, gpu)
-    pixel = view_ring.PIXEL_BYTES + view_ring.MASK_BYTES
-    assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
+    for layers, size in (([], 0), (LAYERS, 12 + 3 + 12 + 2 + 8 + 12 + 2 + 1 + 1 + 2)):
+        count = batch_of(settings(bake__worlds=1000, cameras__resolution=[1920, 1080], render__layers=list(layers)), gpu)
+        pixel = view_ring.PIXEL_BYTES + view_ring.MASK_BYTES + size
+        assert count * 1920 * 1080 * pixel <= view_ring.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
     assert batch_of(settings(cameras__resolution=[8192, 8192]), gpu) == 1
 
 

@@ -10,17 +10,26 @@ import warp as wp
 
 from synpick_warp.cli.main import main
 from synpick_warp.configs.cell.cameras import CameraRow, Pose
+from synpick_warp.configs.schema import Config
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild
 from synpick_warp.system.progress import SilentProgress
-from tests.worlds.small_worlds import catalog, settings
+from tests.builders import boxes, mistake
+from tests.worlds.small_worlds import settings
+
+TINY = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
 
 
 @pytest.fixture(autouse=True)
-def boxes(monkeypatch):
-    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
+def all_boxes():
+    with boxes():
+        yield
+
+
+def smallest(config: Config, device: wp.Device) -> assembly.Factory:
+    return assembly.build_smallest(config, device, SilentProgress(), False, True)
 
 
 def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
@@ -32,8 +41,7 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
         return launch(kernel, *arguments, **options)
 
     monkeypatch.setattr(wp, "launch", record)
-    config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
-    result = warmup.warm_up(config, SilentProgress())
+    result = warmup.warm_up(TINY, SilentProgress())
     rooms = {name.split(".")[2] for name in loaded if name.startswith("synpick_warp.kernels.")}
     assert rooms >= {"sim", "perception", "render", "encoding"}
     assert result.compiled >= 0
@@ -52,8 +60,7 @@ def test_a_warm_up_compiles_what_only_a_stream_launches(monkeypatch):
 def test_dry_launches_find_all_that_a_warm_up_loads(device):
     """What launches for real load afterwards has been found before, whatever the cache holds; the modules that are compiled first, too."""
     early = {build: build.module.get_module_identifier(build.block) for build in slow_builds(device)}
-    config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
-    factory = assembly.build_smallest(config, device, SilentProgress(), False, True)
+    factory = smallest(TINY, device)
     found = []
     for _ in range(2):
         with DryLaunches() as dry:
@@ -71,7 +78,7 @@ def test_a_dry_run_takes_a_camera_on_the_gripper(device):
     """Nothing has been simulated then: the poses of the gripper are zeros."""
     row = CameraRow(fov=60.0, pose=Pose(position=(0.1, 0.0, 0.1), look_at=(0.0, 0.0, -0.1), up=(0.0, 1.0, 0.0)), fixed_to="gripper")
     config = dataclasses.replace(settings(bake__mode="move", cameras__resolution=[32, 18]), camera=(row,))
-    factory = assembly.build_smallest(config, device, SilentProgress(), False, True)
+    factory = smallest(config, device)
     with DryLaunches():
         launch_all(factory.simulation, factory.stream)
 
@@ -99,18 +106,13 @@ def test_the_command_says_what_it_did(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(("variable", "name"), [("WARP_CACHE_PATH", "kernel"), ("XDG_CACHE_HOME", "shape")])
-def test_a_cache_that_cannot_be_written_is_a_mistake(tmp_path, monkeypatch, capsys, variable, name):
+def test_a_cache_that_cannot_be_written_is_a_mistake(tmp_path, monkeypatch, variable, name):
     """The kernels went into a temporary folder, which was removed, with exit code 0."""
     monkeypatch.setattr(warmup, "warm_up", lambda config, progress: pytest.fail("it compiles"))
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
     (tmp_path / "file").touch()
     monkeypatch.setenv(variable, str(tmp_path / "file" / "cache"))
-    assert main(["warmup", "--config", "smoke", "--device", "cpu"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"synpick-warp: error: the {name} cache {tmp_path}/file/cache")
+    line = mistake("warmup", "--config", "smoke", "--device", "cpu")
+    assert line.startswith(f"the {name} cache {tmp_path}/file/cache")
     assert line.endswith(f"(Not a directory), so that a warm-up would be lost; set {variable} to a folder that can be written")
-
-
-def test_folders_that_are_missing_are_named(capsys):
-    assert main(["warmup", "--models", "/nowhere/models"]) == 2
-    assert "there is no models folder /nowhere/models" in capsys.readouterr().err
+    assert "there is no models folder /nowhere/models" in mistake("warmup", "--models", "/nowhere/models")

@@ -88,6 +88,14 @@ class World:
                 if name not in ("target", "overflow", "votes", "above", "ancestors"):
                     array += 1
 
+    def begin(self, episode: int, arrangement: int, mode: int, catalog_index: list[int], target: int) -> Ticks:
+        """An arrangement falls for a tick; perception chooses a target in the first frame."""
+        self.settle(episode, arrangement, mode, catalog_index)
+        yield
+        self.first_frame()
+        self.look(target)
+        yield
+
     def attempt(self, number: int, loads: list[float], **columns: object) -> Ticks:
         """All ticks from the one after the look to the one before the end; then sets what tells of the end."""
         for task in (Task.APPROACH, Task.DESCEND, Task.PRESS):

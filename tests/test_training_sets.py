@@ -1,22 +1,30 @@
-"""PyTorch dataset: samples are the views that were written; pickled copies give the same; batches by PyTorch or its stand-in."""
+"""Data sets for training: samples of PyTorch are the views that were written, also in pickled copies and in batches by PyTorch or its
+stand-in; the decoder for shards against webdataset itself, and what webdataset's own decoders make of 16 bits."""
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import pickle
 import sys
+import warnings
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import synpick_warp
 from synpick_warp.dataset.pytorch import FIELDS, Views, collate
+from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from tests.harness.exporter_contract import FRAMES
+from synpick_warp.views.layer_codec import decode_layer, encode_layer
+from tests.harness.exporter_contract import FRAMES, export
+from tests.twins.masks import masks_of_batch
 from tests.worlds.box_sets import EPISODES, write_set
+from tests.worlds.box_views import batches, cameras, config
 
 STUBS = Path(__file__).parent / "stubs"
 
@@ -102,3 +110,75 @@ def test_batches_of_workers_equal_those_of_this_process(folder, torch):
         for one, other in zip(alone["masks"], shared["masks"], strict=True):
             np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
     assert seen == [frame for _ in EPISODES for frame in range(FRAMES) for _ in range(3)]
+
+
+# ---- webdataset ----
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # Its import looks for torch.
+    import webdataset
+
+LEFT_OPEN = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
+"""webdataset leaves its files to the garbage collector."""
+LENSES = cameras()
+
+
+@pytest.fixture(scope="module")
+def shard(tmp_path_factory) -> Path:
+    out = export(ShardsExporter, tmp_path_factory.mktemp("decoder") / "set", config(("flow", "classes")), (0,))
+    return out / "train_pbr_web" / "shard-000000.tar"
+
+
+def read(shard: Path, *handlers: object) -> list[dict]:
+    """All samples of a shard, through webdataset's own pipeline."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        return list(webdataset.WebDataset(str(shard), shardshuffle=False).decode(*handlers))
+
+
+@LEFT_OPEN
+def test_webdatasets_pipeline_gives_what_was_written(shard):
+    truth = [batch for batch in batches(1, (0,), 3, LENSES) if int(batch.camera[0]) == 0]
+    samples = read(shard, decode_view)
+    assert len(samples) == len(truth) == 3
+    for sample, batch in zip(samples, truth, strict=True):
+        assert sample["depth.png"].dtype == np.uint16
+        np.testing.assert_array_equal(sample["depth.png"], batch.depth[0])
+        assert sample["rgb.jpg"].flags.c_contiguous
+        assert np.median(np.abs(sample["rgb.jpg"].astype(int) - batch.color[0])) <= 3
+        np.testing.assert_array_equal(sample["classes.png"], batch.layers["classes"][0])
+        expected = decode_layer("flow", encode_layer("flow", batch.layers["flow"][0]))
+        np.testing.assert_array_equal(sample["flow.png"], expected)
+        instances = [row["instance_id"] for row in sample["gt.json"]]
+        np.testing.assert_array_equal(sample["mask_visib.json"], [batch.instance[0] == 1 + index for index in instances])
+        np.testing.assert_array_equal(sample["mask.json"], masks_of_batch(batch)[instances])
+        assert sample["camera.json"]["depth_scale"] == 0.1
+
+
+@LEFT_OPEN
+def test_webdatasets_own_decoder_clips_depth_to_0_and_255(shard):
+    """The reason why there is a decoder; if this fails, webdataset has learnt it."""
+    depth = read(shard, "l8")[0]["depth.png"]
+    assert depth.dtype == np.uint8
+    assert set(np.unique(depth)) <= {0, 255}
+
+
+def test_views_without_instances_have_no_masks_and_other_entries_are_left_to_webdataset():
+    assert decode_view(".mask.json", b"{}").shape == (0, 0, 0)
+    assert [decode_view(key, b"{}") for key in (".camera.json", ".txt", ".__key__")] == [None] * 3
+
+
+@pytest.mark.parametrize(
+    ("key", "data", "message"),
+    [
+        (".depth.png", b"\x89PNG", "not an image"),
+        (".rgb.jpg", cv2.imencode(".jpg", np.zeros((4, 4, 3), np.uint8))[1].tobytes()[:60], "not an image"),
+        (".mask.json", b'{"0": {"counts": [5], "size": [2, 2]}}', "5 of 4 pixels"),
+        (".mask.json", b'{"1": {"counts": [4], "size": [2, 2]}}', "does not number its masks from 0"),
+        (".mask.json", json.dumps({"0": {"counts": [4], "size": [2, 2]}, "1": {"counts": [6], "size": [2, 3]}}).encode(), "3 x 2 pixels"),
+        (".mask.json", b'{"0": {"counts": [100000000000], "size": [100000, 1000000]}}', "is damaged"),
+    ],
+)
+def test_damaged_entries_are_one_error(key, data, message):
+    with pytest.raises(DatasetError, match=message):
+        decode_view(key, data)
