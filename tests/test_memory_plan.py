@@ -17,8 +17,7 @@ from synpick_warp.configs.cell.cameras import CameraRow, Jitter, Pose
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import INT32_MAX, settings_of
 from synpick_warp.configs.files.load import load_config, sections
-from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config, Settle
-from synpick_warp.configs.schema import Physics as PhysicsSettings
+from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly, memory_plan, pipeline
 from synpick_warp.factory.memory_plan import check_memory, plan_memory
@@ -26,10 +25,8 @@ from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.stages.sim.physics import Physics
-from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples
-from tests.harness.kernel_files import write
 from tests.worlds.small_worlds import catalog, settings
 
 GIB = 1024**3
@@ -114,60 +111,45 @@ def test_arrays_longer_than_32_bit_indices_are_refused_on_any_machine(overrides,
     assert said.endswith(advice)
 
 
-def test_rays_of_lenses_that_episodes_draw_are_counted():
-    row = CameraRow(
-        fov=40.0, distortion=(-0.1, 0.0, 0.0, 0.0), pose=Pose(position=(0.0, 0.0, 1.2), look_at=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
-    )
-    drawn = replace(row, jitter=Jitter(center=Distribution("uniform", ((-2.0,), (2.0,)))))
-    for rows, count in (((row,), 0), ((drawn,), 1), ((row, drawn), 1)):
-        config = replace(settings(render__views_per_batch=5), camera=rows)
-        found = [row for term in plan_memory(config, CPU) for row in term.rows if row[0] == "Lenses.ray"]
-        assert found == [("Lenses.ray", (5, 180, 320), "", 5 * 180 * 320 * 8)] * count
-
-
-@pytest.mark.parametrize(("given", "rows"), [({}, []), ({"randomize__lamps": 1}, [(5 * 25,)])])
-def test_materials_of_views_are_counted_where_looks_are_drawn(given, rows):
-    """Of 20 objects, 3 fixtures, table and background."""
-    config = settings(render__views_per_batch=5, arrangement__max_objects=20, **given)
-    assert [row[1] for term in plan_memory(config, CPU) for row in term.rows if row[0] == "DressedSurfaces.recolor"] == rows
-
-
-@pytest.mark.parametrize(("most", "count"), [(0.0, 256), (100.0, 102)])
-def test_one_cost_volume_of_stereo_matching_is_counted_for_all_views(most, count):
-    def rows(*layers: str) -> dict[str, tuple[int, ...]]:
-        given = {"render__layers": list(layers), "depth_sensor__max_disparity": most, "render__views_per_batch": 5}
-        return {name: shape for term in plan_memory(settings(**given), CPU) for name, shape, *_ in term.rows}
-
-    assert rows("depth_stereo")["MatchingScratch.cost"] == (1, 180, 320, count)
-    assert rows("depth_stereo")["InfraredImages.ir_left"] == (5, 180, 320)
-    assert not [name for name in rows("depth_sensor", "ir_left") if "Matching" in name or "ir_right" in name]
+LENS = CameraRow(
+    fov=40.0, distortion=(-0.1, 0.0, 0.0, 0.0), pose=Pose(position=(0.0, 0.0, 1.2), look_at=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0))
+)
+DRAWN = replace(LENS, jitter=Jitter(center=Distribution("uniform", ((-2.0,), (2.0,)))))
+"""A camera whose lens each episode draws."""
+STEREO = {"render__layers": ["depth_stereo"]}
+INFRARED = {"render__layers": ["depth_sensor", "ir_left"]}
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
+    ("cameras", "given", "name", "shapes"),
     [
-        ("bake.episodes", 10**12),
-        ("physics.contacts_per_world", 10**18),
-        ("perception.contour_points", 10**12),
-        ("render.views_per_batch", 10**12),
-        ("settle.tries", 10**12),
-        ("move.rounds", 10**9),
+        ((LENS,), {}, "Lenses.ray", []),
+        ((DRAWN,), {}, "Lenses.ray", [(5, 180, 320)]),
+        ((LENS, DRAWN), {}, "Lenses.ray", [(5, 180, 320)]),
+        ((), {}, "DressedSurfaces.recolor", []),
+        # Of 20 objects, 3 fixtures, table and background.
+        ((), {"randomize__lamps": 1}, "DressedSurfaces.recolor", [(5 * 25,)]),
+        # One cost volume for all views.
+        ((), STEREO, "MatchingScratch.cost", [(1, 180, 320, 256)]),
+        ((), STEREO | {"depth_sensor__max_disparity": 100.0}, "MatchingScratch.cost", [(1, 180, 320, 102)]),
+        ((), STEREO, "InfraredImages.ir_left", [(5, 180, 320)]),
+        ((), INFRARED, "MatchingScratch.cost", []),
+        ((), INFRARED, "InfraredImages.ir_right", []),
     ],
 )
-def test_whole_numbers_beyond_32_bits_are_out_of_range(key, value):
-    with pytest.raises(ConfigError, match=rf"{key} is {value} in the settings passed; allowed: at least \d+, at most \d+"):
-        load_config("smoke", {key: value})
+def test_arrays_are_counted_where_settings_need_them(cameras, given, name, shapes):
+    config = replace(settings(render__views_per_batch=5, arrangement__max_objects=20, **given), camera=cameras)
+    assert [shape for term in plan_memory(config, CPU) for found, shape, *_ in term.rows if found == name] == shapes
 
 
-@pytest.mark.parametrize("key", ["settle.max_time", "settle.relax_time", "settle.stuck_time", "pick.press_time"])
-def test_times_of_more_ticks_than_32_bits_count_are_out_of_range(key):
+def test_whole_numbers_and_times_in_ticks_stay_within_32_bits():
     """They wrapped around without a word: an episode that may settle for 1e300 s was given up at once."""
-    with pytest.raises(
-        ConfigError, match=rf"{key} is 1e\+300 in the settings passed; allowed: (above|at least) 0, at most (3600|60) \[s\]"
-    ):
-        load_config("smoke", {key: 1e300})
-    step = settings_of(PhysicsSettings)["step"].bounds.low
-    assert settings_of(Settle)["max_time"].bounds.high < INT32_MAX * step
+    bounds = {f"{section}.{name}": item for section, kind in sections().items() for name, item in settings_of(kind).items()}
+    counts = {key: item.bounds.high for key, item in bounds.items() if item.kind is int and key != "bake.seed"}
+    assert len(counts) > 20
+    assert {key: high for key, high in counts.items() if high > INT32_MAX} == {}
+    times = [bounds[f"settle.{name}"] for name in ("max_time", "relax_time", "stuck_time")] + [bounds["pick.press_time"]]
+    assert max(item.bounds.high for item in times) < INT32_MAX * bounds["physics.step"].bounds.low
 
 
 def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed(tmp_path, monkeypatch):
@@ -176,6 +158,13 @@ def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed
         "the lists of 2,147,483,647 episodes take at least 200.0 GiB of memory, but this machine has 8.0 GiB free; "
         "lower bake.episodes (2147483647), or bake a part with --shard"
     )
+
+
+def fail_to_build(monkeypatch, error: Exception) -> None:
+    def build_factory(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(pipeline, "build_factory", build_factory)
 
 
 @pytest.mark.parametrize(
@@ -189,11 +178,7 @@ def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed
 )
 def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch):
     """The plan is a lower bound, and other programs may take memory at any time."""
-
-    def build_factory(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(pipeline, "build_factory", build_factory)
+    fail_to_build(monkeypatch, error)
     with pytest.raises(
         ConfigError, match=r"\Athe bake ran out of memory; its largest part are images of 3 views .*; lower cameras\.resolution "
     ):
@@ -202,10 +187,7 @@ def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch
 
 
 def test_other_runtime_errors_stay_what_they_are(tmp_path, monkeypatch):
-    def build_factory(*_: object, **__: object) -> None:
-        raise RuntimeError("a fault")
-
-    monkeypatch.setattr(pipeline, "build_factory", build_factory)
+    fail_to_build(monkeypatch, RuntimeError("a fault"))
     with pytest.raises(RuntimeError, match="a fault"):
         pipeline.run_bake(settings(bake__device="cpu"), tmp_path / "out", SilentProgress())
 
@@ -293,53 +275,6 @@ def test_shapes_of_bins_take_a_separating_axis_a_pair():
 def test_the_plan_has_the_arrays_of_all_stages_and_its_estimates():
     names = {name for term in plan_memory(settings(), CPU) for name, *_ in term.rows}
     assert {"WorldState.phase", "ViewBuffers.color", "Newton's contacts", "shared memory of writers"} <= names
-
-
-# ---- free memory ----
-
-
-MEMINFO = "MemTotal:       1000 kB\nMemAvailable:    800 kB\nSwapFree:        50 kB\n"
-
-
-@pytest.mark.parametrize(
-    ("files", "kibibytes"),
-    [
-        ({}, 850),
-        ({"proc/self/cgroup": "0::/a/b\n", "sys/fs/cgroup/a/memory.max": "max\n", "sys/fs/cgroup/a/memory.current": "1024\n"}, 850),
-        (
-            {
-                "proc/self/cgroup": "0::/a/b\n",
-                "sys/fs/cgroup/a/memory.max": f"{600 * 1024}\n",
-                "sys/fs/cgroup/a/memory.current": f"{500 * 1024}\n",
-                "sys/fs/cgroup/a/memory.stat": f"anon 7\ninactive_file {100 * 1024}\n",
-            },
-            250,
-        ),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "2048\n", "sys/fs/cgroup/memory.current": "4096\n"}, 50),
-        (
-            {
-                "proc/self/cgroup": "5:cpu:/x\n4:memory:/docker/1\n",
-                "sys/fs/cgroup/memory/memory.limit_in_bytes": f"{300 * 1024}",
-                "sys/fs/cgroup/memory/memory.usage_in_bytes": f"{100 * 1024}",
-            },
-            250,
-        ),
-    ],
-)
-def test_free_memory_counts_caches_swap_and_the_limits_of_control_groups(files, kibibytes, tmp_path):
-    assert free_host_memory(write(tmp_path, {"proc/meminfo": MEMINFO, **files})) == kibibytes * 1024
-
-
-@given(st.dictionaries(st.sampled_from(("memory.max", "memory.current", "memory.stat")), st.binary(max_size=40)), st.binary(max_size=40))
-@hypothesis_settings(max_examples=fuzz_examples(50), deadline=None)
-def test_any_text_in_the_files_of_control_groups_gives_a_number(tmp_path_factory, files, groups):
-    root = write(tmp_path_factory.mktemp("root"), {"proc/meminfo": MEMINFO})
-    (root / "proc/self").mkdir()
-    (root / "proc/self/cgroup").write_bytes(b"0::/\n" + groups)
-    (root / "sys/fs/cgroup").mkdir(parents=True)
-    for name, content in files.items():
-        (root / "sys/fs/cgroup" / name).write_bytes(content)
-    assert 0 <= free_host_memory(root) <= 850 * 1024
 
 
 # ---- any settings ----

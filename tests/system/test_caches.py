@@ -43,28 +43,23 @@ def check_note(capsys, folder: Path | None, reason: str) -> None:
     assert line.endswith("set WARP_CACHE_PATH to a folder that can be written")
 
 
-def test_a_home_that_is_a_file_is_replaced(home, capsys):
-    """Fault 6."""
-    home.write_text("")
-    check_note(capsys, usable_kernel_cache("1.0"), "Not a directory")
+def no_home() -> Path:
+    raise RuntimeError("Could not determine home directory.")
 
 
-def test_a_home_where_nothing_can_be_created_is_replaced(home, capsys, monkeypatch):
-    """Fault 6: /proc refuses even root, as a read-only file system does."""
-    monkeypatch.setenv("HOME", "/proc")
-    check_note(capsys, usable_kernel_cache("1.0"), "No such file or directory")
-
-
-def test_a_missing_home_is_replaced(home, capsys, monkeypatch):
-    """Fault 6: a container's user without an entry in the password file."""
-
-    def no_home() -> Path:
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.setattr(Path, "home", no_home)
-    assert user_cache() is None
-    check_note(capsys, usable_kernel_cache("1.0"), "the user has no home")
-    assert find_fault(default_cache_dir()) == "Not a directory"
+@pytest.mark.parametrize("kind", ["a file", "like a read-only file system", "missing"])
+def test_a_home_that_cannot_be_used_is_replaced(home, capsys, monkeypatch, kind):
+    """Fault 6: /proc refuses even root; a container's user has no entry in the password file."""
+    if kind == "missing":
+        monkeypatch.setattr(Path, "home", no_home)
+        assert user_cache() is None
+        assert find_fault(default_cache_dir()) == "Not a directory"
+    elif kind == "a file":
+        home.write_text("")
+    else:
+        monkeypatch.setenv("HOME", "/proc")
+    reason = {"a file": "Not a directory", "missing": "the user has no home"}.get(kind, "No such file or directory")
+    check_note(capsys, usable_kernel_cache("1.0"), reason)
 
 
 def test_a_full_disk_is_replaced_and_its_kernels_are_linked(home, capsys, monkeypatch):
