@@ -1,7 +1,6 @@
 """Generate the tables of READMEs that follow from code and results; the prose around them is as committed.
 
-configs/REFERENCE.md: the settings; synpick_warp/apps/validation/README.md: the rules; synpick_warp/exporters/README.md: the columns of
-picks; tools/README.md and tools/reports/real/README.md: the figures in tools/results.
+configs/REFERENCE.md: the settings; tools/README.md and tools/reports/real/README.md: the figures in tools/results.
 
     python -m tools.docs          # writes them
 """
@@ -14,10 +13,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from synpick_warp.apps.validation.registry import load_rules
-from synpick_warp.codes import names
 from synpick_warp.configs.calibration.sensor_presets import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
@@ -26,13 +21,10 @@ from synpick_warp.configs.files.load import sections, table_lists
 from synpick_warp.configs.files.table_lists import SPLITS
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
-from synpick_warp.views.picks import COLUMNS, STATES
 from tools.figures import figures_tables, read_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "REFERENCE.md"
-FORMATS = ROOT / "synpick_warp" / "exporters" / "README.md"
-VALIDATION = ROOT / "synpick_warp" / "apps" / "validation" / "README.md"
 FIGURES = ROOT / "tools" / "README.md"
 PHOTOGRAPHS = ROOT / "tools" / "reports" / "real" / "README.md"
 STUDIES = ("photographs_ablation.json", "photographs_tuning.json")
@@ -44,8 +36,7 @@ _SETTINGS_HEAD = """# Reference of the settings
 What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out. Paths in
 a file are relative to it.
 """
-_RULES_BEGIN, _END = "from the rules' declarations. -->\n", "<!-- End. -->"
-_COLUMNS_BEGIN = "from `synpick_warp/views/picks.py`. -->\n"
+_SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensor_presets.py`."
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
@@ -60,11 +51,12 @@ def settings_reference() -> str:
 
 
 def _sensors() -> list[str]:
-    """Heading and rows of the presets of depth sensors: every figure with its source."""
-    lines = ["## Sensor presets", "", "preset | figure | value | trust | source", "---|---|---|---|---"]
-    for name, figures in SENSORS.items():
-        lines += [f"`{name}` | {key} | `{format_toml(one.value)}` | {one.trust} | {one.source}" for key, one in figures.items()]
-    return lines
+    """Heading and table of the presets of depth sensors: a row a figure, with the trust in each value."""
+    keys = dict.fromkeys(key for figures in SENSORS.values() for key in figures)
+    lines = ["## Sensor presets", "", _SENSORS_HEAD, "", " | ".join(["figure", *SENSORS]), "|".join(["---"] * (len(SENSORS) + 1))]
+    cells = {key: [figures.get(key) for figures in SENSORS.values()] for key in keys}
+    shown = {key: ["" if one is None else f"{format_toml(one.value)} {one.trust[0].upper()}" for one in row] for key, row in cells.items()}
+    return [*lines, *(" | ".join([key, *row]) for key, row in shown.items())]
 
 
 def _anchor(title: str) -> str:
@@ -96,30 +88,6 @@ def _allowed(item: Setting) -> str:
     return f"{interval} {item.unit}".rstrip() + (" or distribution" if isinstance(item.default, Distribution) else "")
 
 
-def validation_reference() -> str:
-    """The README of the validation with its table of rules; the rest is as committed."""
-    rows = [f"| `{name}` | {item.level}{f' [{item.unit}]' * bool(item.unit)} | {item.sentence} |" for name, item in load_rules().items()]
-    return _with_table(VALIDATION, _RULES_BEGIN, ["| rule | level [unit] | what holds |", "|---|---|---|", *rows])
-
-
-def formats_reference() -> str:
-    """The README of the exporters with the columns of picks; the rest is as committed."""
-    lines = []
-    for title, columns in ("trials", COLUMNS), ("states", STATES):
-        lines += [*[""] * bool(lines), f"| column of {title} | type [unit] | content |", "|---|---|---|"]
-        for column in columns:
-            codes = f" Codes from 0: {', '.join(f'`{name}`' for name in names(column.codes))}." if column.codes else ""
-            kind = np.dtype(column.dtype).name + f" x {column.size}" * (column.size > 1) + f" [{column.unit}]" * (column.unit != "1")
-            lines.append(f"| `{column.name}` | {kind} | {column.meaning}{codes} |")
-    return _with_table(FORMATS, _COLUMNS_BEGIN, lines)
-
-
-def _with_table(path: Path, begin: str, lines: list[str]) -> str:
-    """A README with these lines between a mark and the end of generated text; the rest is as committed."""
-    head, rest = path.read_text(encoding="utf-8").split(begin)
-    return f"{head}{begin}\n" + "\n".join(lines) + f"\n\n{_END}{rest.split(_END)[1]}"
-
-
 def figures_reference() -> str:
     """The README of the tools with its tables of figures; the rest is as committed. Raises KeyError for a table without results."""
     return _with_results(FIGURES, figures_tables(read_runs()))
@@ -139,8 +107,6 @@ def _with_results(path: Path, tables: Mapping[str, str]) -> str:
 
 REFERENCES: dict[Path, Callable[[], str]] = {
     SETTINGS_REFERENCE: settings_reference,
-    FORMATS: formats_reference,
-    VALIDATION: validation_reference,
     FIGURES: figures_reference,
     PHOTOGRAPHS: photographs_reference,
 }

@@ -59,26 +59,26 @@ class Bake:
     mode: str = setting(
         "pick",
         "Task of the gripper: pick (empty the tote), target (dig for the most occluded object), move (stir), mixed (drawn per episode), "
-        "cycle (pick, target, move in turn: equal numbers).",
+        "cycle (pick, target, move in turn).",
         choices=(*MODES, MIXED, CYCLE),
     )
     mix: Annotated[tuple[float, float, float], Within(0.0, 1000)] = setting(
-        (1.0, 1.0, 1.0), "Weights with which mode mixed draws pick, target and move for an episode."
+        (1.0, 1.0, 1.0), "Weights of pick, target and move in mode mixed."
     )
     worlds: Annotated[int, Within(0, 65536)] = setting(
-        0, "Totes simulated in parallel, on each device; 0: chosen by episodes, device and memory. A GPU simulates at least 8."
+        0, "Worlds simulated in parallel on each device; 0: chosen by episodes, device and memory. A GPU simulates at least 8."
     )
     episodes: Annotated[int, Within(1, INT32_MAX)] = setting(
-        4, "Episodes (sequences) to generate; each becomes one BOP scene per camera. As many as bake.worlds, where only those are set."
+        4, "Episodes to generate; each becomes one BOP scene per camera. As many as bake.worlds, where only those are set."
     )
-    seed: Annotated[int, Within(0, 2**63 - 1)] = setting(0, "Random seed, from which every random number of the bake follows.")
-    device: str = setting("auto", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
+    seed: Annotated[int, Within(0, 2**63 - 1)] = setting(0, "Seed of all random numbers.")
+    device: str = setting("auto", "cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
         "",
-        "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: the embedded procedural objects.",
+        "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: embedded objects.",
         path=True,
     )
-    lights: str = setting("", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: the embedded procedural maps.", path=True)
+    lights: str = setting("", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: embedded maps.", path=True)
     formats: tuple[str, ...] = setting(
         ("bop",),
         "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), picks (grasp trials), "
@@ -96,41 +96,38 @@ class Arrangement:
 
     counts: Annotated[Counts, Within(0, INT32_MAX)] = setting(
         (),
-        "Parts, by name or obj_id, and how many of each an episode has: one (homogeneous) or several (kitted), with a range drawn anew for "
-        "each episode (mixed); empty: objects are drawn up to volume. Parts mix in the drop.",
+        "Parts, by name or obj_id, with the number, or range of numbers, of each in an episode; empty: objects are drawn up to volume.",
         parse=parse_counts,
         allowed=COUNTS,
     )
     volume: Annotated[float, above(0.0, 1.0, "m³")] = setting(
-        7e-3, "Budget for the total volume of the collision shapes of an episode's objects (paper: 7 l); fill says how it ends the draw."
+        7e-3, "Budget for the total volume of collision shapes of an episode's objects (paper)."
     )
     fill: str = setting(
         EXCEED,
-        "How the budget ends the draw: exceed (the object that reaches or exceeds it is the last; the paper's tables, released) or within "
-        "(that object is left out). An object that alone is larger is never drawn.",
+        "How the budget ends the draw: exceed (the object that reaches or exceeds it is the last; released) or within (it is left out). "
+        "An object that alone is larger is never drawn.",
         choices=FILLS,
     )
     max_objects: Annotated[int, Within(1, MAX_INSTANCES)] = setting(24, "Maximum objects of an episode.")
     repeat_to_fill: bool = setting(
-        True, "Let objects repeat in an episode, as pick.repeats does, where all of the catalog together stay below the budget."
+        True, "Let objects repeat in an episode, as pick.repeats does, where the whole catalog stays below the budget."
     )
     slot_shortfall: Annotated[float, above(0.0, 0.5)] = setting(
-        1e-3, "Accepted fraction of draws that need more body slots than a world has; such draws are repeated, and counted."
+        1e-3, "Accepted fraction of draws that need more body slots than a world has; they are repeated."
     )
     drop: str = setting(
         COLUMN,
-        "Where objects begin to fall: column (one above the other, over the middle), layers (side by side over the whole opening: many "
-        "from a low height) or scattered (each at the lowest of random places, beside those before it or right above them).",
+        "Where objects begin to fall: column (one above the other), layers (side by side over the whole opening) or scattered (each at "
+        "the lowest of random places).",
         choices=(COLUMN, LAYERED, SCATTERED),
     )
     clearance: Annotated[float, Within(0.0, 1.0, "m")] = setting(
-        0.01, "Gap between the bounding spheres of objects as they begin to fall; scattered: of cylinders."
+        0.01, "Gap between bounding spheres of objects as they begin to fall; scattered: of cylinders."
     )
-    upright: Fraction = setting(
-        0.0, "Fraction of the objects that begin to fall with the z axis of their model upwards, so that most stand."
-    )
+    upright: Fraction = setting(0.0, "Fraction of the objects that begin to fall with their z axis upwards, so that most stand.")
     spread: Fraction = setting(
-        0.3, "Drop positions are uniform over this fraction of the tote's opening, in layers of an object's cell, less the object's radius."
+        0.3, "Drop positions are uniform over this fraction of the tote's opening, in layers of a cell, less the object's radius."
     )
 
 
@@ -139,29 +136,22 @@ class Settle:
     """When a dropped pile counts as at rest, and which objects are dropped again."""
 
     min_time: Annotated[float, Within(0.0, 3600.0, "s")] = setting(1.0, "Minimum simulated time from the drop to the first frame.")
-    max_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(
-        10.0, "A world whose pile is not at rest after this time resamples its arrangement."
-    )
+    max_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(10.0, "Time after which a pile that is not at rest is resampled.")
     rest_displacement: Annotated[float, above(0.0, 0.1, "m")] = setting(
-        1e-4, "An object is at rest if none of its points is displaced by more in a tick."
+        1e-4, "Largest displacement in a tick of any point of an object at rest."
     )
     relax_time: Annotated[float, Within(0.0, 3600.0, "s")] = setting(
-        4.0, "Time after which relaxed_displacement replaces rest_displacement, since some piles keep jittering slightly."
+        4.0, "Time after which relaxed_displacement replaces rest_displacement: some piles keep jittering."
     )
-    relaxed_displacement: Annotated[float, above(0.0, 0.1, "m")] = setting(
-        2e-3, "Relaxed rest threshold after relax_time: displacement in a tick."
-    )
+    relaxed_displacement: Annotated[float, above(0.0, 0.1, "m")] = setting(2e-3, "Rest threshold after relax_time: displacement in a tick.")
     rest_ticks: Annotated[int, Within(1, INT32_MAX)] = setting(8, "Consecutive ticks for which all objects must be at rest.")
     restless: Annotated[float, Within(0.0, 0.5)] = setting(
         0.0,
-        "Fraction of the objects that may move by more than rest_displacement, though not by more than relaxed_displacement, in a pile at "
-        "rest: of 150, a few hardly noticeably do for seconds.",
+        "Fraction of the objects that may move by more than rest_displacement, but not relaxed_displacement, in a pile at rest.",
     )
-    stuck_depth: Annotated[float, above(0.0, 1.0, "m")] = setting(0.01, "An object that penetrates another by more is stuck (released).")
-    stuck_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(0.4, "An object stuck for this long is dropped again (released).")
-    max_redrops: Annotated[int, Within(0, INT32_MAX)] = setting(
-        8, "Maximum objects dropped again in an arrangement; one with more is resampled."
-    )
+    stuck_depth: Annotated[float, above(0.0, 1.0, "m")] = setting(0.01, "Penetration above which an object is stuck (released).")
+    stuck_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(0.4, "Time after which a stuck object is dropped again (released).")
+    max_redrops: Annotated[int, Within(0, INT32_MAX)] = setting(8, "Maximum objects dropped again before an arrangement is resampled.")
     tries: Annotated[int, Within(1, INT32_MAX)] = setting(20, "Arrangements tried before an episode is given up.")
 
 
@@ -170,38 +160,34 @@ class Physics:
     """Rigid-body solver and contacts. Values without a source were measured with Newton 1.8."""
 
     step: Annotated[float, Within(1e-5, 0.02, "s")] = setting(2e-3, "Time step (paper).")
-    steps_per_tick: Annotated[int, Within(1, 1000)] = setting(
-        33, "Steps per tick, which is one output frame: 33 steps of 2 ms are 15 Hz (paper)."
-    )
+    steps_per_tick: Annotated[int, Within(1, 1000)] = setting(33, "Steps per tick, one output frame: 33 steps of 2 ms are 15 Hz (paper).")
     gravity: Annotated[float, Within(0.0, 100.0, "m/s²")] = setting(9.81, "Gravitational acceleration.")
     substeps: Annotated[int, Within(1, 100)] = setting(
-        1, "Solver substeps per step, with collision detection in each; two take twice as long, and piles come to rest a little sooner."
+        1, "Solver substeps per step, with collision detection in each; two take twice as long."
     )
     iterations: Annotated[int, Within(1, 1000)] = setting(16, "Projected Gauss-Seidel iterations per solver substep.")
     match_all: bool = setting(
         False,
-        "Warm start every contact from one of the last substep. Newton leaves one of two coincident contacts out, as edges on a face have: "
-        "up to half of their load is lost in every substep, and boxes that lie ten deep move five times as fast.",
+        "Warm start every contact. Newton leaves one of two coincident contacts out, as edges on a face have: boxes that lie ten deep "
+        "then move five times as fast.",
     )
     sleep: Annotated[float, Within(0.0, 0.01, "m")] = setting(
         0.0,
-        "Island sleeping: displacement in a tick up to which an object is at rest, such as 2e-4; 0: off. Islands of touching objects that "
-        "all rest for three ticks are not simulated until one is touched; records lack contact forces of sleeping objects.",
+        "Island sleeping: displacement in a tick up to which an object is at rest, such as 2e-4; 0: off. Touching objects that all rest "
+        "for three ticks are not simulated until one is touched, and lack contact forces in records.",
     )
     friction: Annotated[float, Within(0.0, 10.0)] = setting(0.5, "Coulomb friction coefficient of every shape.")
-    gap: Annotated[float, Within(0.0, 0.1, "m")] = setting(
-        4e-3, "Contact margin of a shape: contacts are generated below twice this distance."
-    )
+    gap: Annotated[float, Within(0.0, 0.1, "m")] = setting(4e-3, "Contact margin of a shape: contacts exist below twice this distance.")
     angular_damping: Annotated[float, Within(0.0, 1e3, "1/s")] = setting(0.05, "Angular damping of the objects (PhysX's default).")
     max_speed: Annotated[float, above(0.0, 100.0, "m/s")] = setting(
-        4.0, "Speed limit of the objects: 8 mm per solver substep are no more than the contact margin of two shapes, so nothing tunnels."
+        4.0, "Speed limit of the objects; above twice the gap per substep they may tunnel."
     )
     contacts_per_world: Annotated[int, Within(16, INT32_MAX)] = setting(512, "Contact capacity per world; about 140 contacts are usual.")
     pairs_per_world: Annotated[int, Within(16, INT32_MAX)] = setting(1024, "Broad-phase pair capacity per world.")
     rows_per_world: Annotated[int, Within(48, INT32_MAX)] = setting(1536, "Capacity for the objects' contact constraint rows per world.")
     gripper_rows_per_world: Annotated[int, Within(48, INT32_MAX)] = setting(256, "Capacity for the gripper's constraint rows per world.")
-    deterministic: bool = setting(True, "On a GPU, sort contact rows, so that a bake can be reproduced bit for bit.")
-    guide_height: Annotated[float, above(0.0, 100.0, "m")] = setting(8.0, "Height of the temporary walls on the rim that guide the drop.")
+    deterministic: bool = setting(True, "Sort contact rows on a GPU, so that bakes are equal bit for bit.")
+    guide_height: Annotated[float, above(0.0, 100.0, "m")] = setting(8.0, "Height of temporary walls on the rim that guide the drop.")
 
     @property
     def tick_time(self) -> float:
@@ -211,39 +197,37 @@ class Physics:
 
 @dataclass(frozen=True)
 class Render:
-    """Rendering of RGB images: light transport, environment lighting, exposure, tone mapping, layers."""
+    """Rendering: light transport, environment lighting, exposure, tone mapping, layers."""
 
     mode: str = setting(
         FAST,
-        "Colour renderer: fast (few paths per coarse pixel, denoised), reference (path tracing, slow) or unoccluded "
-        "(unoccluded environment light and shadows of one lamp: for small images of many worlds); depth and masks are equal.",
+        "Colour renderer: fast (few paths per coarse pixel, denoised), reference (path tracing, slow) or unoccluded (unoccluded light and "
+        "shadows of one lamp: for small images of many worlds).",
         choices=RENDER_MODES,
     )
     samples: Annotated[int, Within(1, 65536)] = setting(64, "Mode reference: paths per pixel; powers of two are stratified best.")
     bounces: Annotated[int, Within(1, 64)] = setting(4, "Maximum surfaces along a path; 1: direct light only.")
-    random_yaw: bool = setting(True, "Rotate each episode's environment map by a random yaw about the vertical.")
+    random_yaw: bool = setting(True, "Rotate each episode's environment map by a random yaw.")
     exposure: Annotated[float, Within(0.01, 100.0)] = setting(1.0, "Factor on the automatic exposure.")
-    exposure_spread: Annotated[float, Within(0.0, 5.0, "EV")] = setting(
-        0.3, "Half width of the uniform random exposure offset of each episode; real cameras step by a third of an EV."
-    )
+    exposure_spread: Annotated[float, Within(0.0, 5.0, "EV")] = setting(0.3, "Half width of each episode's random exposure offset.")
     coarse_pixel: Annotated[int, Within(0, 64, "px")] = setting(
         0,
-        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. At full HD "
-        "5 px instead of these 4 px take 6 % less time, and PSNR is 0.2 to 0.7 dB lower. Shadow rays are spaced as wide, at most 32 px.",
+        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history` (4 px at "
+        "full HD; 5 px take 6 % less time and cost 0.2 to 0.7 dB). Shadow rays are spaced as wide, at most 32 px.",
     )
     coarse_paths: Annotated[int, Within(0, 1024)] = setting(
         0,
-        "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them, "
-        "and up to 32 in an episode's first frame with `history`.",
+        "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them; with "
+        "it up to 32 in an episode's first frame.",
     )
     history: Annotated[int, Within(0, 255)] = setting(
         32,
-        "Mode fast: paths per coarse pixel that are averaged over the frames of an episode where nothing moves; 0: each frame by itself.",
+        "Mode fast: paths per coarse pixel averaged over frames where nothing moves; 0: each frame by itself.",
     )
     lamps: Annotated[int, Within(0, 8)] = setting(
-        8, "Maximum number of a map's lamps, small bright lights with shadow rays of their own; mode unoccluded: 1 if it is at least 1."
+        8, "Maximum lamps of a map, small bright lights with shadow rays of their own; mode unoccluded: at most 1."
     )
-    antialias: bool = setting(True, "Modes fast and unoccluded: anti-alias the edges of surfaces; mode reference always does.")
+    antialias: bool = setting(True, "Anti-alias the edges of surfaces; mode reference always does.")
     tone: str = setting(
         "shoulder",
         "Tone curve: shoulder (linear up to 0.6, highlights compressed), linear (clipped at 1) or filmic (ACES, middle grey kept).",
@@ -252,48 +236,43 @@ class Render:
     table: bool = setting(True, "Render a table under the tote; without it the environment map is the background.")
     table_size: Annotated[tuple[float, float], Within(0.0, 20.0, "m")] = setting(
         (0.0, 0.0),
-        "Length and width of the table that cameras see, about the world's origin; 0: endless. Light and objects meet an endless one.",
+        "Length and width of the table that cameras see, about the origin; 0: endless. Light and objects meet an endless one.",
     )
     table_color: Color = setting((0.45, 0.45, 0.44), "Base colour of the table.")
-    layers: tuple[str, ...] = setting((), "Additional ground-truth layers (AOVs) of each view: any of the allowed names.", choices=LAYERS)
-    views_per_batch: Annotated[int, Within(0, INT32_MAX)] = setting(
-        0, "Views rendered and copied to the host in one batch; 0: chosen by device and resolution."
-    )
+    layers: tuple[str, ...] = setting((), "Additional ground-truth layers (AOVs) of each view.", choices=LAYERS)
+    views_per_batch: Annotated[int, Within(0, INT32_MAX)] = setting(0, "Views rendered in one batch; 0: chosen by device and resolution.")
 
 
 @dataclass(frozen=True)
 class Bop:
     """The BOP data set, as folders or shards."""
 
-    split: str = setting("train_pbr", "Name of the split's folder; the BOP toolkit reads JPEG only from splits named *_pbr.")
+    split: str = setting("train_pbr", "Folder of the split; the BOP toolkit reads JPEG only from *_pbr.")
     color_format: str = setting("jpg", "File format of RGB images.", choices=("jpg", "png"))
     jpeg_quality: Annotated[int, Within(1, 100)] = setting(95, "JPEG quality.")
-    depth_scale: Annotated[float, above(0.0, 10.0, "mm")] = setting(0.1, "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.")
-    masks: bool = setting(True, "Write mask/ (amodal) and mask_visib/ (visible): one file per instance and view.")
+    depth_scale: Annotated[float, above(0.0, 10.0, "mm")] = setting(0.1, "Depth of one count; 0.1 mm reaches 6.5 m.")
+    masks: bool = setting(True, "Write mask/ (amodal) and mask_visib/ (visible).")
     coco: bool = setting(True, "Write COCO annotations (scene_gt_coco.json).")
-    polygons: bool = setting(
-        False, "Segmentation in the format coco: polygons on the borders of pixels, exact, with holes, for tools that read no run lengths."
-    )
+    polygons: bool = setting(False, "Segmentation of the format coco by exact polygons, for tools that read no run lengths.")
     layout: str = setting(
         CLASSIC,
-        "Scene folders: classic (a scene per episode and camera) or multisensor (a scene per episode, with rgb_cam0/, scene_gt_cam0.json "
-        "and so on for each camera, as BOP-Industrial 2025); shards are always classic.",
+        "Scene folders: classic (a scene per episode and camera) or multisensor (a scene per episode, with rgb_cam0/ and so on, as "
+        "BOP-Industrial 2025); shards are always classic.",
         choices=LAYOUTS,
     )
     rectified: bool = setting(
         False,
-        "Render cameras as pinholes of the same camera matrices, without the distortion of their lenses, in all formats: for readers that "
-        "know none. Undistort real pictures to the same matrix.",
+        "Render cameras as pinholes of the same matrices, without distortion. Undistort real pictures to the same matrix.",
     )
     keypoints: Annotated[int, Within(0, 64)] = setting(
-        0, "Keypoints of each object in COCO annotations: points of its surface far from each other (8: as PVNet); 0: none."
+        0, "Keypoints of each object in COCO annotations: farthest points of its surface (8: as PVNet); 0: none."
     )
     graph: bool = setting(
         False,
-        "Write who lies on whom and who hides whom in each frame: scene_graph.json, with an unstacking order, and support in zarr; and "
-        "into models_info.json mass, centre of mass, inertia and suctionable area.",
+        "Write who lies on whom and who hides whom (scene_graph.json, support in zarr), and into models_info.json mass, centre of mass, "
+        "inertia and suctionable area.",
     )
-    target_visibility: Fraction = setting(0.1, "Minimum visible fraction of an instance listed in test_targets_bop19.json.")
+    target_visibility: Fraction = setting(0.1, "Minimum visible fraction of instances in test_targets_bop19.json.")
 
 
 @dataclass(frozen=True)
@@ -308,23 +287,18 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Split:
-    """A split, such as [splits.train]: a range of the data set's episodes with a mode and a BOP folder of its own.
-
-    Splits share seed and settings, never an episode index, and so no random number.
+    """A split, such as [splits.train]: a range of episodes with a mode and a BOP folder of its own. Splits share seed and settings, but no
+    random number.
     """
 
     name: str = ""
     """Key of its table; no setting of its own."""
-    episodes: Annotated[int, Within(1, INT32_MAX)] = setting(
-        1, "Episodes of the split; a finished data set can grow where indices are free."
-    )
+    episodes: Annotated[int, Within(1, INT32_MAX)] = setting(1, "Episodes of the split; it can grow where indices are free.")
     first: Annotated[int, Within(-1, INT32_MAX)] = setting(
-        -1, "Index of its first episode; -1: the next index after the split before it. A gap leaves room to grow."
+        -1, "Index of its first episode; -1: the next after the split before it. A gap leaves room to grow."
     )
-    mode: str = setting("", "Task of the gripper, as bake.mode, which is the default if this is empty.", choices=("", *MODES, MIXED, CYCLE))
-    folder: str = setting(
-        "", "BOP name of the split and of its folder; empty: the split's name, with _pbr if bop.color_format is jpg, as in test_pbr."
-    )
+    mode: str = setting("", "As bake.mode; empty: that.", choices=("", *MODES, MIXED, CYCLE))
+    folder: str = setting("", "Folder of the split; empty: its name, with _pbr if bop.color_format is jpg, as in test_pbr.")
 
 
 @dataclass(frozen=True)

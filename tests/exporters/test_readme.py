@@ -13,6 +13,7 @@ from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GR
 from synpick_warp.factory.attempts import AttemptRecord, ObservedInstance
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.views.layers import LAYER_TABLE
+from synpick_warp.views.picks import COLUMNS, STATES
 
 README = Path(synpick_warp.exporters.__file__).with_name("README.md")
 
@@ -49,3 +50,7 @@ def test_arrays_of_the_store_are_described():
     groups = CONSTANT_GROUPS | EPISODE_GROUPS
     arrays = {name for group in groups.values() for name in group.arrays}
     assert arrays | set(groups) <= described("Zarr trajectories")
+
+
+def test_columns_of_picks_are_described():
+    assert {column.name for column in (*COLUMNS, *STATES)} <= described("Picks")

@@ -16,7 +16,7 @@ KINDS = (TOTE, OWN, NONE, PALLET)
 
 @dataclass(frozen=True)
 class Tote:
-    """The tote (an open box). Its frame is the world frame: origin at the centre of the inner floor, z up. Sizes of the released mesh."""
+    """The tote, an open box. The world frame has its origin at the centre of the inner floor, z up. Sizes of the released mesh."""
 
     outer_size: Annotated[tuple[float, float, float], above(0.0, 10.0, "m")] = setting(
         (0.615, 0.373, 0.200), "Outer length, width and height."
@@ -56,7 +56,7 @@ class MeasuredBin:
     origin: Annotated[tuple[float, float, float], Within(unit="m")] = setting((0.0, 0.0, 0.0), "Origin of the bin's frame in the world.")
     yaw: Annotated[float | None, Within(unit="°")] = setting(None, "Angle about z of the bin's frame in the world; 0 unless it is given.")
     compartments: Annotated[tuple[tuple[float, float, float, float, float, float, float], ...], Within(unit="m")] = setting(
-        (), "Floor of each compartment: centre x, y, length, width; and its height, z = a x + b y + c."
+        (), "Floor of each compartment: centre x, y, length, width, and height z = a x + b y + c."
     )
     openings: Annotated[tuple[tuple[float, float, float, float], ...] | None, Within(unit="m")] = setting(
         None, "Opening of each compartment: centre x, y, length, width; as the floors unless it is given."
@@ -66,10 +66,10 @@ class MeasuredBin:
 
 @dataclass(frozen=True)
 class BinRow(Tote):
-    """A bin of bins.kind = "own", an open box as the tote or a mesh. An episode draws one of the bins by their weights."""
+    """A bin of bins.kind = "own", an open box or a mesh. An episode draws one by weight."""
 
     REQUIRED: ClassVar = ("name",)
-    name: str = setting("", "Name, of at most 32 lower-case letters, digits and underscores; no two bins have the same.")
+    name: str = setting("", "Unique name of at most 32 lower-case letters, digits and underscores.")
     weight: Annotated[float, Within(0.0, 1e6)] = setting(1.0, "Weight with which an episode draws it.")
     compartments: Annotated[tuple[int, int], Within(1, 6)] = setting((1, 1), "Columns (along x) and rows of compartments of equal floors.")
     divider_height: Annotated[float, above(0.0, 10.0, "m")] = setting(0.1, "Height of the dividers between compartments.")
@@ -78,13 +78,13 @@ class BinRow(Tote):
     up: str | None = setting(None, "Axis of the mesh that points up; z unless it is given.", choices=AXES)
     place: str | None = setting(
         None,
-        "Where the mesh lies: floor (unless it is given: its lowest inner point is the world's z = 0, below the middle of its opening), or "
-        "file (as modelled: the mesh's origin is the world's; bins after the first stand on the table of the first).",
+        "Where the mesh lies: floor (default: its lowest inner point is the world's z = 0, below the middle of its opening) or file (the "
+        "mesh's origin is the world's; later bins stand on the table of the first).",
         choices=PLACES,
     )
     collision: str | None = setting(
         None,
-        "What the mesh collides as: mesh (unless it is given), or box (a closed one between its floors and openings, for baskets of wire).",
+        "What the mesh collides as: mesh (default) or box (a closed one, for baskets of wire).",
         choices=COLLISIONS,
     )
     measured: MeasuredBin | None = setting(None, "What the mesh measures; the program writes this table.")
@@ -97,19 +97,19 @@ class BinRow(Tote):
 
 @dataclass(frozen=True)
 class Bins:
-    """What stands under the cameras: the tote, or without walls a table alone or a pallet, whose frame has its origin on top."""
+    """What stands under the cameras. The frame of a table or pallet has its origin on top."""
 
     kind: str = setting(
         TOTE,
-        "What objects are dropped into or onto: tote ([tote]), own (a bin of [[bin]], drawn in each episode), none (the table), pallet.",
+        "What objects are dropped into or onto: tote ([tote]), own (drawn from [[bin]]), none (the table), pallet.",
         choices=KINDS,
     )
     shift: Annotated[tuple[float, float], Within(0.0, 1.0, "m")] = setting(
-        (0.0, 0.0), "Half widths of the offset in x and y that each episode draws for its bin."
+        (0.0, 0.0), "Half widths of each episode's random offset in x and y."
     )
-    yaw: Annotated[float, Within(0.0, 180.0, "°")] = setting(0.0, "Half width of the rotation about z that each episode draws for its bin.")
+    yaw: Annotated[float, Within(0.0, 180.0, "°")] = setting(0.0, "Half width of each episode's random rotation about z.")
     area: Annotated[tuple[float, float], above(0.0, 10.0, "m")] = setting(
-        (0.5, 0.35), "Length and width over which objects are dropped, without walls."
+        (0.5, 0.35), "Length and width over which objects are dropped without walls."
     )
     margin: Annotated[float, Within(0.0, 5.0, "m")] = setting(
         0.15, "Without walls, an object that is farther outside of the area has left."

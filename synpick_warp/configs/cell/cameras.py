@@ -24,7 +24,7 @@ MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
 
 @dataclass(frozen=True)
 class Cameras:
-    """Pinhole cameras above the tote: square pixels with centres at +0.5, principal point in the middle of the image."""
+    """Pinhole cameras above the tote: square pixels, principal point in the middle of the image."""
 
     resolution: Annotated[tuple[int, int], Within(1, 8192, "px")] = setting((1920, 1080), "Image width and height.")
     fov: Annotated[float, Within(1.0, 170.0, "°")] = setting(20.0, "Horizontal field of view.")
@@ -36,7 +36,7 @@ class Cameras:
     )
     ups: Annotated[tuple[tuple[float, float, float], ...], Within(-1e3, 1e3)] = setting(
         ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
-        "Up vector of each camera; by default +y for the first, and towards the tote's centre line for the others.",
+        "Up vector of each camera.",
     )
 
 
@@ -45,7 +45,7 @@ class Pose:
     """Pose of a camera in the tote's frame, in one of three forms."""
 
     matrix: Annotated[tuple[tuple[float, float, float, float], ...] | None, Within(-100.0, 100.0, "m")] = setting(
-        None, "Camera-to-world transform, 4 x 4 (extrinsics as OpenCV's are its inverse)."
+        None, "Camera-to-world transform, 4 x 4."
     )
     position: Annotated[tuple[float, float, float] | None, Within(-100.0, 100.0, "m")] = setting(
         None, "Optical centre; with quaternion, or with look_at and up."
@@ -57,8 +57,8 @@ class Pose:
     up: Annotated[tuple[float, float, float] | None, Within(-1e3, 1e3)] = setting(None, "Direction that is up in the image.")
     axes: str | None = setting(
         None,
-        "Axes of the camera in matrix or quaternion: opencv (x right, y down, z forward; ROS too), unless it is given, or opengl (x right, "
-        "y up, z backward; Blender, nerfstudio and USD too).",
+        "Axes in matrix or quaternion: opencv (x right, y down, z forward; the default) or opengl (x right, y up, z backward; also "
+        "Blender, nerfstudio, USD).",
         choices=(OPENCV, OPENGL),
     )
 
@@ -73,62 +73,58 @@ class Jitter:
     Components are independent. Normal distributions are cut at three standard deviations. Not in the paper.
     """
 
-    position: Annotated[Distribution, Within(-10.0, 10.0, "m")] = setting(
-        _NONE, "Offset of the position along each axis of the frame of the pose."
-    )
-    rotation: Annotated[Distribution, Within(-90.0, 90.0, "°")] = setting(
-        _NONE, "Components of a rotation vector in the camera's axes, by which the camera is turned."
-    )
+    position: Annotated[Distribution, Within(-10.0, 10.0, "m")] = setting(_NONE, "Offset of the position along each axis.")
+    rotation: Annotated[Distribution, Within(-90.0, 90.0, "°")] = setting(_NONE, "Components of a rotation vector in the camera's axes.")
     focal_length: Annotated[Distribution, Within(-0.9, 9.0)] = setting(_NONE, "Relative change of fx and fy, such as 0.01 for 1 % more.")
     center: Annotated[Distribution, Within(-8192.0, 8192.0, "px")] = setting(_NONE, "Offset of cx and of cy.")
 
 
 @dataclass(frozen=True)
 class CameraRow:
-    """A camera. The tables replace [cameras]; pixel centres are at +0.5: add 0.5 to cx and cy of OpenCV and ROS, which have integers."""
+    """A camera. The tables replace [cameras]. Pixel centres are at +0.5: add 0.5 to cx and cy of OpenCV and ROS."""
 
     REQUIRED: ClassVar = ("pose",)
-    name: str = setting("", "Name in the files of a data set: lower-case letters, digits and underscores; empty: camera_0 and so on.")
+    name: str = setting("", "Name of lower-case letters, digits and underscores; empty: camera_0 and so on.")
     resolution: Annotated[tuple[int, int] | None, Within(1, 8192, "px")] = setting(
         None, "Image width and height; not given: cameras.resolution."
     )
     fov: Annotated[float | None, Within(1.0, 170.0, "°")] = setting(
-        None, "Horizontal field of view, with square pixels and the principal point in the middle."
+        None, "Horizontal field of view: square pixels, principal point in the middle."
     )
     matrix: Annotated[
         tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None,
         Within(-MAX_NUMBER, MAX_NUMBER, "px"),
     ] = setting(None, "Camera matrix with fx, fy, cx and cy, instead of fov.")
     distortion: Annotated[tuple[float, ...] | None, Within(-MAX_NUMBER, MAX_NUMBER)] = setting(
-        None, "Distortion of the lens by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
+        None, "OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
     )
     model: str | None = setting(None, "Distortion model, pinhole unless it is given.", choices=MODELS)
     file: str | None = setting(
         None,
-        "Calibration file of OpenCV, ROS, Kalibr, BOP, COLMAP, nerfstudio, Open3D, RealSense or Zivid, or cam_K.txt, instead of matrix, "
-        "distortion and resolution.",
+        "Calibration file of OpenCV, ROS, Kalibr, BOP, COLMAP, nerfstudio, Open3D, RealSense, Zivid, or cam_K.txt, instead of matrix, "
+        "distortion, resolution.",
         path=True,
     )
     scale: Annotated[float | None, above(0.0, 1.0)] = setting(
         None,
-        "Factor on the size of the images, and on the camera matrix with it, such as 0.25 for pictures scaled to a quarter; not given: 1.",
+        "Factor on image size and camera matrix, such as 0.25 for a quarter; not given: 1.",
     )
     sensor: str | None = setting(None, "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
     pixel_center: Annotated[float | None, Within(unit="px")] = setting(
-        None, "Where the given matrix or file has the centre of the first pixel, 0 or 0.5; not given: 0.5, and in a file its format's."
+        None, "Centre of the first pixel in the given matrix or file, 0 or 0.5; not given: 0.5, of a file its format's."
     )
     pose: Pose = setting(Pose(), "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
     fixed_to: str | None = setting(
         None,
-        "What carries the camera: the world, unless it is given, or the gripper (eye-in-hand). The pose is then in the frame of its shaft, "
-        "whose origin is on the wrist axis, z up.",
+        "What carries the camera: the world (default), or the gripper (eye-in-hand; the pose is in the frame of its shaft, whose origin "
+        "is on the wrist axis, z up).",
         choices=(WORLD, GRIPPER),
     )
     modalities: tuple[str, ...] | None = setting(
-        None, "Images in its files: any of the allowed names, of layers those in render.layers; not given: all.", choices=MODALITIES
+        None, "Images in its files, of layers those in render.layers; not given: all.", choices=MODALITIES
     )
     every: Annotated[int | None, Within(1, 1000, "frames")] = setting(
-        None, "Frames from one picture to the next, of which the first is that of frame 0; not given: 1."
+        None, "Frames from one picture to the next, from frame 0; not given: 1."
     )
     jitter: Jitter | None = setting(
         None, "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution."

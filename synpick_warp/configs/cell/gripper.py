@@ -35,11 +35,9 @@ _LITRES_PER_MINUTE = 1e-3 / 60.0
 
 @dataclass(frozen=True)
 class Gripper:
-    """The gripper: a conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
+    """A conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
 
-    kind: str = setting(
-        SUCTION1, "Kind of gripper: suction1 (one cup) or suction_array (a plate with the cups of gripper.cups).", choices=GRIPPERS
-    )
+    kind: str = setting(SUCTION1, "suction1 (one cup) or suction_array (a plate with gripper.cups).", choices=GRIPPERS)
     cups: Annotated[tuple[tuple[float, float], ...], Within(-0.5, 0.5, "m")] = setting(
         (),
         "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
@@ -47,13 +45,13 @@ class Gripper:
     )
     valve: str = setting(
         EACH,
-        "Vacuum of a suction_array: each (a valve for each cup) or common (one for all: if one leaks or breaks off, all seals are poor).",
+        "Valve of a suction_array: each (one per cup) or common (if one cup leaks or breaks off, all seals are poor).",
         choices=(EACH, COMMON),
     )
     mesh: str = setting(
         "",
-        "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) of the body of a suction_array: origin on the wrist axis, which is "
-        "y, cups towards -z. Empty: a plate.",
+        "Mesh (.stl, .ply, .obj, .glb, .gltf, .step) of a suction_array's body: origin on the wrist axis, which is y, cups towards -z. "
+        "Empty: a plate.",
         path=True,
     )
     mesh_unit: str = setting("m", "Unit of that mesh.", choices=tuple(UNITS))
@@ -62,7 +60,7 @@ class Gripper:
     finger_width: Annotated[float, Within(0.005, 1.0, "m")] = setting(0.075, "Diameter of the shaft at its top.")
     cup_width: Annotated[float, Within(0.005, 0.5, "m")] = setting(0.042, "Diameter of the suction cup.")
     cup_length: Annotated[float, Within(0.005, 0.5, "m")] = setting(
-        0.055, "Distance from the wrist axis to the tool centre point (TCP) at the cup's lip."
+        0.055, "Distance from the wrist axis to the tool centre point (TCP), the cup's lip."
     )
     finger_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(1.5, "Mass of the shaft.")
     cup_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(0.5, "Mass of the cup.")
@@ -78,31 +76,29 @@ class Gripper:
 
 @dataclass(frozen=True)
 class Suction:
-    """The suction cup: seal test by rays, and the compliant constraint (spring-damper) that holds attached objects."""
+    """The suction cup: seal test by rays, and a spring-damper that holds attached objects."""
 
     rays: Annotated[int, Within(3, 64)] = setting(10, "Rays of the seal test, on a circle at the cup's lip (paper).")
     vacuum: Annotated[float | None, above(0.0, _ATMOSPHERE, "kPa")] = setting(
         None,
-        "Vacuum below a tight cup, such as 60: seals then follow from physics. A seal breaks at the vacuum times the area of the mouth "
-        "that the object covers, less what leaks take. Rays meet the mesh, on the lip and within; it sets radius, rays, surface and break "
-        "forces. Not given: good_force and poor_force, whatever the cup (paper).",
+        "Vacuum below a tight cup, such as 60: a seal then breaks at the vacuum, less leaks, times the covered area of the mouth; it sets "
+        "radius, rays, surface and break forces. Not given: good_force and poor_force (paper).",
     )
     flow: Annotated[float | None, Within(0.1, 1e5, "l/min")] = setting(
         None,
-        "Suction rate of the ejector with an open cup, 40 unless given. Air that enters through holes, beside the object or below the lip "
-        "lowers the vacuum: linear characteristic, orifice with a discharge coefficient of 0.62. Small ejectors have 10 to 80; Schmalz "
-        "lists 8.3 for airtight parts and cups of up to 60 mm.",
+        "Suction rate of the ejector with an open cup, 40 unless given; small ejectors have 10 to 80. Linear characteristic, orifices "
+        "with a discharge coefficient of 0.62.",
     )
     compliance: Annotated[float | None, Within(0.0, 1.0)] = setting(
         None,
-        "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: a ball seals if its cap below the lip "
-        "is no higher, so with a radius of 1.3 cups; with 0.05, as of a flat cup, of 2.5.",
+        "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: balls from a radius of 1.3 cups seal; "
+        "with 0.05, as of a flat cup, of 2.5.",
     )
     radius: Annotated[float, above(0.0, 0.25, "m")] = setting(0.01, "Radius of that circle (released).")
     reach: Annotated[float, above(0.0, 1.0, "m")] = setting(0.03, "Length of the rays (paper).")
     surface: str = setting(
         "hull",
-        "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh: a pitcher is open).",
+        "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh).",
         choices=("hull", "mesh"),
     )
     tolerated_misses: Annotated[int, Within(0, INT32_MAX)] = setting(
@@ -117,9 +113,7 @@ class Suction:
     twist_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(50.0, "Torsional stiffness about the cup's axis.")
     twist_damping: Annotated[float, Within(0.0, 1e5, "N·m·s/rad")] = setting(0.1, "Angular damping of twist and swing.")
     swing_limit: Annotated[float, Within(0.0, 90.0, "°")] = setting(5.0, "Angle by which an attached object may swing freely (released).")
-    swing_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(
-        50.0, "Stiffness against swing beyond that angle; with 10, an object of 1.1 kg that hangs by its end swings by 18°."
-    )
+    swing_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(50.0, "Stiffness against swing beyond that angle.")
 
     @property
     def mouth_rays(self) -> int:

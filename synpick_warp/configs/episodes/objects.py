@@ -117,8 +117,8 @@ class Objects:
 
     embedded: tuple[str, ...] = setting(
         (HOUSEHOLD,),
-        "Sets of embedded objects, where bake.models is empty: household (21, like those of YCB-Video), industrial (bolt, nut, bracket, "
-        "pipe_tee, gear, sheet_part, box).",
+        "Embedded objects, where bake.models is empty: household (21, like those of YCB-Video), industrial (bolt, nut, bracket, pipe_tee, "
+        "gear, sheet_part, box).",
         choices=EMBEDDED,
     )
     unit: str = setting(
@@ -128,7 +128,7 @@ class Objects:
     )
     hull_vertices: Annotated[int, Within(8, 256)] = setting(
         64,
-        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.5 mm outside.",
+        "Maximum vertices of a convex hull.",
     )
     piece_vertices: Annotated[int, Within(8, 256)] = setting(32, "Maximum vertices of each piece of a convex decomposition.")
     pieces: Annotated[int, Within(1, 64)] = setting(16, "Maximum pieces of a convex decomposition.")
@@ -136,65 +136,54 @@ class Objects:
         0.05, "CoACD's concavity threshold; smaller values follow the surface more closely."
     )
     decomposition_time: Annotated[float, above(0.0, 86400.0, "s")] = setting(
-        1800.0, "Limit of processor time of a convex decomposition; an object that takes longer is an error."
+        1800.0, "Maximum processor time of a convex decomposition; longer is an error."
     )
     concave_ratio: Fraction = setting(
         0.6,
-        "Objects whose row does not say whether they are concave are decomposed if 1 - depth is below this. Depth is that of the convex "
-        "hull above the surface, at most, in halves of the hull's thickness: 0 of a hollow ball, 0.8 of a tube, above 1 of a bowl, of a "
-        "bracket, and of a plate with holes as wide as it is thick.",
+        "Objects whose row does not say whether they are concave are decomposed if 1 - depth is below this. Depth: largest distance of "
+        "the convex hull from the surface, in halves of the hull's thickness (hollow ball 0, tube 0.8, bowl or bracket above 1).",
     )
-    strict: bool = setting(
-        False, "End the bake at the first object or light map that cannot be used, instead of leaving it out with a line."
-    )
+    strict: bool = setting(False, "End the bake at the first object or light map that cannot be used, instead of leaving it out.")
     density: Annotated[float, above(0.0, 1e5, "kg/m³")] = setting(
-        400.0, "Density of objects without a mass; where it is not set, their mass is a guess, which is told."
+        400.0, "Density of objects without a mass; not set: the mass is a guess, and named as one."
     )
     mass_volume: str = setting(
         HULL,
-        "Volume that the density is multiplied by: hull, that of the convex hull, or mesh, that of the mesh where it is watertight, and of "
-        "the collision shape elsewhere. Where density is set and this is not: mesh.",
+        "Volume for the density: hull (convex hull) or mesh (where it is watertight, else the collision shape; the default where density "
+        "is set).",
         choices=(HULL, MESH),
     )
     metallic: Fraction = setting(0.1, "Metallic factor of objects whose material names none.")
     roughness: Fraction = setting(0.5, "Roughness of objects whose material names none.")
     crease_angle: Annotated[float, Within(0.0, 180.0, "°")] = setting(
         35.0,
-        "Meshes without normals are smooth where triangles meet at up to this angle, and have a sharp edge beyond; 180: smooth all over.",
+        "Meshes without normals are smooth where triangles meet at up to this angle; 180: all over.",
     )
-    center: bool = setting(
-        False, "Move the centre of each mesh's bounding box to its origin; BOP models, whose poses refer to their origin, stay as they are."
-    )
+    center: bool = setting(False, "Move the centre of each mesh's bounding box to its origin, except of BOP models.")
     symmetries: str = setting(
         DECLARED,
-        "Symmetries of objects: declared (those of their rows, else of models_info.json), or detect (of objects that declare none, by the "
-        "shape alone: texture does not count).",
+        "Symmetries: declared (of their rows, else of models_info.json), or detect (of objects that declare none, by shape alone).",
         choices=SYMMETRIES,
     )
     symmetry_tolerance: Annotated[float, Within(1e-3, 0.2)] = setting(
         0.03,
-        "Largest distance between a surface and its rotated self for the rotation to be detected as a symmetry, in diameters (BOP's "
-        "organizers took 0.1, at least 15 mm, and left out what texture tells apart).",
+        "Largest distance between a surface and its rotated self for a detected symmetry, in diameters (BOP: 0.1, at least 15 mm).",
     )
     diameter_tolerance: Annotated[float, above(0.0, 1.0)] = setting(
         0.1,
-        "Largest relative difference between a model's diameter and that of its row in the object table; with more, the row is not used.",
+        "Largest relative difference between a model's diameter and that of its row; with more, the row is not used.",
     )
 
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """A row of the object table: physical and material properties that model files do not contain."""
+    """Physical and material properties that model files do not contain."""
 
     REQUIRED: ClassVar = ("id", "diameter")
     IDENTITY: ClassVar = ("id", "name", "diameter", "symmetries_discrete", "symmetries_continuous")
     id: Annotated[int, Within(0, INT32_MAX)] = setting(0, "The model's obj_id in its BOP folder.")
-    name: str = setting(
-        "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
-    )
-    diameter: Annotated[float, Within(0.0, unit="m")] = setting(
-        0.0, "Diameter of the model, which must agree for the row to be used; 0: any."
-    )
+    name: str = setting("", "Name; of meshes that are not BOP models the file name without suffix.")
+    diameter: Annotated[float, Within(0.0, unit="m")] = setting(0.0, "Diameter of the model, which must agree; 0: any.")
     mass: Annotated[float | None, above(0.0, unit="kg")] = setting(None, "Mass; not given: by objects.density.")
     concave: bool | None = setting(
         None, "Use a convex decomposition as collision shape instead of the convex hull; not given: by objects.concave_ratio."

@@ -155,70 +155,62 @@ _STRENGTH, _TEMPERATURE = Distribution(LOG_UNIFORM, ((0.1,), (1.0,))), Distribut
 
 @dataclass(frozen=True)
 class Randomize:
-    """Domain randomization: each episode draws these anew, all off by default. Geometry and labels depend on none but the distractors.
-    Lamps are drawn for each variant of an environment map, of which each episode draws one.
-
-    A distribution is a value, or `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`, `{ normal = [mean, sigma] }` (clamped to
-    what is allowed) or `{ choice = [...], weights = [...] }`. Not in the paper.
+    """Domain randomization: each episode draws these anew, all off by default. Of these only distractors change geometry and labels. A
+    distribution is a value, or `{ uniform = [low, high] }`, `{ log_uniform = [low, high] }`, `{ normal = [mean, sigma] }` (clamped) or `{
+    choice = [...], weights = [...] }`. Not in the paper.
     """
 
-    object_hue: Annotated[Distribution, Within(-180.0, 180.0, "°")] = setting(
-        _NONE, "Rotation of the hue of each object's base colour and texture."
-    )
+    object_hue: Annotated[Distribution, Within(-180.0, 180.0, "°")] = setting(_NONE, "Rotation of the hue of each object.")
     object_brightness: Annotated[Distribution, Within(0.05, 20.0)] = setting(
-        _NONE, "Factor on the base colour of each object, in linear light; the result is clamped to 1."
+        _NONE, "Factor on the base colour of each object, in linear light."
     )
-    object_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of each object, in place of its own.")
-    object_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of each object, in place of its own.")
+    object_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of each object.")
+    object_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of each object.")
     bin_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
         _NO_COLOR, "Base colour of the bin; with a texture, its factor."
     )
     bin_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the bin.")
     bin_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of the bin.")
-    bin_textures: str = setting("", "Folder of images, one of which each episode draws as the bin's texture; empty: none.", path=True)
+    bin_textures: str = setting("", "Folder of images: each episode draws the bin's texture; empty: none.", path=True)
     table_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
         _NO_COLOR, "Base colour of the table; with a texture, its factor."
     )
     table_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the table.")
-    table_textures: str = setting("", "Folder of images, one of which each episode draws as the table's texture; empty: none.", path=True)
+    table_textures: str = setting("", "Folder of images: each episode draws the table's texture; empty: none.", path=True)
     background_textures: str = setting(
         "",
-        "Folder of images, one of which each episode draws as the texture of a floor, which is seen beyond the edge of the table "
-        "(render.table_size); empty: the environment map is seen there.",
+        "Folder of images: each episode draws the texture of a floor beyond the edge of the table (render.table_size); empty: the "
+        "environment map is seen there.",
         path=True,
     )
     surfaces: Annotated[int, Within(0, MOST_CHOICES // 2)] = setting(
         0,
-        "Procedural textures (carpet, boards, checks, print, clutter) of table and floor, beside those of folders. With them, "
-        "distractors of no folder are geometric solids with such textures.",
+        "Procedural textures (carpet, boards, checks, print, clutter) of table, floor and geometric distractors, beside those of folders.",
     )
     texture_width: Annotated[Distribution, Within(0.01, 100.0, "m")] = setting(
         _HALF_METRE, "Width of one repeat of the textures of bin, table and floor."
     )
     lamps: Annotated[Distribution, Within(0, 4)] = setting(
-        _NONE, "Number of lamps besides an environment map, rounded: distant discs, which cast soft shadows."
+        _NONE, "Number of lamps besides an environment map, rounded: distant discs with soft shadows."
     )
-    lamp_variants: Annotated[int, Within(1, 64)] = setting(4, "With lamps: variants of each environment map, each with lamps of its own.")
+    lamp_variants: Annotated[int, Within(1, 64)] = setting(4, "Variants of each environment map, each with lamps of its own.")
     lamp_elevation: Annotated[Distribution, Within(10.0, 90.0, "°")] = setting(_ELEVATION, "Height of each lamp above the horizon.")
     lamp_radius: Annotated[Distribution, Within(0.3, 20.0, "°")] = setting(_RADIUS, "Angular radius of each lamp.")
     lamp_strength: Annotated[Distribution, Within(0.01, 100.0)] = setting(
-        _STRENGTH, "Light of each lamp on a surface that faces up, relative to that of the map."
+        _STRENGTH, "Light of each lamp on a surface that faces up, relative to the map's."
     )
     lamp_temperature: Annotated[Distribution, Within(1700.0, 25000.0, "K")] = setting(_TEMPERATURE, "Colour temperature of each lamp.")
     distractors: Annotated[Distribution, Within(0, MOST_DISTRACTORS)] = setting(
         _NONE,
-        "Number of distractors, rounded: objects in the pile that are rendered and occlude others, but have no labels and are no targets. "
-        "They count towards arrangement.max_objects.",
+        "Number of distractors, rounded: objects in the pile without labels, which are no targets. They count towards "
+        "arrangement.max_objects.",
     )
     distractor_models: str = setting(
         "",
-        "Folder of distractors, as bake.models, without those that have a name or the shape of a labelled object, in any size; empty: "
-        "geometric solids.",
+        "Folder of distractors, as bake.models, without those of a labelled object's name or shape; empty: geometric solids.",
         path=True,
     )
-    exposure: Annotated[Distribution, Within(-5.0, 5.0, "EV")] = setting(
-        _NONE, "Exposure offset, in place of what render.exposure_spread draws."
-    )
+    exposure: Annotated[Distribution, Within(-5.0, 5.0, "EV")] = setting(_NONE, "Exposure offset, in place of render.exposure_spread.")
 
     @property
     def most_distractors(self) -> int:
