@@ -79,7 +79,7 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
 def _allowed(item: Setting) -> str:
     """What a setting allows, beyond what its default shows: an interval with its unit, or words."""
     low, high, above = (None if bound is None else f"{bound:.10g}" for bound in (item.bounds.low, item.bounds.high, item.bounds.above))
-    if (item.kind in (bool, str) and not item.choices) or item.path:
+    if (item.kind in (bool, str) and not item.choices and item.default is not None) or item.path:
         return "a path" if item.path else ""
     if item.allowed or (low or high or above) is None:
         return describe_allowed(item) + f" [{item.unit}]" * bool(item.unit)
