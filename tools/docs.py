@@ -34,7 +34,7 @@ _SETTINGS_HEAD = """# Reference of the settings
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
 
 What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out. Paths in
-a file are relative to it.
+a file are relative to it. Choices stand in the meaning.
 """
 _SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensor_presets.py`."
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
@@ -45,7 +45,7 @@ def settings_reference() -> str:
     parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
     parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
-    lines = ["key | default | allowed | meaning", "---|---|---|---"]
+    lines = ["key | default, allowed | meaning", "---|---|---"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
     return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
 
@@ -66,13 +66,13 @@ def _anchor(title: str) -> str:
 
 def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
-    lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | | **{" ".join((kind.__doc__ or "").split())}**']
+    lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | **{" ".join((kind.__doc__ or "").split())}**']
     for name, item in settings_of(kind).items():
         if is_table(item.kind):
             lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
             continue
         default = "" if item.default is None else f"`{format_toml(item.default)}`"
-        lines.append(f"`{prefix}{name}` | {default} | {_allowed(item)} | {item.doc}")
+        lines.append(f"`{prefix}{name}` | {', '.join(filter(None, (default, _allowed(item))))} | {item.doc}")
     return lines
 
 
@@ -81,6 +81,8 @@ def _allowed(item: Setting) -> str:
     low, high, above = (None if bound is None else f"{bound:.10g}" for bound in (item.bounds.low, item.bounds.high, item.bounds.above))
     if (item.kind in (bool, str) and not item.choices and item.default is not None) or item.path:
         return "a path" if item.path else ""
+    if item.choices and all(choice in item.doc for choice in item.choices):
+        return ""
     if item.allowed or (low or high or above) is None:
         return describe_allowed(item) + f" [{item.unit}]" * bool(item.unit)
     interval = f"({above}" if above is not None else f"[{low}" if low is not None else "(-∞"
