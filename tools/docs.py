@@ -45,7 +45,7 @@ def settings_reference() -> str:
     parts = {f"[{name}]": (kind, f"{name}.") for name, kind in sections().items()}
     parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
-    lines = ["key | default, allowed | meaning", "---|---|---"]
+    lines = ["key | default; allowed | meaning", "---|---|---"]
     lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
     return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
 
@@ -72,7 +72,7 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
             lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
             continue
         default = "" if item.default is None else f"`{format_toml(item.default)}`"
-        lines.append(f"`{prefix}{name}` | {', '.join(filter(None, (default, _allowed(item))))} | {item.doc}")
+        lines.append(f"`{prefix}{name}` | {'; '.join(filter(None, (default, _allowed(item))))} | {item.doc}")
     return lines
 
 
