@@ -37,6 +37,8 @@ What they are for: the [guide](README.md). Ranges are intervals, of each number 
 a file are relative to it. Choices stand in the meaning.
 """
 _SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensor_presets.py`."
+_MEASURED = "measured"
+"""Table of a bin that users do not set."""
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 
 
@@ -68,6 +70,9 @@ def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
     """Rows of a section: its title and meaning, then its settings."""
     lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | **{" ".join((kind.__doc__ or "").split())}**']
     for name, item in settings_of(kind).items():
+        if name == _MEASURED:
+            lines.append(f"`{name}` | | What the program measures of the mesh, and writes.")
+            continue
         if is_table(item.kind):
             lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
             continue
