@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Mode
 from synpick_warp.factory.assembly import make_renderer
@@ -22,6 +23,7 @@ from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.probe import probe
 from tests.twins import planning
+from tests.twins.raycast import rotation_of
 from tests.worlds.kernel_worlds import KernelWorlds, filled
 from tests.worlds.toy_scene import ToyScene, ball, box, build_scene, camera, entry, flat_shaded, sheet, snapshot
 
@@ -136,18 +138,13 @@ def axis_angle(axis: tuple[float, float, float], angle: float) -> tuple[float, .
     return (*(np.sin(angle / 2) * np.array(axis)), np.cos(angle / 2))
 
 
-def rotated(quaternion: tuple[float, ...], vector: tuple[float, ...]) -> np.ndarray:
-    cross = 2 * np.cross(quaternion[:3], vector)
-    return vector + quaternion[3] * cross + np.cross(quaternion[:3], cross)
-
-
 def test_the_normal_and_the_point_of_tilted_planes(device):
     """Sheets in five poses: the normal is the sheet's z axis, and the grasp point lies on the sheet."""
     poses = [(0.02 * i, 0.01 * i, 0.1 * i, *axis_angle((np.cos(i), np.sin(i), 0.0), 0.25 * i)) for i in range(5)]
     harness = GraspHarness(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)] for pose in poses], (VIEW,)))
     plan = harness.plan_grasps()
     for i, pose in enumerate(poses):
-        normal = rotated(pose[3:], (0.0, 0.0, 1.0))
+        normal = rotation_of(pose[3:])[:, 2]
         # A sum of 441 normals in float32.
         np.testing.assert_allclose(plan.normal.numpy()[i], normal, atol=5e-6)
         assert abs((plan.point.numpy()[i] - pose[:3]) @ normal) < 5e-6
@@ -229,15 +226,10 @@ def test_worlds_without_a_target_and_unused_views_keep_their_plan(device):
         assert (array.numpy()[1] != 5.0).all()
 
 
-def turned(yaw: float, lean: float) -> tuple[float, ...]:
-    """Pose of a sheet about the origin: leaning about its long axis x, which points along `yaw`; angles [°]."""
-    half, other = np.radians(yaw) / 2, np.radians(lean) / 2
-    return (0, 0, 0, np.cos(half) * np.sin(other), np.sin(half) * np.sin(other), np.sin(half) * np.cos(other), np.cos(half) * np.cos(other))
-
-
 def test_two_cups_turn_along_a_narrow_sheet(device):
     """Also where it leans to its side by less than the free swing; by more, they meet the normal, and do not fit."""
-    poses = [turned(30, 0), turned(-65, 0), turned(30, 3), turned(120, 12)]
+    angles = ((30, 0), (-65, 0), (30, 3), (120, 12))  # Of the long axis x, then the lean about it [°].
+    poses = [(0, 0, 0, *Rotation.from_euler("ZX", pair, degrees=True).as_quat()) for pair in angles]
     toy = ToyScene([entry(sheet(0.2, 0.04))], [[(0, pose)] for pose in poses], (camera(320, 240, 1600.0, (0.0, 0.0, 2.0)),))
     planned = GraspHarness(device, toy).plan_grasps()
     harness = GraspHarness(device, toy, cups=((-0.06, 0.0), (0.06, 0.0)))

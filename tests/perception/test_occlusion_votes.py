@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.codes import MAX_INSTANCES, Mode
 from tests.twins import planning
-from tests.twins.planning import PlannerHarness, paint, paint_shapes
+from tests.twins.planning import PlannerHarness, mosaic, paint, paint_shapes
 
 HIGH, LOW, LOWEST = 1.8, 1.9, 2.0
 
@@ -20,19 +21,20 @@ def harness_of(device, *pictures, instances: int = 5, **options) -> PlannerHarne
 # ---- votes ----
 
 
-def test_a_nearer_neighbour_gets_a_vote_for_every_point_of_the_border(device):
-    """The lower object borders on the upper one in rows 20 to 59; a border with the background yields no votes."""
-    votes = harness_of(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])).votes()[0]
-    expected = np.zeros((5, 5))
-    expected[0, 1] = 40
-    np.testing.assert_array_equal(votes, expected)
-
-
-def test_neighbours_on_both_sides_of_a_thin_part_get_their_own_votes(device):
-    """At a width of five pixels, the normals of the two sides must not be confused."""
-    votes = harness_of(device, paint([(40, 20, 44, 59, LOW), (45, 10, 80, 69, HIGH), (5, 30, 39, 49, HIGH)])).votes()[0]
-    np.testing.assert_array_equal(votes[0, :3], [0, 40, 20])
-    assert (votes[1:] == 0).all()
+@pytest.mark.parametrize(
+    ("rectangles", "expected"),
+    [
+        pytest.param([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)], {(0, 1): 40}, id="a vote a point of the border, none beside nothing"),
+        pytest.param(
+            [(40, 20, 44, 59, LOW), (45, 10, 80, 69, HIGH), (5, 30, 39, 49, HIGH)],
+            {(0, 1): 40, (0, 2): 20},
+            id="the normals of the two sides of a part of five pixels are not confused",
+        ),
+    ],
+)
+def test_known_votes(device, rectangles, expected):
+    votes = harness_of(device, paint(rectangles)).votes()[0]
+    assert {pair: votes[pair] for pair in zip(*np.nonzero(votes), strict=True)} == expected
 
 
 def test_part_thinner_than_the_offset_yields_too_few_votes(device):
@@ -164,22 +166,17 @@ def test_neighbour_without_contour_points_is_within_reach(device):
 # ---- which views ----
 
 
-def test_unused_views_write_nothing(device):
+def test_unused_views_write_nothing_and_others_clear_earlier_votes(device):
     picture = paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])
     harness = harness_of(device, picture, picture)
     harness.images.views.world.assign(np.array([-1, 0]))
     harness.observation.votes.fill_(7.0)
     votes = harness.votes()
-    assert votes[0, 0, 1] == 40
+    assert (votes[0].sum(), votes[0, 0, 1]) == (40, 40)
     assert (votes[1] == 7.0).all()
     harness.observation.above.fill_(3)
     harness.planner.order_clutter(harness.scene, harness.observation)
     assert harness.observation.above.numpy()[..., 0].tolist() == [[2, 0, 0, 0, 0], [3] * 5]
-
-
-def test_votes_of_an_earlier_observation_are_cleared(device):
-    harness = harness_of(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]))
-    np.testing.assert_array_equal(harness.votes().copy(), harness.votes())
 
 
 def test_votes_equal_the_reference(device):
@@ -203,51 +200,45 @@ def test_votes_equal_the_reference(device):
     assert (planning.votes(harness, 10.0) != expected).sum() > 5
 
 
+def test_votes_among_many_instances_equal_the_reference(device):
+    ids = mosaic(MAX_INSTANCES, 300, 200, 2)
+    depth = np.where(ids < 0, 2.5, 2.0 + 0.003 * (ids * 37 % MAX_INSTANCES)).astype(np.float32)
+    harness = PlannerHarness(device, [ids], [depth], MAX_INSTANCES)
+    votes = harness.votes()
+    np.testing.assert_allclose(votes, planning.votes(harness, 10.0), rtol=1e-6)
+    assert (votes[0] > 0).sum() > 300
+
+
 # ---- stacks ----
 
 
-def order_of(device, picture, instances: int) -> tuple[PlannerHarness, list[set[int]]]:
-    harness = harness_of(device, picture, instances=instances)
+@pytest.mark.parametrize(
+    ("rectangles", "above", "chosen"),
+    [
+        pytest.param([(20, 20, 80, 70, LOW), (40, 30, 60, 80, HIGH)], [{1}, set()], (1, 0), id="two"),
+        # Only outer contours are followed, as in the paper.
+        pytest.param([(20, 20, 80, 70, LOW), (40, 30, 60, 50, HIGH)], [set(), set()], (0, 1), id="one inside the outer contour"),
+        # 0 lies on 2, which lies on 1; 0 does not touch 1.
+        pytest.param(
+            [(70, 30, 100, 60, HIGH), (10, 20, 40, 70, LOWEST), (30, 35, 80, 55, LOW)], [set(), {0, 2}, {0}], (0, 1), id="three in a row"
+        ),
+        # 0 and 4 lie side by side on plate 3, across its edge; 2 lies across both; 1 lies alone and is smaller than 2.
+        pytest.param(
+            [(10, 30, 35, 70, LOW), (95, 10, 110, 20, LOWEST), (20, 45, 70, 60, HIGH), (15, 40, 90, 85, LOWEST), (50, 30, 75, 70, LOW)],
+            [{2}, set(), set(), {0, 2, 4}, {2}],
+            (2, 3),
+            id="five",
+        ),
+    ],
+)
+def test_known_stacks(device, rectangles, above, chosen):
+    """What lies above each object, and the targets in the modes PICK and TARGET."""
+    harness = harness_of(device, paint(rectangles), instances=len(rectangles))
     _, paths = harness.graph()
-    return harness, [set(np.flatnonzero(row).tolist()) for row in paths[0]]
-
-
-def choices(harness: PlannerHarness) -> tuple[int, int]:
-    """Targets in the modes PICK and TARGET."""
-    chosen = []
-    for mode in (1, 2):
+    assert [set(np.flatnonzero(row).tolist()) for row in paths[0]] == above
+    for mode, target in zip((Mode.PICK, Mode.TARGET), chosen, strict=True):
         harness.worlds.state.mode.fill_(mode)
-        chosen.append(harness.choose()[0])
-    return tuple(chosen)
-
-
-def test_a_stack_of_two(device):
-    harness, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 80, HIGH)]), 2)
-    assert above == [{1}, set()]
-    assert choices(harness) == (1, 0)
-
-
-def test_object_inside_the_outer_contour_of_another_gets_no_votes(device):
-    """Only outer contours are followed, as in the paper: an object on the middle of a larger one gets no votes."""
-    harness, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 50, HIGH)]), 2)
-    assert above == [set(), set()]
-    assert choices(harness) == (0, 1)
-
-
-def test_a_stack_of_three_in_a_row(device):
-    """0 lies on 2, which lies on 1; 0 does not touch 1."""
-    harness, above = order_of(device, paint([(70, 30, 100, 60, HIGH), (10, 20, 40, 70, LOWEST), (30, 35, 80, 55, LOW)]), 3)
-    assert above == [set(), {0, 2}, {0}]
-    assert choices(harness) == (0, 1)
-
-
-def test_a_stack_of_five(device):
-    """0 and 4 lie side by side on plate 3, across its edge; 2 lies across both; 1 lies alone and is small."""
-    plate, across, alone = (15, 40, 90, 85, LOWEST), (20, 45, 70, 60, HIGH), (95, 10, 110, 20, LOWEST)
-    harness, above = order_of(device, paint([(10, 30, 35, 70, LOW), alone, across, plate, (50, 30, 75, 70, LOW)]), 5)
-    assert above == [{2}, set(), set(), {0, 2, 4}, {2}]
-    # Nothing is above 1 and 2; 2 has the larger visible fraction.
-    assert choices(harness) == (2, 3)
+        assert harness.choose() == [target]
 
 
 def test_a_cycle_of_three_is_broken_at_its_weakest_edge(device):

@@ -7,18 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Mode, Outcome, Phase, Stream
+from synpick_warp.codes import MAX_INSTANCES, Mode, Outcome, Phase, Stream
+from synpick_warp.stages.arrays import count_words
 from tests.twins import planning, rng
 from tests.twins.planning import PlannerHarness
 
-EMPTY = np.full((4, 4), -1), np.ones((4, 4))
 SEED = 9
 
 
 def harness_of(device, visible, fraction, ancestors) -> PlannerHarness:
     """One world and one view a row."""
     visible = np.atleast_2d(visible)
-    harness = PlannerHarness(device, [EMPTY[0]] * len(visible), [EMPTY[1]] * len(visible), visible.shape[1])
+    harness = PlannerHarness.unseen(device, *visible.shape)
     harness.observation.visible.assign(visible)
     harness.observation.visible_fraction.assign(np.atleast_2d(fraction))
     harness.observation.ancestors.assign(np.reshape(ancestors, harness.observation.ancestors.shape).astype(np.uint32))
@@ -61,10 +61,13 @@ def test_a_failure_weighs_as_an_object_above_or_more_than_all_since_the_last_suc
     assert (choose(harness, Mode.PICK), choose(harness, Mode.TARGET)) == ([picked], [targeted])
 
 
-def test_more_than_sixteen_ancestors(device):
-    harness = harness_of(device, [1] * 32, [0.5] * 32, [0xFFFFFFFE] + [0x7FFF0000] * 31)
-    assert choose(harness, Mode.TARGET) == [0]
-    assert choose(harness, Mode.PICK) == [1]
+def test_ancestors_of_all_words_count(device):
+    """Instance i has i ancestors, the last ones."""
+    there = np.arange(MAX_INSTANCES)[None, :] >= MAX_INSTANCES - np.arange(MAX_INSTANCES)[:, None]
+    octets = np.packbits(np.pad(there, ((0, 0), (0, 32 * count_words(MAX_INSTANCES) - MAX_INSTANCES))), axis=1, bitorder="little")
+    harness = harness_of(device, [1] * MAX_INSTANCES, [0.5] * MAX_INSTANCES, octets.view(np.uint32))
+    assert choose(harness, Mode.PICK) == [0]
+    assert choose(harness, Mode.TARGET) == [MAX_INSTANCES - 1]
 
 
 @given(rows=st.lists(st.tuples(st.integers(0, 1), st.sampled_from([0.2, 0.4, 0.9]), st.integers(0, 15)), min_size=1, max_size=6))

@@ -52,6 +52,16 @@ def paint_shapes(shapes: list[tuple[np.ndarray, tuple[float, float, float]]], he
     return ids, depth.astype(np.float32)
 
 
+def mosaic(count: int, width: int, height: int, seed: int) -> np.ndarray:
+    """Voronoi cells of random points as ids (H, W), some of them in no place; -1: between them."""
+    numbers = np.random.default_rng(seed)
+    points = numbers.uniform((0, 0), (width, height), (count, 2))
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    away = np.hypot(columns[..., None] - points[:, 0], rows[..., None] - points[:, 1])
+    nearest = np.argmin(away, axis=-1)
+    return np.where(np.min(away, axis=-1) < 0.045 * width, numbers.permutation(count)[nearest], -1)
+
+
 class PlannerHarness:
     """One view a world: a `GraspPlanner` and the segmentation of synthetic images, computed by OpenCV, that it reads."""
 
@@ -90,6 +100,11 @@ class PlannerHarness:
             getattr(self.observation, name).assign(self.expected[name])
         self.scene = self.worlds.scene
         self.planner = GraspPlanner(Perception(exact_cycle=self.scene.perception.exact_cycle), self.images, self.arrays)
+
+    @classmethod
+    def unseen(cls, device: Any, views: int, instances: int, **options: Any) -> PlannerHarness:
+        """Views that show nothing, for tests that set the observation."""
+        return cls(device, [np.full((4, 4), -1)] * views, [np.ones((4, 4))] * views, instances, **options)
 
     def votes(self) -> np.ndarray:
         """Occlusion votes (V, I, I)."""
@@ -192,50 +207,10 @@ def net_weights(votes_: np.ndarray, least: float) -> np.ndarray:
     return np.maximum(kept - kept.T, 0.0)
 
 
-def is_acyclic(edges: np.ndarray) -> bool:
-    """True if no power of the adjacency matrix has a non-zero diagonal."""
-    power = edges.astype(int)
-    for _ in range(len(edges)):
-        if np.trace(power) > 0:
-            return False
-        power = ((power @ edges) > 0).astype(int)
-    return True
-
-
-def transitive_closure(edges: np.ndarray) -> np.ndarray:
-    """Pairs connected by a path."""
-    paths = edges.astype(int)
-    for _ in range(len(edges)):
-        paths = ((paths + paths @ edges) > 0).astype(int)
-    return paths > 0
-
-
-def heaviest_by_orders(weights: np.ndarray) -> tuple[float, set[bytes]]:
-    """Weight of the heaviest acyclic subset and all subsets of that weight, by enumerating every order of the objects."""
-    best, sets = -1.0, set()
-    for order in itertools.permutations(range(len(weights))):
-        rank = np.argsort(order)
-        kept = (weights > 0) & (rank[None, :] < rank[:, None])
-        weight = weights[kept].sum()
-        if weight > best:
-            best, sets = weight, set()
-        if weight == best:
-            sets.add(kept.tobytes())
-    return best, sets
-
-
-def heaviest_by_subsets(weights: np.ndarray) -> tuple[float, set[bytes]]:
-    """As `heaviest_by_orders`, by enumerating every subset of the edges."""
-    edges = np.argwhere(weights > 0)
-    best, sets = -1.0, set()
-    for chosen in itertools.product((False, True), repeat=len(edges)):
-        kept = np.zeros(weights.shape, bool)
-        kept[tuple(edges[list(chosen)].T)] = True
-        weight = weights[kept].sum()
-        if weight >= best and is_acyclic(kept):
-            sets = {kept.tobytes()} | (sets if weight == best else set())
-            best = weight
-    return best, sets
+def heaviest_by_orders(weights: np.ndarray) -> float:
+    """Weight of the heaviest acyclic subset, by enumerating every order of the objects."""
+    ranks = (np.argsort(order) for order in itertools.permutations(range(len(weights))))
+    return max(weights[rank[None, :] < rank[:, None]].sum() for rank in ranks)
 
 
 def greedy_order(weights: np.ndarray) -> list[int]:
