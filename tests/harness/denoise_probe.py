@@ -12,13 +12,19 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
+from synpick_warp.system.hardware.device import pick_device
 from tests.harness.aimed_views import aimed_views
+from tests.harness.devices import default_device
 
 
 class FlatDenoiser:
-    """The denoiser on coarse pixels of 1 px that all show one plane, which faces the camera at a depth of 1 m."""
+    """The denoiser on coarse pixels of 1 px that all show one plane, which faces the camera at a depth of 1 m.
 
-    def __init__(self, width: int, height: int, device: wp.Device) -> None:
+    Unless tests assign other light, there is none, but unoccluded light of 1.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        device = pick_device(default_device())
         sizes = {"view": 1, "cell_row": height, "cell_column": width}
         matrix = np.array([[100.0, 0.0, width / 2.0], [0.0, 100.0, height / 2.0], [0.0, 0.0, 1.0]])
         self.device, self.count = device, build_grid(width, height).tiles * 32
@@ -30,7 +36,7 @@ class FlatDenoiser:
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, device) for _ in range(2))
         names = ("diffuse", "specular", "unoccluded_diffuse", "unoccluded_specular", "indirect")
-        self.light = {name: np.zeros((height, width, 3)) for name in names}
+        self.light = {name: np.full((height, width, 3), float(name.startswith("unoccluded"))) for name in names}
 
     def show(self, segment: np.ndarray, depth: np.ndarray) -> None:
         """Set the guide image: segmentation ids and depth [m] (row, column) of surfaces that face the camera."""

@@ -12,9 +12,8 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.render.view_setup import make_views
 from tests.twins.raycast import rotation_of
-from tests.worlds.toy_scene import ToyScene, build_scene, snapshot
+from tests.worlds.toy_scene import ToyScene, build_scene, snapshot, views_of
 
 
 @dataclass
@@ -46,9 +45,7 @@ def render_layers(
 ) -> RenderedLayers:
     """Render layers of every world by every camera: view = world x cameras + camera."""
     config = replace(toy.settings(), render=replace(toy.settings().render, layers=names))
-    scene = build_scene(toy, device)
-    worlds, cameras = len(toy.placed), len(toy.cameras)
-    views = worlds * cameras
+    scene, views = build_scene(toy, device), views_of(toy, device)
     now = snapshot(toy, device)
     if previous is not None:
         poses, visible = previous.fixture_poses or toy.fixture_poses, previous.fixtures_visible or toy.fixtures_visible
@@ -56,12 +53,10 @@ def render_layers(
         for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
             wp.copy(getattr(now, f"last_{name}"), getattr(last, name))
         now.follows.assign(np.array(previous.follows))
-    renderer = make_renderer(config, scene, toy.instances, views, colors=False)
-    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
+    renderer = make_renderer(config, scene, toy.instances, views.count, colors=False)
+    sizes = view_buffer_sizes(views.count, scene.width, scene.height, toy.instances)
     out = allocate(LayerBuffers, sizes, device, names)
-    view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
-    view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(now, make_views(view_world, view_camera, views, toy.instances), allocate(ViewBuffers, sizes, device), out)
+    renderer.render(now, views, allocate(ViewBuffers, sizes, device), out)
     layers = {name: getattr(out, name).numpy() for name in names}
     return RenderedLayers(layers, renderer.gbuffer.segment.numpy(), renderer.gbuffer.depth.numpy(), names)
 

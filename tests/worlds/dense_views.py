@@ -14,17 +14,12 @@ from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratc
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.views.frames import FrameBatch
 from tests.worlds.box_views import catalog
-from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, snapshot
+from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, random_pile, snapshot
 
 
 def dense_toy(count: int, lenses: tuple[Camera, ...], room: int, seed: int = 0) -> ToyScene:
     """A world of `count` boxes of the catalog of `box_views`, in a heap that reaches beyond the images."""
-    rng = np.random.default_rng(seed)
-    placed = []
-    for _ in range(count):
-        quaternion = rng.normal(size=4)
-        position = rng.uniform((-0.4, -0.3, -0.2), (0.4, 0.3, 0.1))
-        placed.append((int(rng.integers(2)), (*position, *(quaternion / np.linalg.norm(quaternion)))))
+    placed = random_pile(np.random.default_rng(seed), 2, count, (-0.4, -0.3, -0.2), (0.4, 0.3, 0.1))
     return ToyScene(list(catalog().entries), [placed], lenses, instances=room, config=Config(bop=Bop(depth_scale=0.1)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,6 +12,7 @@ import warp as wp
 from synpick_warp.configs.calibration.lens import PINHOLE, Lens, LensMap
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
@@ -28,6 +30,10 @@ UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
 """Pose at the origin."""
 WHITE = (1.0, 1.0, 1.0)
+HALF = (float(linear_to_srgb(0.5)),) * 3
+"""Colour of a linear albedo of 0.5."""
+ANNOTATIONS = ("depth", "instance", "amodal", "pixels", "boxes")
+"""Fields of `RenderedViews` that the light does not change."""
 
 
 def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
@@ -138,6 +144,23 @@ def with_render(mode: str = FAST, **settings) -> Config:
     return Config(render=replace(Config().render, mode=mode, **settings))
 
 
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Rotation matrix (3, 3)."""
+    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return rotation * np.linalg.det(rotation)
+
+
+def random_pose(rng: np.random.Generator, low: Any = (-0.1, -0.1, -0.1), high: Any = (0.1, 0.1, 0.1)) -> tuple[float, ...]:
+    """Position between two corners [m], and any rotation."""
+    quaternion, position = rng.normal(size=4), rng.uniform(low, high)
+    return (*position, *(quaternion / np.linalg.norm(quaternion)))
+
+
+def random_pile(rng: np.random.Generator, meshes: int, count: int, low: Any, high: Any) -> list[tuple[int, tuple[float, ...]]]:
+    """Objects (index of a mesh, pose) between two corners [m]."""
+    return [(int(rng.integers(meshes)), pose) for pose in (random_pose(rng, low, high) for _ in range(count))]
+
+
 @dataclass
 class ToyScene:
     """A scene: poses are x, y, z [m] and a quaternion x, y, z, w; every camera renders every world."""
@@ -187,6 +210,32 @@ class RenderedViews:
         return bits_of(self.masks)
 
 
+def assert_same(first: RenderedViews, second: RenderedViews, *names: str) -> None:
+    """Compare fields of rendered views bit by bit."""
+    for name in names:
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Peak signal-to-noise ratio [dB]; the peak is the radiance of a white plane under a map of radiance 1."""
+    return float(-10.0 * np.log10(np.mean((np.clip(a, 0.0, 1.0) - np.clip(b, 0.0, 1.0)) ** 2)))
+
+
+def one(mesh: TriangleMesh, pose: tuple[float, ...], view: Camera, material: Material = GREY, **more) -> ToyScene:
+    """A scene of one object and one camera."""
+    return ToyScene([entry(mesh, material)], [[(0, pose)]], (view,), **more)
+
+
+def clutter() -> list:
+    """Boxes, balls and a plane of several materials, close together, for `render_objects`."""
+    return [
+        (sheet(0.6, 0.5), surface((0.8, 0.75, 0.7), 0.0, 0.7)),
+        (box(0.08, 0.06, 0.1), surface((0.2, 0.5, 0.8), 0.0, 0.5), (0.06, 0.03, 0.05, *UPRIGHT)),
+        (ball(0.045, 3), surface((0.9, 0.8, 0.5), 1.0, 0.4), (-0.05, 0.02, 0.045, *UPRIGHT)),
+        (box(0.05, 0.12, 0.03), surface((0.8, 0.2, 0.2), 0.0, 0.9), (-0.02, -0.07, 0.015, 0.0, 0.0, np.sin(0.3), np.cos(0.3))),
+    ]
+
+
 def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
     """Device snapshot of a scene; environment map 0 in every world."""
     worlds = len(toy.placed)
@@ -207,6 +256,13 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
     return result
 
 
+def views_of(toy: ToyScene, device: wp.Device, cameras: Any = None) -> Any:
+    """The struct `Views` of every world by every camera: view = world x cameras + camera; `cameras`: as of `make_views`."""
+    places = np.indices((len(toy.placed), len(toy.cameras)), np.int32).reshape(2, -1)
+    world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in places)
+    return make_views(world, camera_index, places.shape[1], toy.instances, cameras)
+
+
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
@@ -216,15 +272,10 @@ def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
 
 def render(toy: ToyScene, device: wp.Device, colors: bool = True) -> RenderedViews:
     """Render every world by every camera: view = world x cameras + camera. Without colours, `color`, `radiance` and `resolve` are empty."""
-    config = toy.settings()
-    scene = build_scene(toy, device)
-    worlds, cameras = len(toy.placed), len(toy.cameras)
-    views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.instances, views, colors=colors)
-    out = allocate_view_buffers(views, scene.width, scene.height, toy.instances, device)
-    view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
-    view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.instances), out)
+    scene, views = build_scene(toy, device), views_of(toy, device)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, views.count, colors=colors)
+    out = allocate_view_buffers(views.count, scene.width, scene.height, toy.instances, device)
+    renderer.render(snapshot(toy, device), views, out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "pixels", "boxes")}
     images["masks"] = masks_of_buffers(out)
     shown = {name: getattr(renderer.image, name).numpy() if colors else np.empty(0) for name in ("radiance", "resolve")}
@@ -241,10 +292,9 @@ def render_objects(device: wp.Device, *placed, view: Camera, config: Config | No
 
 def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Render the G-buffer of world 0 by camera 0 only."""
+    toy = replace(toy, placed=toy.placed[:1], cameras=toy.cameras[:1])
     scene = build_scene(toy, device)
     renderer = make_renderer(toy.settings(), scene, toy.instances, 1, colors=False)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
-    zero = wp.zeros(1, dtype=wp.int32, device=device)
-    views = make_views(zero, zero, 1, toy.instances)
-    renderer.render_gbuffer(snapshot(toy, device), views, out)
+    renderer.render_gbuffer(snapshot(toy, device), views_of(toy, device), out)
     return out, renderer

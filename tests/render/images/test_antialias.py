@@ -14,7 +14,20 @@ from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
 from tests.harness.probe import probe
-from tests.worlds.toy_scene import UPRIGHT, RenderedViews, box, camera, even_light, render_objects, sheet, sun, surface, with_render
+from tests.worlds.toy_scene import (
+    ANNOTATIONS,
+    UPRIGHT,
+    RenderedViews,
+    assert_same,
+    box,
+    camera,
+    even_light,
+    render_objects,
+    sheet,
+    sun,
+    surface,
+    with_render,
+)
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
 
@@ -201,8 +214,7 @@ def test_antialiasing_changes_only_the_colour_of_resolved_pixels(device):
         (sheet(0.3, 0.1), rotated_pose(-0.05, 0.0, -0.1, 1.0), (0.8, 0.8, 0.3)),
     ]
     antialiased, aliased = (render_image(device, *bodies, config=with_render(antialias=on), table=True) for on in (True, False))
-    for name in ("depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
-        np.testing.assert_array_equal(getattr(antialiased, name), getattr(aliased, name))
+    assert_same(antialiased, aliased, "exact_depth", "radiance", *ANNOTATIONS)
     resolved = antialiased.resolve[0] != 0
     assert not aliased.resolve.any()
     np.testing.assert_array_equal(antialiased.color[0][~resolved], aliased.color[0][~resolved])

@@ -14,26 +14,21 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import Fixture, Material
 from tests.twins.layers import PreviousFrame, pose_in, previous_points, project, render_layers, surface_points
 from tests.twins.raycast import rotation_of
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, sheet
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, one, random_pose, random_rotation, sheet
 
 VIEW = camera(160, 90, 453.7, (0.0, 0.0, 2.0))
 TILTED = (0.03, -0.02, 0.1, 0.3, -0.1, 0.2, 0.8)
 FIXTURES = (Fixture(box(0.5, 0.3, 0.02), GREY), Fixture(box(0.02, 0.02, 0.1), GREY), Fixture(box(0.04, 0.04, 0.01), GREY))
 
 
-def one(mesh, pose=TILTED, view=VIEW, **more) -> ToyScene:
-    return ToyScene([entry(mesh)], [[(0, pose)]], (view,), **more)
+def single(mesh, pose=TILTED, view=VIEW, **more) -> ToyScene:
+    return one(mesh, pose, view, **more)
 
 
 def crowded(**more) -> ToyScene:
     """A box in a tote beside the gripper shaft and cup, on a table."""
     poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.1, 0.0, 0.2, *UPRIGHT), (0.1, 0.0, 0.12, *UPRIGHT))
-    return one(box(0.1, 0.05, 0.04), fixtures=FIXTURES, fixture_poses=poses, fixtures_visible=(1, 1, 1), table=True, **more)
-
-
-def random_pose(rng: np.random.Generator) -> tuple[float, ...]:
-    q = rng.normal(size=4)
-    return (*rng.uniform(-0.1, 0.1, 3), *(q / np.linalg.norm(q)))
+    return single(box(0.1, 0.05, 0.04), fixtures=FIXTURES, fixture_poses=poses, fixtures_visible=(1, 1, 1), table=True, **more)
 
 
 # ---- choice of layers ----
@@ -48,7 +43,7 @@ def test_only_the_named_layers_are_rendered(device):
 
 
 def test_normals_of_a_ball_point_away_from_its_centre(device):
-    rendered = render_layers(one(ball(0.1, 5), (0.02, 0.01, 0.3, 0.1, 0.5, 0.2, 0.8)), device)
+    rendered = render_layers(single(ball(0.1, 5), (0.02, 0.01, 0.3, 0.1, 0.5, 0.2, 0.8)), device)
     seen = rendered.segment[0] == 1
     center = VIEW.rotation @ (0.02, 0.01, 0.3) + VIEW.translation
     expected = (surface_points(rendered.depth[0], VIEW) - center)[seen]
@@ -68,7 +63,7 @@ def test_normals_of_a_sheet_face_the_camera_from_either_side(device, flip):
         # Flipped about its own x axis: q (1, 0, 0, 0).
         x, y, z, w = pose[3:]
         pose[3:] = (w, z, -y, -x)
-    rendered = render_layers(one(sheet(0.2, 0.2), tuple(pose)), device)
+    rendered = render_layers(single(sheet(0.2, 0.2), tuple(pose)), device)
     normal = VIEW.rotation @ rotation_of(pose[3:])[:, 2] * (-1.0 if flip else 1.0)
     assert normal[2] < 0.0
     np.testing.assert_allclose(
@@ -100,7 +95,7 @@ def test_albedo_is_the_base_colour_under_any_light(device):
 
 def test_albedo_shows_the_texture(device):
     texture = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (90, 91, 92)]], np.uint8).repeat(64, axis=0).repeat(64, axis=1)
-    toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT))
+    toy = single(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT))
     toy.entries = [entry(sheet(0.2, 0.2), Material((1.0, 1.0, 1.0), texture, 0.0, 0.5))]
     rendered = render_layers(toy, device)
     albedo = rendered["albedo"][0]
@@ -119,7 +114,7 @@ def test_nocs_gives_the_point_in_object_coordinates(device):
     shift = np.array([0.03, -0.2, 0.01])
     mesh = flat_shaded(whole.vertices + shift, whole.faces)
     pose = (0.0, 0.2, 0.1, 0.2, -0.1, 0.1, 0.9)
-    rendered = render_layers(one(mesh, pose), device)
+    rendered = render_layers(single(mesh, pose), device)
     seen = rendered.segment[0] == 1
     rotation, translation = pose_in(VIEW, pose)
     own = (surface_points(rendered.depth[0], VIEW)[seen] - translation) @ rotation
@@ -131,7 +126,7 @@ def test_nocs_gives_the_point_in_object_coordinates(device):
 
 
 def test_nocs_of_known_points(device):
-    rendered = render_layers(one(box(0.2, 0.1, 0.05), (0.0, 0.0, 0.0, *UPRIGHT), camera(161, 91, 453.7, (0.0, 0.0, 2.0))), device)
+    rendered = render_layers(single(box(0.2, 0.1, 0.05), (0.0, 0.0, 0.0, *UPRIGHT), camera(161, 91, 453.7, (0.0, 0.0, 2.0))), device)
     diagonal = np.linalg.norm((0.2, 0.1, 0.05))
     np.testing.assert_allclose(rendered["nocs"][0, 45, 80], (0.5, 0.5, 0.5 + 0.025 / diagonal), atol=1e-6)
     rows, columns = np.nonzero(rendered.segment[0] == 1)
@@ -175,7 +170,7 @@ def test_an_obj_id_that_does_not_fit_the_layer_is_an_error(device, number):
 def test_flow_of_a_translation_across_the_view(device):
     # Moved 10 px to the right and 5 px up since the previous frame, at depth 1 m and 100 px a metre.
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
-    toy = one(sheet(0.4, 0.4), (0.1, 0.05, 0.0, *UPRIGHT), view)
+    toy = single(sheet(0.4, 0.4), (0.1, 0.05, 0.0, *UPRIGHT), view)
     rendered = render_layers(toy, device, PreviousFrame([[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], [1]))
     seen = rendered.segment[0] == 1
     np.testing.assert_allclose(rendered["flow"][0][seen], np.broadcast_to((-10.0, 5.0), (seen.sum(), 2)), atol=1e-5)
@@ -184,7 +179,7 @@ def test_flow_of_a_translation_across_the_view(device):
 
 def test_flow_of_a_translation_towards_the_camera(device):
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
-    toy = one(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), view)
+    toy = single(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), view)
     rendered = render_layers(toy, device, PreviousFrame([[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], [1]))
     seen = rendered.segment[0] == 1
     np.testing.assert_allclose(rendered["scene_flow"][0][seen], np.broadcast_to((0.0, 0.0, 0.5), (seen.sum(), 3)), atol=1e-7)
@@ -196,8 +191,7 @@ def test_flow_of_a_translation_towards_the_camera(device):
 @pytest.mark.parametrize("seed", range(3))
 def test_flow_agrees_with_poses_in_float64(device, seed):
     rng = np.random.default_rng(seed)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.linalg.det(turn)
+    turn = random_rotation(rng)
     view = camera(160, 90, 453.7, tuple(turn.T @ (0.0, 0.0, -2.0)), turn)
     meshes = [box(0.16, 0.07, 0.2), ball(0.06, 3), box(0.2, 0.004, 0.1)]
     now, then = ([random_pose(rng) for _ in meshes] for _ in range(2))
@@ -260,7 +254,7 @@ def test_flow_of_bodies_absent_in_the_previous_frame_is_unknown(device):
 
 
 def test_optical_flow_of_a_point_behind_the_camera_is_unknown(device):
-    toy = one(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), camera(160, 90, 100.0, (0.0, 0.0, 1.0)))
+    toy = single(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), camera(160, 90, 100.0, (0.0, 0.0, 1.0)))
     rendered = render_layers(toy, device, PreviousFrame([[(0, (0.0, 0.0, 1.5, *UPRIGHT))]], [1]))
     seen = rendered.segment[0] == 1
     assert np.isnan(rendered["flow"][0]).all()

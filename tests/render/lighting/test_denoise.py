@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.kernels.render.lighting import coarse_grid, denoise
 from synpick_warp.kernels.render.visibility.records import read_record, write_record
-from synpick_warp.system.hardware.device import pick_device
 from tests.harness.denoise_probe import FlatDenoiser
-from tests.harness.devices import default_device
 from tests.harness.probe import probe
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
@@ -62,7 +60,7 @@ def test_packed_surfaces_keep_id_depth_and_normal(device):
 @given(width=st.integers(1, 40), height=st.integers(1, 30), seed=st.integers(0, 100))
 def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, seed):
     # Unoccluded light of any strength, of which the same fraction arrives everywhere.
-    flat = FlatDenoiser(width, height, pick_device(default_device()))
+    flat = FlatDenoiser(width, height)
     rng = np.random.default_rng(seed)
     for name, ratio in (("diffuse", 0.7), ("specular", 0.4)):
         unoccluded = rng.uniform(0.2, 2.0, (height, width, 3))
@@ -75,10 +73,8 @@ def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, see
 
 
 def test_steps_without_noise_stay_sharp_and_noise_is_averaged():
-    flat = FlatDenoiser(64, 48, pick_device(default_device()))
+    flat = FlatDenoiser(64, 48)
     ones = np.ones((48, 64))
-    for name in ("unoccluded_diffuse", "unoccluded_specular"):
-        flat.assign(name, ones)
     step = np.where(np.arange(64) < 32, 0.2, 1.0)[None] * ones
     noise = np.random.default_rng(0).choice([0.0, 1.0], size=(48, 64))
     flat.assign("diffuse", step)
@@ -96,9 +92,7 @@ def test_steps_without_noise_stay_sharp_and_noise_is_averaged():
 
 def test_larger_variance_scale_widens_the_kernel():
     """Rare bright samples: a block with some of them looks bright, unless its variance is scaled up, because its estimate is too low."""
-    flat = FlatDenoiser(64, 48, pick_device(default_device()))
-    for name in ("unoccluded_diffuse", "unoccluded_specular"):
-        flat.assign(name, np.ones((48, 64)))
+    flat = FlatDenoiser(64, 48)
     rare = 20.0 * (np.random.default_rng(0).uniform(size=(48, 64)) < 0.05)
     flat.assign("diffuse", rare)
     deviation = [flat.run(scale)["diffuse"][8:40, 8:56, 0].std() for scale in (0.0, 0.5, 1.0, 2.0, 1e9)]
@@ -110,9 +104,7 @@ def test_larger_variance_scale_widens_the_kernel():
 
 def test_one_bright_path_is_spread_over_the_wide_kernel():
     """A firefly has its whole block's variance, so that the block's mean is no evidence of a feature."""
-    flat = FlatDenoiser(64, 48, pick_device(default_device()))
-    for name in ("unoccluded_diffuse", "unoccluded_specular"):
-        flat.assign(name, np.ones((48, 64)))
+    flat = FlatDenoiser(64, 48)
     firefly = np.full((48, 64), 0.5)
     firefly[24, 32] = 20.0
     for name in ("diffuse", "specular"):
@@ -124,9 +116,7 @@ def test_one_bright_path_is_spread_over_the_wide_kernel():
 
 
 def test_other_bodies_and_other_depths_do_not_mix():
-    flat = FlatDenoiser(32, 32, pick_device(default_device()))
-    for name in ("unoccluded_diffuse", "unoccluded_specular"):
-        flat.assign(name, np.ones((32, 32)))
+    flat = FlatDenoiser(32, 32)
     left = np.arange(32)[None] * np.ones((32, 1)) < 16
     flat.show(np.where(left, 1, 2), np.ones((32, 32)))
     flat.assign("diffuse", np.where(left, 0.2, 0.9))

@@ -52,21 +52,10 @@ def test_aligned_runs_of_scrambled_points_are_nets(key, dimension, run, power):
         assert len(np.unique(boxes, axis=0)) == count
 
 
-def scrambled_points(device, key: int, dimension: int, count: int = 256) -> np.ndarray:
-    return scrambled_point(key, np.arange(count), dimension, device=device)
-
-
-def test_scrambled_points_are_stratified(device):
-    for key, dimension in ((1, 0), (1, 1), (2, 0)):
-        for part in scrambled_points(device, key, dimension).reshape(4, 64, 2):
-            assert len({tuple(stratum) for stratum in (part * 8).astype(int)}) == 64
-            assert all(len(set((part[:, axis] * 64).astype(int))) == 64 for axis in (0, 1))
-
-
 def test_points_of_other_dimensions_and_keys_are_uncorrelated(device):
     # The correlation of 256 pairs of independent numbers is about 1/16. Owen scrambling flips the first digit of two neighbours
     # together, which makes it 1.2 times as much; dependent pairs have 0.5 and more.
-    points = np.array([scrambled_points(device, key, dimension) for key in range(1, 21) for dimension in range(3)])
+    points = np.array([scrambled_point(key, np.arange(256), dimension, device=device) for key in range(1, 21) for dimension in range(3)])
     correlation = np.corrcoef(np.concatenate([points[..., 0], points[..., 1]]))
     other = np.abs(correlation[np.triu_indices(len(correlation), 1)])
     assert np.sqrt((other**2).mean()) < 1.5 / 16.0

@@ -6,18 +6,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import warp as wp
 
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
-from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.render import denoised
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.views.frames import most_words
 from tests.harness.trace_probe import trace_gbuffer
-from tests.twins.annotate import count_pixels
+from tests.twins.annotate import annotated
 from tests.twins.raycast import cast_scene
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, render, render_gbuffer, with_render
+from tests.worlds.toy_scene import (
+    UPRIGHT,
+    ToyScene,
+    assert_same,
+    ball,
+    box,
+    camera,
+    entry,
+    random_pile,
+    render,
+    render_gbuffer,
+    views_of,
+    with_render,
+)
 
 VIEW = camera(160, 90, 160.0, (0.0, 0.0, 1.0))
 MESHES = (box(0.06, 0.04, 0.03), ball(0.02, 1), box(0.1, 0.015, 0.015))
@@ -25,20 +35,8 @@ MESHES = (box(0.06, 0.04, 0.03), ball(0.02, 1), box(0.1, 0.015, 0.015))
 
 def pile(count: int, seed: int = 0, **more) -> ToyScene:
     """Small objects above each other, some beyond the border of the image."""
-    rng = np.random.default_rng(seed)
-    placed = []
-    for _ in range(count):
-        quaternion = rng.normal(size=4)
-        position = rng.uniform((-0.55, -0.3, -0.15), (0.55, 0.3, 0.15))
-        placed.append((int(rng.integers(len(MESHES))), (*position, *(quaternion / np.linalg.norm(quaternion)))))
+    placed = random_pile(np.random.default_rng(seed), len(MESHES), count, (-0.55, -0.3, -0.15), (0.55, 0.3, 0.15))
     return ToyScene([entry(mesh) for mesh in MESHES], [placed], (VIEW,), **{"instances": MAX_INSTANCES} | more)
-
-
-def canvas(view: Camera) -> Camera:
-    """The same camera with an image three times as wide and high, centred on the original."""
-    matrix = view.matrix.copy()
-    matrix[:2, 2] += view.width, view.height
-    return Camera(3 * view.width, 3 * view.height, matrix, view.rotation, view.translation)
 
 
 @pytest.fixture(scope="module", params=[200, MAX_INSTANCES])
@@ -47,7 +45,7 @@ def dense(request):
 
 
 def test_masks_agree_with_float64_rays_and_counts_with_masks(device, dense):
-    picture, wide = render(dense, device, colors=False), render(replace(dense, cameras=(canvas(VIEW),)), device, colors=False)
+    picture, pixels, boxes = annotated(dense, device)
     meshes, poses = [MESHES[index] for index, _ in dense.placed[0]], [pose for _, pose in dense.placed[0]]
     depth, instance, masks = cast_scene(meshes, poses, VIEW)
     seen = masks.any(axis=(1, 2))
@@ -60,7 +58,6 @@ def test_masks_agree_with_float64_rays_and_counts_with_masks(device, dense):
     assert np.unique(picture.instance).size > 100
     same = (picture.instance[0] == instance) & (instance > 0)
     assert np.quantile(np.abs(picture.exact_depth[0] - depth)[same], 0.999) < 2e-6
-    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.masks[0], wide.masks[0])
     np.testing.assert_array_equal(picture.pixels[0], pixels)
     np.testing.assert_array_equal(picture.boxes[0], boxes)
     assert (boxes[:, 0, 2] >= VIEW.width).any()
@@ -94,8 +91,7 @@ def test_rays_meet_the_bodies_of_all_words(device, dense):
     names = ("segment", "triangle", "barycentric", "depth")
     raster = {name: getattr(renderer.gbuffer, name).numpy().copy() for name in names}
     assert renderer.bodies.body_mask.shape[2] == 4
-    zero = wp.zeros(1, dtype=wp.int32, device=device)
-    trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, 1)
+    trace_gbuffer(renderer.scene, renderer.bodies, views_of(toy, device, renderer.cameras), renderer.gbuffer, 1)
     same = raster["segment"] == renderer.gbuffer.segment.numpy()
     assert (~same).sum() <= 3
     np.testing.assert_allclose(renderer.gbuffer.depth.numpy()[same], raster["depth"][same], rtol=1e-5)
@@ -105,8 +101,7 @@ def test_rays_meet_the_bodies_of_all_words(device, dense):
 def test_pictures_do_not_depend_on_the_room_for_instances(device, mode):
     config = with_render(mode, samples=2) if mode == REFERENCE else with_render(mode)
     few, many = (render(pile(14, 3, instances=room, config=config, fixtures_visible=(0, 1, 0)), device) for room in (14, MAX_INSTANCES))
-    for name in ("color", "depth", "instance", "exact_depth", "radiance", "resolve"):
-        np.testing.assert_array_equal(getattr(few, name), getattr(many, name))
+    assert_same(few, many, "color", "depth", "instance", "exact_depth", "radiance", "resolve")
     for name in ("masks", "pixels", "boxes"):
         np.testing.assert_array_equal(getattr(few, name), getattr(many, name)[:, :14])
 
@@ -116,8 +111,7 @@ def test_bodies_about_the_end_of_a_word_are_anti_aliased_alike(device, count):
     """With fixtures 63, 64 and 65 bodies, all in the image: one word with a free bit, and two."""
     fixtures = {"fixtures_visible": (1, 1, 1), "fixture_poses": tuple((0.2 * index, 0.1, -0.3, *UPRIGHT) for index in range(3))}
     exact, wide = (render(pile(count, 4, instances=room, config=with_render(UNOCCLUDED), **fixtures), device) for room in (count, 200))
-    for name in ("color", "instance", "resolve"):
-        np.testing.assert_array_equal(getattr(exact, name), getattr(wide, name))
+    assert_same(exact, wide, "color", "instance", "resolve")
 
 
 def test_coverage_rays_meet_the_bodies_of_later_words(device, monkeypatch):
@@ -126,8 +120,7 @@ def test_coverage_rays_meet_the_bodies_of_later_words(device, monkeypatch):
     beside = [(1, (50.0, 0.01 * index, 0.5, *UPRIGHT)) for index in range(220)]
     crowded = replace(seen, placed=[seen.placed[0] + beside])
     alone, among = render(seen, device), render(crowded, device)
-    np.testing.assert_array_equal(among.instance, alone.instance)
-    np.testing.assert_array_equal(among.resolve, alone.resolve)
+    assert_same(among, alone, "instance", "resolve")
     assert (alone.resolve != 0).sum() > 100
     monkeypatch.setattr(denoised, "crowd_of", lambda _: denoised.ManyBodies())
     assert (render(crowded, device).resolve != among.resolve).any()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.calibration.lens import FISHEYE, with_matrix
 from synpick_warp.configs.schema import UNOCCLUDED
@@ -19,10 +20,11 @@ from synpick_warp.stages.view_ring import allocate_lenses
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.render.visibility.test_raster import NEVER, depth_in_float64, gbuffer_of, random_triangles, triangles
-from tests.twins.annotate import count_pixels
+from tests.twins.annotate import annotated
 from tests.twins.layers import PreviousFrame, render_layers
 from tests.worlds.toy_scene import (
     DOWN,
+    FLAT,
     UPRIGHT,
     ToyScene,
     ball,
@@ -31,6 +33,7 @@ from tests.worlds.toy_scene import (
     camera,
     distorted,
     entry,
+    one,
     render,
     sheet,
     surface,
@@ -48,22 +51,24 @@ VIEWS = {
 }
 
 
-def loose(corners: np.ndarray, view: Camera) -> ToyScene:
-    return ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
+TURN = Rotation.from_euler("xyz", [172, 9, 40], degrees=True).as_matrix()
+OFF_CENTRE = Camera(96, 64, np.array([[75.0, 0.0, 51.3], [0.0, 69.4, 30.2], [0.0, 0.0, 1.0]]), TURN, -TURN @ (0.02, -0.03, 1.0))
+"""A real camera matrix without a lens: fx ≠ fy and cx ≠ W/2."""
 
 
 def opencv_pixels(view: Camera, points: np.ndarray) -> np.ndarray:
     """Pixel coordinates of world points (n, 3) by OpenCV with the camera's values; its pixel centres are then at + 0.5, as ours."""
-    project = cv2.fisheye.projectPoints if view.lens.lens.model == FISHEYE else cv2.projectPoints
+    lens = view.lens and view.lens.lens
+    project = cv2.fisheye.projectPoints if lens and lens.model == FISHEYE else cv2.projectPoints
     there = (points @ view.rotation.T + view.translation).reshape(-1, 1, 3)
-    return project(there, np.zeros(3), np.zeros(3), view.matrix, np.array(view.lens.lens.coefficients))[0].reshape(-1, 2)
+    return project(there, np.zeros(3), np.zeros(3), view.matrix, np.array(lens.coefficients) if lens else None)[0].reshape(-1, 2)
 
 
 @settings(max_examples=30, deadline=None)
 @given(name=st.sampled_from(sorted(VIEWS)), seed=st.integers(0, 2**32 - 1), size=st.sampled_from([0.003, 0.03, 0.3, 2.0]))
 def test_the_rasterizer_misses_no_ray(name, seed, size):
     """Triangles all over and beside the image, some through the camera's plane: their footprints bound their bent images."""
-    toy, device = loose(random_triangles(seed, 30, size, 0.8), VIEWS[name]), pick_device(default_device())
+    toy, device = one(triangles(random_triangles(seed, 30, size, 0.8)), FLAT, VIEWS[name]), pick_device(default_device())
     ours, theirs = gbuffer_of(toy, device), gbuffer_of(toy, device, by_rays=True)
     differs = ours["segment"] != theirs["segment"]
     assert differs.sum() <= (2 if device.is_cuda else 0)
@@ -75,7 +80,7 @@ def test_the_rasterizer_misses_no_ray(name, seed, size):
 @pytest.mark.parametrize("size", [0.03, 0.3])
 def test_depth_and_masks_are_those_of_float64(device, name, size):
     corners = random_triangles(5, 40, size, 0.4)
-    found = gbuffer_of(loose(corners, VIEWS[name]), device)
+    found = gbuffer_of(one(triangles(corners), FLAT, VIEWS[name]), device)
     depth, clear = depth_in_float64(corners, VIEWS[name])
     sure = clear > 0.1
     assert sure.mean() > 0.4
@@ -106,10 +111,10 @@ def test_rays_of_a_drawn_camera_matrix_are_those_of_float64(device, name, zoom, 
         np.testing.assert_allclose(cameras.lenses.ray.numpy()[row], lenses[row].rays(), rtol=0, atol=5e-7)
 
 
-@pytest.mark.parametrize("name", VIEWS)
-def test_edges_lie_where_opencv_projects_them(device, name):
+@pytest.mark.parametrize("view", [*VIEWS.values(), OFF_CENTRE], ids=[*VIEWS, "off centre"])
+def test_edges_lie_where_opencv_projects_them(device, view):
     """A square that fills most of the image: its mask ends within 0.02 px of the projected outline."""
-    view, half = VIEWS[name], 0.35
+    half = 0.35
     found = gbuffer_of(ToyScene([entry(sheet(2 * half, 2 * half))], [[(0, (0.05, 0.02, 0.0, *UPRIGHT))]], (view,)), device)
     side = np.linspace(-half, half, 400)
     ends = np.full_like(side, half)
@@ -127,12 +132,8 @@ def test_edges_lie_where_opencv_projects_them(device, name):
 @pytest.mark.parametrize("place", [(0.68, 0.0), (-0.75, 0.45), (0.0, -0.62)])
 def test_masks_beyond_the_border_are_those_of_the_continued_lens(device, name, place):
     view = VIEWS[name]
-    lens = view.lens.cropped(-view.width, -view.height, (3 * view.width, 3 * view.height))
-    shifted = view.matrix + np.array([[0, 0, view.width], [0, 0, view.height], [0, 0, 0]])
-    canvas = Camera(*lens.size, shifted, view.rotation, view.translation, lens=lens)
     toy = ToyScene([entry(ball(0.15, 3))], [[(0, (*place, 0.1, *UPRIGHT)), (0, (*place, -0.3, *UPRIGHT))]], (view,))
-    picture, wide = render(toy, device, colors=False), render(replace(toy, cameras=(canvas,)), device, colors=False)
-    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.masks[0], wide.masks[0])
+    picture, pixels, boxes = annotated(toy, device)
     assert pixels[0][0] > 50
     # The inverse is float32 here and float64 there: a ray within 1e-3 px of an outline may pass it on either side.
     assert np.abs(picture.pixels[0] - pixels).max() <= 1

@@ -14,12 +14,29 @@ from synpick_warp.codes import Segment
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.render import raster
-from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.harness.trace_probe import trace_gbuffer
 from tests.twins.masks import bits_of, masks_of_buffers
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet
+from tests.worlds.toy_scene import (
+    ANNOTATIONS,
+    FLAT,
+    GREY,
+    UPRIGHT,
+    ToyScene,
+    assert_same,
+    ball,
+    box,
+    camera,
+    entry,
+    flat_shaded,
+    one,
+    random_pose,
+    render,
+    render_gbuffer,
+    sheet,
+    views_of,
+)
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
 NEVER = 1.0e6
@@ -35,8 +52,7 @@ def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[
     """G-buffer and amodal bits of world 0 seen by camera 0; `by_rays`: the G-buffer by ray tracing."""
     out, renderer = render_gbuffer(toy, device)
     if by_rays:
-        zero = wp.zeros(1, dtype=wp.int32, device=device)
-        trace_gbuffer(renderer.scene, renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, 1)
+        trace_gbuffer(renderer.scene, renderer.bodies, views_of(toy, device, renderer.cameras), renderer.gbuffer, 1)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": bits_of(masks_of_buffers(out))[0]}
 
@@ -77,7 +93,7 @@ def random_triangles(seed: int, count: int, size: float, spread: float) -> np.nd
 def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
     """Two metres are much larger than the camera's distance of one: such triangles pass through its plane, and behind it."""
     corners = random_triangles(seed, count, size, 0.2)
-    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device(default_device()))
+    found = gbuffer_of(one(triangles(corners), FLAT, VIEW), pick_device(default_device()))
     depth, clear = depth_in_float64(corners)
     sure = clear > 0.1
     assert sure.mean() > 0.5
@@ -94,7 +110,7 @@ def test_triangles_that_reach_the_camera_plane_are_complete(device, depth):
     near, far = rng.uniform(-0.02, 0.02, (12, 2)), rng.uniform(-0.25, 0.25, (12, 2, 2))
     corners = np.stack([np.concatenate([n, [1.0 - depth]]) for n in near])[:, None]
     corners = np.concatenate([corners, np.concatenate([far, np.zeros((12, 2, 1))], axis=2)], axis=1)
-    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
+    found = gbuffer_of(one(triangles(corners), FLAT, VIEW), device)
     expected, clear = depth_in_float64(corners)
     sure = clear > 0.02
     assert sure.mean() > 0.4
@@ -106,7 +122,7 @@ def test_triangles_that_reach_the_camera_plane_are_complete(device, depth):
 def test_ray_tracing_gives_the_same_gbuffer(device, seed):
     rng = np.random.default_rng(seed)
     meshes = [ball(0.1, 4), box(0.2, 0.1, 0.05), ball(0.05, 2), sheet(0.4, 0.3)]
-    poses = [(*rng.uniform((-0.2, -0.1, 0.0), (0.2, 0.1, 0.3)), *(q / np.linalg.norm(q))) for q in rng.normal(size=(4, 4))]
+    poses = [random_pose(rng, (-0.2, -0.1, 0.0), (0.2, 0.1, 0.3)) for _ in meshes]
     fixtures = (Fixture(box(0.7, 0.5, 0.02), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(ball(0.04, 3), GREY))
     placed = ((0.01, 0.0, 0.0, *UPRIGHT), (0.1, 0.1, 0.4, *UPRIGHT), (0.1, 0.1, 0.2, *UPRIGHT))
     toy = ToyScene(
@@ -144,7 +160,7 @@ def test_shared_edges_are_watertight(device):
             faces += [(a, b, c), (c, d, a)] if (i + j) % 2 else [(d, a, b), (b, c, d)]
     mesh = triangles(np.array(faces))
     for turn in (UPRIGHT, (1.0, 0.0, 0.0, 0.0)):
-        found = gbuffer_of(ToyScene([entry(mesh)], [[(0, (0.0, 0.0, 0.0, *turn))]], (VIEW,)), device)
+        found = gbuffer_of(one(mesh, (0.0, 0.0, 0.0, *turn), VIEW), device)
         rows, columns = np.nonzero(found["segment"] == 1)
         inside = found["segment"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         assert (inside == 1).all()
@@ -154,10 +170,7 @@ def test_shared_edges_are_watertight(device):
 def test_the_order_of_triangles_and_bodies_does_not_matter(device):
     corners = random_triangles(3, 300, 0.05, 0.2)
     shuffled = np.random.default_rng(0).permutation(len(corners))
-    first, second = (
-        gbuffer_of(ToyScene([entry(triangles(c))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
-        for c in (corners, corners[shuffled])
-    )
+    first, second = (gbuffer_of(one(triangles(c), FLAT, VIEW), device) for c in (corners, corners[shuffled]))
     np.testing.assert_array_equal(first["depth"], second["depth"])
     np.testing.assert_array_equal(first["amodal"], second["amodal"])
     met = first["segment"] == 1
@@ -166,7 +179,7 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
 
 @pytest.mark.parametrize("capacity", [0, 3, raster.BLOCKS])
 def test_large_triangles_are_complete_with_any_capacity_for_blocks(device, capacity, monkeypatch):
-    toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927))]], (camera(192, 128, 300.0, (0.0, 0.0, 1.0)),))
+    toy = one(box(0.3, 0.2, 0.1), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(192, 128, 300.0, (0.0, 0.0, 1.0)))
     expected = gbuffer_of(toy, device, by_rays=True)
     monkeypatch.setattr(raster, "BLOCKS", capacity)
     monkeypatch.setattr(raster, "INSTANCE_BLOCKS", 0)
@@ -190,8 +203,7 @@ def test_the_static_background_equals_the_rasterized_tote(device):
     )
     other = replace(toy, fixture_poses=((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), *toy.fixture_poses[1:]))
     pictures = [render(scene, device) for scene in (toy, other)]
-    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
-        np.testing.assert_array_equal(getattr(pictures[0], name), getattr(pictures[1], name))
+    assert_same(*pictures, "color", "exact_depth", "radiance", *ANNOTATIONS)
     assert {1, Segment.TABLE, Segment.TOTE, Segment.FINGER} <= set(np.unique(pictures[0].instance))
     # An object under the tote keeps its amodal bits, and is not visible.
     assert ((pictures[0].amodal & 2) != 0).any()
@@ -230,8 +242,7 @@ def test_a_world_shows_its_own_bin(device, chosen):
     several = render(replace(IN_A_BIN, fixtures=(*BINS, *GRIP), bin=chosen), device)
     alone = render(replace(IN_A_BIN, fixtures=(BINS[chosen], *GRIP)), device)
     assert {1, 2, Segment.TABLE, Segment.TOTE, Segment.FINGER} <= set(np.unique(alone.instance))
-    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
-        np.testing.assert_array_equal(getattr(several, name), getattr(alone, name))
+    assert_same(several, alone, "color", *ANNOTATIONS)
 
 
 def test_a_bin_that_moves_with_camera_and_objects_gives_the_same_picture(device):

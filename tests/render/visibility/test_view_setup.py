@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.stages.render.view_setup import make_views, pair_views
-from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, render_gbuffer, sheet
+from synpick_warp.stages.render.view_setup import pair_views
+from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, random_pile, random_rotation, render_gbuffer, sheet, views_of
 
 
 def pile(rng, count: int) -> ToyScene:
     """An object at the origin and others of many shapes at random poses around it, seen from a random camera; some surround the camera."""
     meshes = [box(0.16, 0.07, 0.2), ball(0.06, 2), box(0.3, 0.004, 0.02), sheet(0.2, 0.1), box(0.02, 0.02, 0.02)]
-    rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    rotation *= np.linalg.det(rotation)
+    rotation = random_rotation(rng)
     view = camera(83, 46, rng.uniform(40.0, 250.0), tuple(rotation.T @ (0.0, 0.0, -rng.uniform(0.1, 1.5))), rotation)
-    placed = []
-    for index in range(count):
-        quaternion = rng.normal(size=4)
-        position = rng.uniform(-0.4, 0.4, 3) * min(index, 1)
-        placed.append((int(rng.integers(len(meshes))), (*position, *(quaternion / np.linalg.norm(quaternion)))))
+    placed = random_pile(rng, len(meshes), count, (-0.4,) * 3, (0.4,) * 3)
+    placed[0] = (placed[0][0], (0.0, 0.0, 0.0, *placed[0][1][3:]))
     return ToyScene([entry(mesh) for mesh in meshes], [placed], (view,), instances=count + 2)
 
 
@@ -41,8 +37,7 @@ def test_tile_body_masks_are_conservative(device, seed):
     assert present == 14
     expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "mask_words")}
     renderer.bodies.body_mask.fill_(wp.uint64((1 << 14) - 1))
-    zero = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.instances, renderer.cameras), renderer.gbuffer, out)
+    renderer.rasterizer.rasterize(renderer.bodies, views_of(toy, device, renderer.cameras), renderer.gbuffer, out)
     for name, image in expected.items():
         np.testing.assert_array_equal(image, getattr(out, name).numpy())
     counts = np.array([int(value).bit_count() for value in masks])
