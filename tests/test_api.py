@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import subprocess
 import sys
 import tomllib
@@ -64,13 +65,14 @@ def test_the_version_stands_in_one_place_and_the_type_marker_is_packaged():
     assert (ROOT / "synpick_warp" / "py.typed").is_file()
 
 
-def test_settings_of_a_preset_are_overridden(tmp_path, calls):
+def test_settings_of_a_preset_are_overridden(tmp_path, calls, caplog):
     synpick_warp.bake("smoke", str(tmp_path / "set"), {"bake.mode": "move"}, shard=(1, 2))
     [(config, out, progress, shard, *_)] = calls
     assert config == load_config("smoke", {"bake.mode": "move"}) == synpick_warp.load_config("smoke", {"bake.mode": "move"})
     assert synpick_warp.load_config() == load_config(None, {})
     assert (out, shard) == (tmp_path / "set", (1, 2))
-    assert isinstance(progress, SilentProgress)
+    progress.note("masses are guessed")
+    assert caplog.record_tuples == [("synpick_warp", logging.WARNING, "masses are guessed")]
 
 
 def test_a_config_is_taken_as_it_is(tmp_path, calls):
