@@ -1,13 +1,17 @@
-"""Assertions on convex pieces."""
+"""Assertions and measurements on convex pieces and closed meshes."""
 
 from __future__ import annotations
 
 import collections
+from collections.abc import Iterable
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
+from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.collision.hulls import mass_properties
-from synpick_warp.scenes.types import ConvexPiece
+from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from tests.twins.rays import edges_match, first_hit
 
 
 def assert_valid(piece: ConvexPiece) -> None:
@@ -21,3 +25,30 @@ def assert_valid(piece: ConvexPiece) -> None:
     heights = np.einsum("fi,fvi->fv", doubled, piece.vertices[None] - corners[:, :1])
     assert heights.max() <= 1e-5 * size**3
     assert mass_properties([piece]).volume > 0.0
+
+
+def assert_closed(mesh: TriangleMesh) -> None:
+    """Closed, outward, with normals of length 1."""
+    assert edges_match(merge_positions(mesh.vertices, mesh.faces)[1])
+    assert signed_volume(mesh.vertices, mesh.faces) > 0
+    assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-3
+
+
+def is_convex(piece: ConvexPiece) -> bool:
+    """Closed, outward, and no vertex more than a micrometre beyond a face."""
+    corners = piece.vertices[piece.faces].astype(np.float64)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    height = ((piece.vertices[None].astype(np.float64) - corners[:, :1]) * normal[:, None]).sum(axis=2)
+    return edges_match(piece.faces) and signed_volume(piece.vertices, piece.faces) > 0 and height.max() < 1e-6
+
+
+def filled(pieces: Iterable[ConvexPiece], points: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    """Whether points (N, 3) lie in one of some convex pieces, at least `margin` deep [m]."""
+    planes = [ConvexHull(piece.vertices.astype(float)).equations for piece in pieces]
+    return np.any([(points @ each[:, :3].T + each[:, 3] <= -margin).all(axis=1) for each in planes], axis=0)
+
+
+def felt(pieces: Iterable[ConvexPiece], origin: tuple[float, ...], direction: tuple[float, ...]) -> float:
+    """Distance along a ray to the first of some pieces [m]."""
+    return min(first_hit(piece.vertices, piece.faces, origin, direction) for piece in pieces)

@@ -12,26 +12,36 @@ import trimesh
 from synpick_warp.configs.cell.gripper import GRIPPERS
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.schema import Gripper
 from synpick_warp.dataset.commit.manifest import describe_differences, make_manifest
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.bin_meshes.loading import load_settings
+from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
 from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
 from synpick_warp.scenes.grippers.tool_mesh import measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
-from tests.scenes.test_tote_gripper import UP, convex, felt
-from tests.twins.rays import edges_match, first_hit
+from tests.harness.pieces import assert_closed, felt, is_convex
+from tests.twins.rays import first_hit
 from tests.worlds.small_worlds import catalog
 
+ARRAY = {"kind": "suction_array"}
 EXAMPLES = [
     {},
-    {"kind": "suction_array", "cups": [[0.0, 0.0]]},
-    {"kind": "suction_array", "cups": [[-0.05, 0.0], [0.0, 0.0], [0.05, 0.0]]},
-    {"kind": "suction_array", "cups": [[0.04, 0.03], [-0.04, 0.03], [-0.04, -0.03]], "cup_width": 0.03, "cup_length": 0.08},
+    ARRAY | {"cups": [[0.0, 0.0]]},
+    ARRAY | {"cups": [[-0.05, 0.0], [0.0, 0.0], [0.05, 0.0]]},
+    ARRAY | {"cups": [[0.04, 0.03], [-0.04, 0.03], [-0.04, -0.03]], "cup_width": 0.03, "cup_length": 0.08},
 ]
 """Settings of grippers. To add a kind, add a row."""
-BEAM = {"kind": "suction_array", "cups": [[0.0, 0.06], [0.0, -0.06]], "mesh_unit": "mm"}
+BEAM = ARRAY | {"cups": [[0.0, 0.06], [0.0, -0.06]], "mesh_unit": "mm"}
 """Two cups, 120 mm apart along the wrist axis, under the beam of `beam_file`."""
+
+
+UP = (0.0, 0.0, 1.0)
+
+
+def options(row: dict[str, object]) -> dict[str, object]:
+    """Settings of a gripper by full keys."""
+    return {f"gripper.{name}": value for name, value in row.items()}
 
 
 def beam_file(folder: Path, low: float = -20.0, half: float = 80.0) -> Path:
@@ -45,16 +55,22 @@ def test_every_kind_has_a_head_a_behavior_and_an_example():
     assert set(GRIPPERS) == set(HEADS) == set(BEHAVIORS) == {"suction1", *(row["kind"] for row in EXAMPLES[1:])}
 
 
-@pytest.mark.parametrize("row", EXAMPLES)
-def test_settings_survive_writing_and_reading(row, tmp_path):
-    config = load_config("smoke", {f"gripper.{name}": value for name, value in row.items()})
-    (tmp_path / "written.toml").write_text(config_to_toml(config))
-    assert load_config(str(tmp_path / "written.toml"), {}) == config
+def test_the_finger_is_a_cone_above_the_tilt_axis_and_its_collision_shape_is_as_long():
+    gripper = Gripper()
+    fixture, collider = finger_fixture(gripper), finger_collider(gripper)
+    assert_closed(fixture.mesh)
+    assert fixture.material.texture is None
+    assert is_convex(collider)
+    for vertices in (fixture.mesh.vertices, collider.vertices):
+        assert (vertices[:, 2].min(), vertices[:, 2].max()) == (0, pytest.approx(gripper.finger_length))
+    vertices = fixture.mesh.vertices
+    assert np.ptp(vertices[:, 0]) == pytest.approx(gripper.finger_width)
+    assert np.ptp(vertices[vertices[:, 2] < 0.02, 0]) == pytest.approx(0.03, abs=1e-3)
 
 
 def test_a_mesh_is_the_body_of_a_tool(tmp_path):
     """Its cups end in it; its checksum is written, so that another mesh under the same name is refused."""
-    config = load_settings("smoke", {f"gripper.{name}": value for name, value in BEAM.items()} | {"gripper.mesh": str(beam_file(tmp_path))})
+    config = load_settings("smoke", options(BEAM | {"mesh": str(beam_file(tmp_path))}))
     gripper, head = config.gripper, make_head(config.gripper)
     low, high = head.fixture.mesh.vertices.min(axis=0), head.fixture.mesh.vertices.max(axis=0)
     np.testing.assert_allclose([low, high], [(-0.021, -0.081, -0.055), (0.021, 0.081, 0.005)], atol=1.2e-3)
@@ -88,18 +104,18 @@ def test_meshes_that_cannot_hold_the_cups_are_refused(size, other, said, tmp_pat
     (tmp_path / "beam.txt").write_bytes(path.read_bytes())
     given = BEAM | other | {"mesh": str(tmp_path / other.get("mesh", path.name))}
     with pytest.raises(ConfigError, match=r"^gripper.mesh: [^\n]*" + said + r"[^\n]*$"):
-        load_settings("smoke", {f"gripper.{name}": value for name, value in given.items()})
+        load_settings("smoke", options(given))
 
 
 @pytest.mark.parametrize("row", EXAMPLES)
-def test_a_head_ends_in_the_lips_of_its_cups(row):
-    gripper = load_config("smoke", {f"gripper.{name}": value for name, value in row.items()}).gripper
-    head = make_head(gripper)
+def test_a_head_ends_in_the_lips_of_its_cups_and_its_settings_survive_writing(row, tmp_path):
+    config = load_config("smoke", options(row))
+    (tmp_path / "written.toml").write_text(config_to_toml(config))
+    assert load_config(str(tmp_path / "written.toml"), {}) == config
+    gripper, head = config.gripper, make_head(config.gripper)
     mesh, radius, lip = head.fixture.mesh, gripper.cup_width / 2, -gripper.cup_length
-    assert edges_match(merge_positions(mesh.vertices, mesh.faces)[1])
-    assert signed_volume(mesh.vertices, mesh.faces) > 0
-    assert np.abs(np.linalg.norm(mesh.normals, axis=1) - 1).max() < 1e-3
-    assert all(convex(piece) and len(piece.vertices) <= 32 for piece in head.pieces)
+    assert_closed(mesh)
+    assert all(is_convex(piece) and len(piece.vertices) <= 32 for piece in head.pieces)
     assert mesh.vertices[:, 2].min() == pytest.approx(lip)
     assert min(head.inertia) > 0
     assert 2 * max(head.inertia) < sum(head.inertia)
@@ -113,32 +129,26 @@ def test_a_head_ends_in_the_lips_of_its_cups(row):
         assert felt(head.pieces, (x + 0.9 * radius, y + 1e-3, -1.0), UP) == pytest.approx(1.0 + lip, abs=1e-6)
 
 
-ARRAY = {"gripper.kind": "suction_array"}
-
-
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        ({"gripper.kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
-        ({"gripper.mesh": "a.stl"}, r'gripper.mesh is "a.stl" .*; allowed: none with gripper.kind "suction1"'),
-        ({"gripper.cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
-        (
-            {"gripper.valve": "common"},
-            r'^gripper.valve is "common" .*; allowed: each with gripper.kind "suction1", which [^\n]*$',
-        ),
-        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.03, 0.0]]}, r"gripper.cups is .*; allowed: cups that do not overlap: 0 and 1 are 0.03"),
-        (ARRAY | {"gripper.cups": [[0.0, 0.0], [0.3, 0.0]]}, r"gripper.cups is .*; allowed: within 0.155 m of the middle: the tool"),
-        (ARRAY | {"gripper.cups": [[0.05 * i - 0.4, 0.0] for i in range(17)]}, r"gripper.cups is .*; allowed: 1 to 16 places"),
+        ({"kind": "suction_array"}, r"gripper.cups is \[\] by default; allowed: 1 to 16 places \[x, y\]"),
+        ({"mesh": "a.stl"}, r'gripper.mesh is "a.stl" .*; allowed: none with gripper.kind "suction1"'),
+        ({"cups": [[0.0, 0.0]]}, r'gripper.cups is .*; allowed: none with gripper.kind "suction1"'),
+        ({"valve": "common"}, r'^gripper.valve is "common" .*; allowed: each with gripper.kind "suction1", which [^\n]*$'),
+        (ARRAY | {"cups": [[0.0, 0.0], [0.03, 0.0]]}, r"gripper.cups is .*; allowed: cups that do not overlap: 0 and 1 are 0.03"),
+        (ARRAY | {"cups": [[0.0, 0.0], [0.3, 0.0]]}, r"gripper.cups is .*; allowed: within 0.155 m of the middle: the tool"),
+        (ARRAY | {"cups": [[0.05 * i - 0.4, 0.0] for i in range(17)]}, r"gripper.cups is .*; allowed: 1 to 16 places"),
     ],
 )
 def test_tools_that_cannot_be_are_refused(overrides, expected):
     with pytest.raises(ConfigError, match=expected):
-        load_config("smoke", overrides)
+        load_config("smoke", options(overrides))
 
 
 def test_cups_that_reach_no_object_are_refused():
     """Objects are gripped at the tool centre point: a cup farther from it than any object is long holds nothing."""
-    config = load_config("tabletop", ARRAY | {"gripper.cups": [[0.3, 0.0], [0.4, 0.0]]})
+    config = load_config("tabletop", options(ARRAY | {"cups": [[0.3, 0.0], [0.4, 0.0]]}))
     long, short = (catalog([(size, 0.03, 0.02)]) for size in (0.29, 0.28))
     check_reach(config.gripper, config.suction, long)
     with pytest.raises(ConfigError, match=r"^no cup of gripper.cups reaches an object: the nearest is 0.3 m from the tool centre[^\n]*$"):
