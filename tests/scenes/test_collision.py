@@ -1,26 +1,35 @@
-"""Collision shapes: hulls of few vertices, mass properties, convex decomposition and its cache."""
+"""Collision shapes: simplified hulls, mass properties, convex decomposition and its cache."""
 
 from __future__ import annotations
 
+import itertools
+import os
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import coacd
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist, pdist
+from scipy.spatial.transform import Rotation
 
+from synpick_warp.configs.fields import settings_of
+from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import smooth_normals
 from synpick_warp.scenes.collision import shapes as collision
+from synpick_warp.scenes.collision import simplification
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
-from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
+from synpick_warp.scenes.collision.hulls import hull_planes, hull_volume, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
-from synpick_warp.scenes.collision.simplification import simplify_hull
+from synpick_warp.scenes.collision.simplification import MIN_VERTICES, simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure
 from tests.harness.environment import checkout_environment
@@ -35,6 +44,9 @@ def as_mesh(shape: trimesh.Trimesh) -> TriangleMesh:
     return TriangleMesh(vertices, faces, smooth_normals(vertices, faces), np.zeros((len(vertices), 2), np.float32))
 
 
+BOX = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+
+
 def bowl(segments: int = 10) -> trimesh.Trimesh:
     """Half a spherical shell, 0.1 m outside, 0.09 m inside, open at the top."""
     angle = np.linspace(0.0, np.pi / 2, 5)
@@ -43,29 +55,15 @@ def bowl(segments: int = 10) -> trimesh.Trimesh:
     return trimesh.creation.revolve(np.concatenate([outer, inner]), sections=segments)
 
 
-def never(line: str) -> None:
-    pytest.fail(line)
-
-
-def nothing(function, calls, limits):
-    assert not calls, "computed again"
-    return []
-
-
-def test_mass_properties_of_a_cube_far_from_its_origin():
-    box = trimesh.creation.box((1.0, 1.0, 1.0))
-    box.apply_translation((3.0, -2.0, 7.0))
-    result = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32))])
-    assert result.volume == pytest.approx(1.0)
-    assert result.center_of_mass == pytest.approx((3.0, -2.0, 7.0))
-    assert np.allclose(result.unit_inertia, np.eye(3) / 6)
-
-
-def test_mass_properties_of_two_half_boxes_are_those_of_the_whole():
+def test_mass_properties_of_a_cube_far_from_its_origin_and_of_two_half_boxes():
+    cube = trimesh.creation.box((1.0, 1.0, 1.0)).apply_translation((3.0, -2.0, 7.0))
     halves = [trimesh.creation.box(bounds=((left, 0.0, 0.0), (left + 0.1, 0.2, 0.3))) for left in (0.0, 0.1)]
-    result = mass_properties([ConvexPiece(half.vertices.astype(np.float32), half.faces.astype(np.int32)) for half in halves])
-    assert result.volume == pytest.approx(0.012)
-    assert np.allclose(np.diag(result.unit_inertia), np.array((0.2**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.2**2)) / 12)
+    for boxes, sides, middle in (([cube], (1.0, 1.0, 1.0), (3.0, -2.0, 7.0)), (halves, (0.2, 0.2, 0.3), (0.1, 0.1, 0.15))):
+        result = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32)) for box in boxes])
+        squares = np.square(sides)
+        assert result.volume == pytest.approx(np.prod(sides))
+        assert result.center_of_mass == pytest.approx(middle)
+        assert np.allclose(result.unit_inertia, np.diag(squares.sum() - squares) / 12)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(5, 60), st.floats(1e-2, 1.0))
@@ -106,74 +104,55 @@ def test_a_decomposed_bowl_stays_hollow(bowl_shape):
         assert np.einsum("fi,fi->f", doubled, middle - corners[:, 0]).max() > 0.0
 
 
-def test_the_second_time_a_shape_comes_from_the_cache(bowl_shape, monkeypatch):
+def test_the_second_time_shapes_come_from_the_cache(bowl_shape, tmp_path, monkeypatch):
+    """Hulls too; and decompositions in parallel give the same pieces."""
     cache, mesh, shape = bowl_shape
-    monkeypatch.setattr(collision, "run_isolated", nothing)
-    (again,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, never)
-    assert len(again) == len(shape)
-    for one, two in zip(again, shape, strict=True):
+    (parallel, _) = collision_shapes(["one", "two"], [mesh, as_mesh(bowl(8))], [CONCAVE, CONCAVE], tmp_path, lambda _: None)
+    (hull,) = collision_shapes(["box"], [BOX], [HULL], tmp_path / "new", pytest.fail)
+    assert [file.suffix for file in (tmp_path / "new").iterdir()] == [".npz"]
+    monkeypatch.setattr(collision, "run_isolated", lambda function, calls, limits: pytest.fail("computed again") if calls else [])
+    (again,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, pytest.fail)
+    (hull_again,) = collision_shapes(["box"], [BOX], [HULL], tmp_path / "new", pytest.fail)
+    for one, two in zip((*again, *hull_again, *parallel), (*shape, *hull, *shape), strict=True):
         assert np.array_equal(one.vertices, two.vertices)
         assert np.array_equal(one.faces, two.faces)
-        assert one.vertices.dtype == np.float32
-        assert one.faces.dtype == np.int32
-
-
-def test_hulls_are_cached_too_and_no_temporary_file_is_left(tmp_path, monkeypatch):
-    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
-    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
-    assert [file.suffix for file in (tmp_path / "new").iterdir()] == [".npz"]
-    monkeypatch.setattr(collision, "run_isolated", nothing)
-    (again,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
-    assert np.array_equal(again[0].vertices, shape[0].vertices)
+        assert (one.vertices.dtype, one.faces.dtype) == (np.float32, np.int32)
 
 
 def test_other_settings_and_other_meshes_have_cache_files_of_their_own(tmp_path):
     mesh = as_mesh(trimesh.creation.icosphere(3, radius=0.05))
     moved = replace(mesh, vertices=mesh.vertices + np.float32(1e-3))
-    shapes = collision_shapes(["a", "b", "c"], [mesh, mesh, moved], [HULL, replace(HULL, hull_vertices=20), HULL], tmp_path, never)
+    shapes = collision_shapes(["a", "b", "c"], [mesh, mesh, moved], [HULL, replace(HULL, hull_vertices=20), HULL], tmp_path, pytest.fail)
     assert len(list(tmp_path.iterdir())) == 3
     assert [len(shape[0].vertices) for shape in shapes] == [64, 20, 64]
 
 
-@pytest.mark.parametrize("damage", [b"", b"scrap", None])
+@pytest.mark.parametrize("damage", ["empty", "scrap", "half", "indices", "fifo"])
 def test_a_damaged_cache_file_is_computed_again(tmp_path, damage):
-    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
-    collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    """Also one with vertex indices out of range."""
+    collision_shapes(["box"], [BOX], [HULL], tmp_path, pytest.fail)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
-    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    if damage == "fifo":
+        file.unlink()
+        os.mkfifo(file)
+    elif damage == "indices":
+        with np.load(file) as data:
+            arrays = {**data, "faces": data["faces"] + 5}
+        np.savez(file, **arrays)
+    else:
+        file.write_bytes({"empty": b"", "scrap": b"scrap", "half": whole[: len(whole) // 2]}[damage])
+    (shape,) = collision_shapes(["box"], [BOX], [HULL], tmp_path, pytest.fail)
     assert_valid(shape[0])
     assert file.read_bytes() == whole
 
 
-def test_a_cache_file_with_vertex_indices_out_of_range_is_computed_again(tmp_path):
-    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
-    collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
-    (file,) = tmp_path.iterdir()
-    with np.load(file) as data:
-        arrays = {**data, "faces": data["faces"] + 5}
-    np.savez(file, **arrays)
-    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
-    assert_valid(shape[0])
-
-
 def test_without_a_writable_cache_shapes_are_computed_all_the_same(tmp_path):
     (tmp_path / "file").write_text("")
-    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     lines: list[str] = []
-    shapes = collision_shapes(["a", "b"], [mesh, mesh], [HULL, HULL], tmp_path / "file" / "cache", lines.append)
-    assert len(shapes) == 2
-    assert len(lines) == 1
-    assert "cannot be written" in lines[0]
-
-
-def test_parallel_decomposition_gives_the_same_pieces(tmp_path, bowl_shape):
-    _, mesh, shape = bowl_shape
-    other = as_mesh(bowl(8))
-    first, _ = collision_shapes(["one", "two"], [mesh, other], [CONCAVE, CONCAVE], tmp_path, lambda _: None)
-    assert len(first) == len(shape)
-    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(first, shape, strict=True))
+    assert len(collision_shapes(["a", "b"], [BOX, BOX], [HULL, HULL], tmp_path / "file" / "cache", lines.append)) == 2
+    (line,) = lines
+    assert "cannot be written" in line
 
 
 GUARDLESS = """
@@ -205,46 +184,41 @@ def test_a_script_without_main_guard_can_decompose(tmp_path):
     assert (result.returncode, result.stdout, result.stderr) == (0, "[1, 1]\n", "")
 
 
-def fall_back(tmp_path, monkeypatch, result):
-    """Collision shape of a mug, and the progress lines, where the decomposition returns or raises `result`."""
-
-    def run(function, calls, limits):
-        return [result if function is decompose else function(*call) for call in calls]
-
-    monkeypatch.setattr(collision, "run_isolated", run)
-    lines: list[str] = []
-    (shape,) = collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append)
-    return shape, lines
-
-
 @pytest.mark.parametrize(
     ("result", "said"),
     [
         ((), "found no convex pieces"),
         (Failure("crashed (SIGSEGV)"), "crashed (SIGSEGV)"),
         (CatalogError("all vertices lie in one plane"), "failed (all vertices lie in one plane)"),
+        *(
+            (Failure(reason, by_machine=True), reason)
+            for reason in ("took longer than 300 s of processor time and was stopped", "was killed, probably for lack of memory")
+        ),
     ],
 )
-def test_what_cannot_be_decomposed_gets_its_hull_with_a_line_and_is_tried_again(tmp_path, monkeypatch, result, said):
+def test_what_cannot_be_decomposed_gets_its_hull_with_a_line_or_is_an_error_and_is_tried_again(tmp_path, monkeypatch, result, said):
+    """An error where the machine does not suffice. No file is left."""
+
+    def run(function, calls, limits):
+        return [result if function is decompose else function(*call) for call in calls]
+
+    monkeypatch.setattr(collision, "run_isolated", run)
     for _ in range(2):
-        (hull,), lines = fall_back(tmp_path, monkeypatch, result)
+        lines: list[str] = []
+        if isinstance(result, Failure) and result.by_machine:
+            with pytest.raises(CatalogError, match=f"^mug: its convex decomposition {said}; .*raise objects.decomposition_time"):
+                collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append)
+            continue
+        (((hull,),)) = collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lines.append)
         assert_valid(hull)
         assert lines[-1].startswith(f"mug: its convex decomposition {said}; its convex hull is used instead: ")
         assert len(lines) == 2
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("reason", ["took longer than 300 s of processor time and was stopped", "was killed, probably for lack of memory"])
-def test_a_decomposition_for_which_the_machine_does_not_suffice_is_an_error_and_leaves_no_file(tmp_path, monkeypatch, reason):
-    for _ in range(2):
-        with pytest.raises(CatalogError, match=f"^mug: its convex decomposition {reason}; .*raise objects.decomposition_time"):
-            fall_back(tmp_path, monkeypatch, Failure(reason, by_machine=True))
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_hull_that_cannot_be_computed_is_the_error_of_its_object(tmp_path):
     flat = as_mesh(trimesh.creation.box((0.1, 0.1, 0.0)))
-    good, bad = collision_shapes(["good", "bad"], [as_mesh(bowl()), flat], [HULL, HULL], tmp_path, never)
+    good, bad = collision_shapes(["good", "bad"], [as_mesh(bowl()), flat], [HULL, HULL], tmp_path, pytest.fail)
     assert len(good) == 1
     assert isinstance(bad, CatalogError)
     assert str(bad) == "bad: all vertices lie in one plane; a body needs a volume"
@@ -252,22 +226,14 @@ def test_a_hull_that_cannot_be_computed_is_the_error_of_its_object(tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "modes"),
-    [
-        ("closed", ["off"]),
-        ("open", ["auto"]),
-        ("apart", ["off"]),
-        ("joined", ["auto"]),
-        ("folded", ["off"]),
-        ("lost", ["off", "auto"]),
-    ],
+    [("closed", "off"), ("open", "auto"), ("apart", "off"), ("joined", "auto"), ("folded", "off"), ("lost", "off auto")],
 )
 def test_only_open_meshes_inner_walls_and_lost_parts_are_preprocessed(monkeypatch, kind, modes):
     shell, asked = bowl(), []
     if kind == "open":
         shell.update_faces(np.arange(len(shell.faces)) > 0)
     if kind in ("apart", "joined"):
-        other = trimesh.creation.icosphere(2, 0.05)
-        other.apply_translation((0.5 if kind == "apart" else 0.0, 0.0, 0.0))
+        other = trimesh.creation.icosphere(2, 0.05).apply_translation((0.5 if kind == "apart" else 0.0, 0.0, 0.0))
         shell = trimesh.util.concatenate([trimesh.creation.box((0.06, 0.2, 0.06)), other])
     if kind == "folded":
         shell = trimesh.Trimesh(shell.vertices, [*shell.faces, (0, 9, 30), (9, 0, 30)], process=False)
@@ -279,7 +245,7 @@ def test_only_open_meshes_inner_walls_and_lost_parts_are_preprocessed(monkeypatc
 
     monkeypatch.setattr(coacd, "run_coacd", run_coacd)
     (piece,) = decompose(as_mesh(shell), CONCAVE)
-    assert asked == modes
+    assert asked == modes.split()
     assert_valid(piece)
 
 
@@ -302,7 +268,7 @@ def test_repeated_triangles_and_needles_do_not_reach_coacd(monkeypatch, copies):
 def test_slivers_of_a_decomposition_are_dropped(monkeypatch):
     big, flat = trimesh.creation.box((0.1, 0.1, 0.1)).vertices, trimesh.creation.box((0.01, 0.01, 1e-5)).vertices
     monkeypatch.setattr(coacd, "run_coacd", lambda *_, **__: [(big, None), (flat, None), (flat * (1, 1, 0), None)])
-    (piece,) = decompose(as_mesh(trimesh.creation.box((0.1, 0.1, 0.1))), CONCAVE)
+    (piece,) = decompose(BOX, CONCAVE)
     assert mass_properties([piece]).volume == pytest.approx(1e-3)
 
 
@@ -311,3 +277,196 @@ def test_the_default_cache_follows_the_environment(monkeypatch, tmp_path):
     assert default_cache_dir() == tmp_path / "synpick-warp" / "collision"
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     assert default_cache_dir() == Path.home() / ".cache" / "synpick-warp" / "collision"
+
+
+# ---- simplification of hulls: boxes, scans of boxes, spheres, random and degenerate points ----
+
+
+def ring(radius: float, height: float, count: int) -> np.ndarray:
+    """Points of a circle about the z-axis."""
+    angle = np.linspace(0.0, 2.0 * np.pi, count, endpoint=False)
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.full(count, height)])
+
+
+def ball(rng: np.random.Generator, radius: float, count: int) -> np.ndarray:
+    points = rng.normal(size=(count, 3))
+    return radius * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def ladle(rng: np.random.Generator) -> np.ndarray:
+    """A sphere with a thin, long handle."""
+    thickness, length = rng.uniform(0.005, 0.1), rng.uniform(3.0, 10.0)
+    return np.concatenate([ball(rng, rng.uniform(0.2, 1.0), 80), ring(thickness, length, 12), ring(0.7 * thickness, 1.01 * length, 12)])
+
+
+def wedge(rng: np.random.Generator) -> np.ndarray:
+    """A long body that tapers to an edge, with rough sides."""
+    width, edge = rng.uniform(0.3, 1.0, 2), rng.uniform(0.001, 0.05)
+    corners = [(x * width[0], y * width[1], 0.0) for x in (-1, 1) for y in (-1, 1)]
+    corners += [(x * edge, y * rng.uniform(0.2, 1.0) * width[1], 3.0) for x in (-1, 1) for y in (-1, 1)]
+    points = np.concatenate([corners, rng.dirichlet(np.full(8, 0.3), 150) @ corners])
+    return points + rng.normal(size=points.shape) * 0.005
+
+
+def cone(rng: np.random.Generator) -> np.ndarray:
+    return np.concatenate([ring(1.0, 0.0, int(rng.integers(30, 90))), [(0.0, 0.0, rng.uniform(0.2, 6.0))]])
+
+
+def rod(rng: np.random.Generator) -> np.ndarray:
+    """A thin rod with one chamfered end."""
+    radius, count = rng.uniform(0.001, 0.05), int(rng.integers(16, 40))
+    return np.concatenate([ring(radius, -1.0, count), ring(radius, 1.0, count), ring(0.7 * radius, 1.0 + 0.4 * radius, count)])
+
+
+def disc(rng: np.random.Generator) -> np.ndarray:
+    """A thin disc with one chamfered rim."""
+    thickness, count = rng.uniform(0.001, 0.05), int(rng.integers(30, 60))
+    return np.concatenate([ring(1.0, -thickness, count), ring(1.0, thickness, count), ring(0.97, 1.2 * thickness, count)])
+
+
+def tetrahedron(rng: np.random.Generator) -> np.ndarray:
+    """A rounded tetrahedron of any shape."""
+    return (rng.normal(size=(4, 1, 3)) + ball(rng, 0.08, 20)).reshape(-1, 3)
+
+
+FAMILIES = (ladle, wedge, cone, rod, disc, tetrahedron)
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def turned(points: np.ndarray, seed: int) -> np.ndarray:
+    """Points in a random orientation: quaternions of normal components are uniformly distributed."""
+    return points @ Rotation.from_quat(np.random.default_rng(seed).normal(size=4)).as_matrix().T
+
+
+def reach(piece: ConvexPiece, points: np.ndarray) -> float:
+    """Largest distance of a piece's vertex from a side of the points' hull, outside of it."""
+    planes = ConvexHull(points).equations
+    return float((piece.vertices @ planes[:, :3].T + planes[:, 3]).max())
+
+
+@settings(max_examples=12)
+@pytest.mark.parametrize("family", FAMILIES)
+@given(SEEDS, st.integers(8, 64), st.floats(-4.0, 4.0))
+def test_hulls_of_any_shape_and_size_become_half_spaces_of_their_volume(family, seed, limit, exponent):
+    points = (turned(family(np.random.default_rng(seed)), seed) * 10.0**exponent).astype(np.float32)
+    with mock.patch.object(simplification, "_decimate", wraps=simplification._decimate) as decimate:
+        piece = simplify_hull(points, limit)
+    assert decimate.call_count <= 1  # A second call is the fallback.
+    assert_valid(piece)
+    assert len(piece.vertices) <= limit
+    size = np.ptp(points, axis=0).max()
+    assert mass_properties([piece]).volume == pytest.approx(ConvexHull(points.astype(np.float64)).volume, rel=2e-3)
+    assert len(ConvexHull(piece.vertices.astype(np.float64)).vertices) == len(piece.vertices)
+    assert pdist(piece.vertices.astype(np.float64)).min() > 4e-7 * size
+
+
+@settings(max_examples=10)
+@given(SEEDS, st.integers(8, 12))
+def test_a_diagonal_rod_of_few_vertices_stays_thin(seed, limit):
+    points = turned(rod(np.random.default_rng(seed)), seed)
+    piece = simplify_hull(points, limit)
+    radius = np.linalg.norm(np.cross(points, turned(np.array([(0.0, 0.0, 1.0)]), seed)), axis=1).max()
+    assert reach(piece, points) < 4.0 * radius
+
+
+@settings(max_examples=8)
+@given(SEEDS, st.integers(8, 64))
+def test_a_turned_hull_gives_the_turned_result(seed, limit):
+    points = np.random.default_rng(seed).normal(size=(60, 3)) * (0.1, 0.06, 0.03)
+    piece, other = simplify_hull(points, limit), simplify_hull(turned(points, seed), limit)
+    assert mass_properties([other]).volume == pytest.approx(mass_properties([piece]).volume, rel=1e-5)
+    distances = cdist(turned(piece.vertices, seed), other.vertices)
+    assert max(distances.min(axis=0).max(), distances.min(axis=1).max()) < 1e-4
+
+
+@settings(max_examples=8)
+@given(SEEDS, st.integers(-30, 30))
+def test_a_scaled_hull_gives_the_scaled_result(seed, exponent):
+    points = tetrahedron(np.random.default_rng(seed)).astype(np.float32)
+    scale = np.float32(2.0**exponent)
+    assert np.array_equal(simplify_hull(points * scale, 24).vertices, simplify_hull(points, 24).vertices * scale)
+
+
+@settings(max_examples=8)
+@pytest.mark.parametrize("family", FAMILIES)
+@given(SEEDS)
+def test_no_useful_half_space_is_left_over(family, seed):
+    """Without a limit: a candidate of little volume but great height must not end the selection."""
+    hull = ConvexHull(turned(family(np.random.default_rng(seed)), seed))
+    facets, frame = simplification._cluster(hull, simplification._centroid(hull))
+    min_gain = 1e-3 * hull.volume
+    chosen = simplification._select(facets, frame, len(facets.normal), min_gain)
+    current = simplification._intersect(facets, chosen)
+    for index in set(range(len(facets.normal))) - set(chosen):
+        cut = simplification._intersect(facets, [*chosen, index])
+        assert simplification._gain(current, cut, facets.normal[index], facets.offset[index]) < min_gain
+
+
+def test_where_half_spaces_fail_the_hull_of_selected_points_is_returned():
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    with mock.patch.object(simplification, "_choose_facets", side_effect=QhullError):
+        piece = simplify_hull(points, 32)
+    assert_valid(piece)
+    assert 24 <= len(piece.vertices) <= 32
+    assert reach(piece, points) < 1e-6
+
+
+@pytest.mark.parametrize("limit", [0, 4, MIN_VERTICES - 1])
+def test_fewer_vertices_than_a_box_has_are_refused_also_by_the_settings(limit):
+    with pytest.raises(ValueError, match=f"max_vertices is {limit}, but must be at least 8"):
+        simplify_hull(np.random.default_rng(0).random((50, 3)), limit)
+    assert [settings_of(Objects)[name].bounds.low for name in ("hull_vertices", "piece_vertices")] == [MIN_VERTICES] * 2
+
+
+def test_a_cube_keeps_its_eight_corners():
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 6)] * 3), axis=-1).reshape(-1, 3)
+    piece = simplify_hull(grid, 64)
+    assert_valid(piece)
+    assert np.array_equal(np.unique(piece.vertices, axis=0), np.unique(np.sign(grid[np.abs(grid).min(axis=1) == 0.5]) / 2, axis=0))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 400), st.integers(8, 64), st.floats(1e-3, 1.0))
+@example(0, 4, 8, 1e-3)  # Half-spaces with a vertex at infinity in a plane through the inner point.
+def test_simplified_hulls_are_valid(seed, count, limit, flatness):
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.05, 0.1 * flatness)
+    piece = simplify_hull(points, limit)
+    assert_valid(piece)
+    assert len(piece.vertices) <= limit
+    assert np.array_equal(simplify_hull(points, limit).vertices, piece.vertices)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(1e-5, 2e-4))
+def test_a_scanned_box_gets_six_planar_sides(seed, roughness):
+    """Points of a box's sides, moved by up to `roughness` [m]: each side becomes one plane, no farther from it than twice that."""
+    rng, size = np.random.default_rng(seed), np.array((0.1, 0.15, 0.05))
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 9)] * 3), axis=-1).reshape(-1, 3)
+    points = grid[np.abs(grid).max(axis=1) == 0.5] * size
+    scanned = points + rng.uniform(-roughness, roughness, points.shape)
+    piece = simplify_hull(scanned, 64)
+    assert mass_properties([piece]).volume == pytest.approx(hull_volume(scanned), rel=2e-3)
+    vertices, planes = piece.vertices.astype(np.float64), hull_planes(piece)
+    for axis, side in itertools.product(range(3), (-1.0, 1.0)):
+        assert (side * vertices[:, axis]).max() == pytest.approx(size[axis] / 2, abs=2 * roughness)
+        facing = planes[side * planes[:, axis] > np.cos(np.radians(2.0))]
+        distances = np.abs(vertices @ facing[:, :3].T - facing[:, 3])
+        corners = vertices[distances[:, (distances < 1e-6).sum(axis=0).argmax()] < 1e-6]
+        assert len(corners) >= 4
+        assert (np.ptp(np.delete(corners, axis, axis=1), axis=0) > 0.9 * np.delete(size, axis)).all()
+
+
+def test_a_sphere_keeps_its_volume_in_64_vertices():
+    # Its vertices lie outside and the middles of its facets inside: by 12 and 8 % of the radius at most.
+    sphere = trimesh.creation.icosphere(3, radius=0.05)
+    piece = simplify_hull(sphere.vertices, 64)
+    assert_valid(piece)
+    assert 50 <= len(piece.vertices) <= 64
+    assert mass_properties([piece]).volume == pytest.approx(hull_volume(sphere.vertices), rel=1e-3)
+    assert np.linalg.norm(piece.vertices, axis=1).max() < 1.12 * 0.05
+    assert hull_planes(piece)[:, 3].min() > 0.92 * 0.05
+
+
+@pytest.mark.parametrize("points", [np.zeros((9, 3)), np.eye(3), np.random.default_rng(0).random((50, 3)) * (1, 1, 0), np.ones((1, 3))])
+def test_coplanar_points_have_no_hull(points):
+    assert hull_volume(points) == 0.0
+    with pytest.raises(CatalogError, match="one plane"):
+        simplify_hull(points, 64)

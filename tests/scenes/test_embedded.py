@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.configs.files.load import load_config
+from synpick_warp.scenes import modelling
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.catalog import shape_recipe
 from synpick_warp.scenes.collision import shapes
@@ -22,49 +23,14 @@ from synpick_warp.scenes.embedded import objects
 from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
 from synpick_warp.scenes.embedded.surfaces import KINDS, SIDE, surface_textures
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
-from synpick_warp.scenes.modelling import (
-    BOX_FACES,
-    NO_TEXTURE,
-    at_height,
-    ellipse,
-    lathe,
-    make_mesh,
-    rotation,
-    rounded_box,
-    rounded_rectangle,
-    solid,
-    sweep,
-    torus,
-)
 from synpick_warp.scenes.symmetries.detection import find_symmetries
+from tests.harness.pieces import assert_closed
 from tests.twins.rays import edges_match
 from tests.worlds.model_files import REAL_HULLS
 from tools.embedded_shapes import modelled_shape
 
-TABLE = {
-    # id: mass [kg], diameter [m] of the real object, metallic, roughness
-    1: (0.414, 0.172, 0.6, 0.2),
-    2: (0.411, 0.270, 0.1, 0.5),
-    3: (0.514, 0.199, 0.1, 0.5),
-    4: (0.349, 0.121, 0.1, 0.5),
-    5: (0.603, 0.197, 0.3, 0.5),
-    6: (0.171, 0.090, 0.6, 0.2),
-    7: (0.187, 0.143, 0.1, 0.5),
-    8: (0.097, 0.114, 0.1, 0.5),
-    9: (0.370, 0.130, 0.6, 0.3),
-    10: (0.066, 0.198, 0.3, 0.3),
-    11: (0.244, 0.260, 0.1, 0.5),
-    12: (1.131, 0.259, 0.1, 0.5),
-    13: (0.147, 0.162, 0.6, 0.3),
-    14: (0.118, 0.125, 0.6, 0.3),
-    15: (0.895, 0.226, 0.1, 0.6),
-    16: (0.729, 0.237, 0.3, 0.5),
-    17: (0.082, 0.204, 0.1, 0.5),
-    18: (0.016, 0.121, 0.1, 0.5),
-    19: (0.125, 0.175, 0.1, 0.5),
-    20: (0.202, 0.217, 0.1, 0.5),
-    21: (0.028, 0.103, 0.1, 0.7),
-}
+TABLE = {row.id: row for row in load_config("synpick").object_rows}
+"""The paper's object table, with diameters of the real objects."""
 PRINTED = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14)
 CONCAVE = (13, 14, 15)
 ALL = {raw.obj_id: raw for raw in procedural_objects(EMBEDDED)}
@@ -121,38 +87,34 @@ def surface_samples(raw):
     return (weights @ points).reshape(-1, 3), colors(raw, (weights @ uv).reshape(-1, 2))
 
 
-def test_ids_masses_and_materials_are_those_of_the_table():
-    assert list(OBJECTS) == list(range(1, 22))
-    for obj_id, (mass, _, metallic, roughness) in TABLE.items():
-        raw = OBJECTS[obj_id]
-        assert (raw.mass, raw.material.metallic, raw.material.roughness) == (mass, metallic, roughness)
-        assert raw.concave == (obj_id in CONCAVE)
+def test_ids_masses_materials_and_symmetries_are_those_of_the_table_and_of_bop():
+    assert list(OBJECTS) == list(TABLE) == list(range(1, 22))
+    for raw, row in zip(OBJECTS.values(), TABLE.values(), strict=True):
+        assert (raw.mass, raw.material.metallic, raw.material.roughness) == (row.mass, row.metallic, row.roughness)
+        assert raw.concave == row.concave == (raw.obj_id in CONCAVE)
         assert raw.source is None
     assert len({raw.name for raw in OBJECTS.values()}) == 21
-
-
-def test_surfaces_are_closed_and_face_outward(any_raw):
-    _, faces = merge_positions(any_raw.mesh.vertices, any_raw.mesh.faces)
-    assert edges_match(faces)
-    assert signed_volume(any_raw.mesh.vertices, any_raw.mesh.faces) > 0
-    assert 200 <= len(any_raw.mesh.faces) <= 6000
-
-
-def test_the_origin_is_the_middle_of_the_bounding_box(any_raw):
-    assert np.abs(any_raw.mesh.vertices.min(axis=0) + any_raw.mesh.vertices.max(axis=0)).max() < 2e-6
+    discrete = {obj_id: len(raw.symmetries_discrete) for obj_id, raw in OBJECTS.items() if raw.symmetries_discrete}
+    assert discrete == {1: 1, 16: 7, 19: 1, 20: 1, 21: 3}
+    assert {obj_id for obj_id, raw in OBJECTS.items() if raw.symmetries_continuous} == {13, 18}
 
 
 def test_sizes_are_near_the_real_ones(raw):
-    assert raw.hull.diameter == pytest.approx(TABLE[raw.obj_id][1], rel=0.1)
-    assert ConvexHull(raw.mesh.vertices).volume * 1000 == pytest.approx(REAL_HULLS[raw.obj_id], rel=0.16)
+    hull = ConvexHull(raw.mesh.vertices).volume
+    assert raw.hull.diameter == pytest.approx(TABLE[raw.obj_id].diameter, rel=0.1)
+    assert hull * 1000 == pytest.approx(REAL_HULLS[raw.obj_id], rel=0.16)
+    if raw.obj_id in CONCAVE:
+        assert signed_volume(raw.mesh.vertices, raw.mesh.faces) / hull < 0.6
 
 
-def test_normals_are_units_on_the_outside(any_raw):
+def test_surfaces_are_closed_face_outward_and_lie_about_the_origin(any_raw):
+    mesh = any_raw.mesh
+    assert_closed(mesh)
+    assert 200 <= len(mesh.faces) <= 6000
+    assert np.abs(mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)).max() < 2e-6
     points, _ = corners(any_raw)
-    normals = any_raw.mesh.normals[any_raw.mesh.faces].astype(np.float64)
-    assert np.abs(np.linalg.norm(normals, axis=2) - 1).max() < 1e-3
     flat = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-    assert ((normals * flat[:, None]).sum(axis=2) > 0).all()
+    assert ((mesh.normals[mesh.faces].astype(np.float64) * flat[:, None]).sum(axis=2) > 0).all()
 
 
 def test_textures_have_several_colours_and_are_used(raw):
@@ -165,39 +127,29 @@ def test_textures_have_several_colours_and_are_used(raw):
 
 
 @pytest.mark.parametrize("obj_id", PRINTED)
-def test_labels_are_not_mirrored(obj_id):
-    """Seen from outside, triangles run counter-clockwise in space and so they must in the picture."""
-    _, uv = printed(obj_id)
+def test_labels_are_upright_and_not_mirrored(obj_id):
+    """Seen from outside, triangles run counter-clockwise in space and so they must in the picture. On upright faces its v grows with
+    height: for v as a linear function on the triangle, dv/dz > 0.
+    """
+    points, uv = printed(obj_id)
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     assert (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > -1e-9).all()
-
-
-@pytest.mark.parametrize("obj_id", PRINTED)
-def test_labels_on_upright_faces_are_upright(obj_id):
-    """On upright faces the picture's v grows with height: for v as a linear function on the triangle, dv/dz > 0."""
-    points, uv = printed(obj_id)
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     area = np.linalg.norm(normal, axis=1)
     upright = (np.abs(normal[:, 2]) < 1e-3 * area) & (area > 1e-7)
     assert upright.any()
     edges = np.stack([points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]], axis=1)[upright]
-    rise = np.stack([uv[:, 1, 1] - uv[:, 0, 1], uv[:, 2, 1] - uv[:, 0, 1]], axis=1)[upright]
+    rise = np.stack([first[:, 1], second[:, 1]], axis=1)[upright]
     slope = np.einsum("nij,nj->ni", np.linalg.pinv(edges), rise)
     assert (slope[:, 2] >= -1e-6).all()
     assert (slope[:, 2] > 0.1).any()
-
-
-@pytest.mark.parametrize("obj_id", CONCAVE)
-def test_concave_objects_fill_little_of_their_hulls(obj_id):
-    mesh = OBJECTS[obj_id].mesh
-    assert signed_volume(mesh.vertices, mesh.faces) / ConvexHull(mesh.vertices).volume < 0.6
 
 
 @pytest.mark.parametrize(("name", "row"), PARTS.items())
 def test_parts_have_the_sizes_masses_and_symmetries_of_their_drawings(name, row):
     """Their rotations are all that the detection of symmetries finds by shape alone, which knows nothing of how they are made."""
     sides, density, order = row
-    part = next(raw for raw in ALL.values() if raw.name == name)
+    part = NAMED[name]
     np.testing.assert_allclose(np.ptp(part.mesh.vertices, axis=0), np.array(sides) / 1000, atol=3e-5)
     assert part.mass == pytest.approx(density * signed_volume(part.mesh.vertices, part.mesh.faces), rel=0.01)
     found = find_symmetries(part.mesh.vertices.astype(np.float64), part.mesh.faces, part.hull.diameter, 6e-4)
@@ -213,7 +165,7 @@ def rotations(raw):
         assert offset == (0.0, 0.0, 0.0)
         name = "xyz"[int(np.argmax(axis))]
         # The turned surfaces have 32 or 48 sides: these turns meet both.
-        yield from (rotation(name, 360 / 16 * step) for step in (1, 3, 8))
+        yield from (modelling.rotation(name, 360 / 16 * step) for step in (1, 3, 8))
 
 
 def test_symmetries_keep_shape_and_colour(raw):
@@ -229,12 +181,6 @@ def test_symmetries_keep_shape_and_colour(raw):
         assert np.quantile(np.abs(tint[near] - tint[index[near]]).max(axis=1), 0.95) <= 40
 
 
-def test_symmetries_are_those_bop_has():
-    discrete = {obj_id: len(raw.symmetries_discrete) for obj_id, raw in OBJECTS.items() if raw.symmetries_discrete}
-    assert discrete == {1: 1, 16: 7, 19: 1, 20: 1, 21: 3}
-    assert {obj_id for obj_id, raw in OBJECTS.items() if raw.symmetries_continuous} == {13, 18}
-
-
 def test_embedded_objects_are_deterministic():
     for obj_id, row in list(enumerate(objects.ROWS, start=1))[::4]:
         old, new = OBJECTS[obj_id], objects._make_object.__wrapped__(obj_id, row)
@@ -244,7 +190,7 @@ def test_embedded_objects_are_deterministic():
 
 
 def volume(patch):
-    mesh = make_mesh(patch, centered=False)
+    mesh = modelling.make_mesh(patch, centered=False)
     assert edges_match(merge_positions(mesh.vertices, mesh.faces)[1])
     return signed_volume(mesh.vertices, mesh.faces)
 
@@ -254,30 +200,27 @@ def test_a_rounded_box_has_the_volume_of_its_parts(x, y, z, share):
     radius = share * min(x, y, z)
     a, b, c = x - 2 * radius, y - 2 * radius, z - 2 * radius
     exact = a * b * c + 2 * radius * (a * b + b * c + c * a) + np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
-    result = volume(rounded_box((x, y, z), radius, dict.fromkeys(BOX_FACES, NO_TEXTURE), segments=6))
+    result = volume(modelling.rounded_box((x, y, z), radius, dict.fromkeys(modelling.BOX_FACES, modelling.NO_TEXTURE), segments=6))
     assert result == pytest.approx(exact, rel=0.01)
     assert result <= exact * (1 + 1e-3)
 
 
-def test_a_cylinder_has_the_volume_of_its_prism():
+def test_a_cylinder_has_the_volume_of_its_prism_and_a_ring_that_of_a_torus():
     exact = 0.5 * 40 * np.sin(2 * np.pi / 40) * 0.05**2 * 0.1
-    assert volume(solid(lathe([(0.05, 0.0), (0.05, 0.1)], 40))) == pytest.approx(exact, rel=1e-3)
-
-
-def test_a_ring_has_the_volume_of_a_torus():
+    assert volume(modelling.solid(modelling.lathe([(0.05, 0.0), (0.05, 0.1)], 40))) == pytest.approx(exact, rel=1e-3)
     turn = 2 * np.pi * np.arange(-1, 65) / 64
     path = np.stack([0.05 * np.cos(turn), 0.05 * np.sin(turn), 0 * turn], axis=1)
-    rings = sweep(path, ellipse(0.02, 0.02, 32), np.ones((len(path), 1)), (0.0, 0.0, 1.0))[1:-1]
-    assert volume(torus(rings)) == pytest.approx(2 * np.pi**2 * 0.05 * 0.01**2, rel=0.02)
+    rings = modelling.sweep(path, modelling.ellipse(0.02, 0.02, 32), np.ones((len(path), 1)), (0.0, 0.0, 1.0))[1:-1]
+    assert volume(modelling.torus(rings)) == pytest.approx(2 * np.pi**2 * 0.05 * 0.01**2, rel=0.02)
 
 
 def test_a_prism_has_hard_edges_and_a_smooth_side():
-    mesh = make_mesh(solid(np.stack([at_height(rounded_rectangle(0.1, 0.06, 0.02, 8), z) for z in (0.0, 0.1)])), centered=False)
+    outline = modelling.rounded_rectangle(0.1, 0.06, 0.02, 8)
+    mesh = modelling.make_mesh(modelling.solid(np.stack([modelling.at_height(outline, z) for z in (0.0, 0.1)])), centered=False)
     top = mesh.normals[(mesh.vertices[:, 2] == np.float32(0.1))]
     assert np.allclose(np.sort(np.unique(np.abs(top[:, 2]).round(3))), [0, 1])
-    middle = (
-        np.abs(mesh.vertices - np.array([0.05 - 0.02 + 0.02 * np.sqrt(0.5), 0.03 - 0.02 + 0.02 * np.sqrt(0.5), 0.0])).max(axis=1) < 1e-6
-    )
+    out = 0.02 * np.sqrt(0.5)
+    middle = np.abs(mesh.vertices - np.array([0.05 - 0.02 + out, 0.03 - 0.02 + out, 0.0])).max(axis=1) < 1e-6
     side = mesh.normals[middle & (np.abs(mesh.normals[:, 2]) < 0.1)]
     assert np.allclose(side, [[np.sqrt(0.5), np.sqrt(0.5), 0]], atol=1e-3)
 
@@ -307,12 +250,8 @@ def test_textures_follow_from_their_index_and_differ():
 # ---- shipped collision shapes ----
 
 
-NAMED = {raw.name: raw for raw in procedural_objects(EMBEDDED)}
+NAMED = {raw.name: raw for raw in ALL.values()}
 SETTINGS = load_config("synpick").objects
-
-
-def pieces_of(shape):
-    return [(piece.vertices.tolist(), piece.faces.tolist()) for piece in shape]
 
 
 def piece_corners(shape):
@@ -342,7 +281,11 @@ def test_each_object_has_its_shape(name):
 def test_a_decomposition_is_that_of_its_object():
     """The smallest one: seconds, where those of mug and bowl take minutes."""
     raw, recipe = NAMED["drill"], shape_recipe(NAMED["drill"], SETTINGS)
-    assert pieces_of(embedded_shape(raw.mesh, recipe)) == pieces_of(decompose(raw.mesh, recipe))
+    found, computed = (
+        [(piece.vertices.tolist(), piece.faces.tolist()) for piece in shape]
+        for shape in (embedded_shape(raw.mesh, recipe), decompose(raw.mesh, recipe))
+    )
+    assert found == computed
 
 
 def test_rounding_errors_do_not_hide_shapes_and_changes_do():
@@ -352,7 +295,4 @@ def test_rounding_errors_do_not_hide_shapes_and_changes_do():
     assert embedded_shape(rounded, recipe) is not None
     assert embedded_shape(replace(raw.mesh, vertices=raw.mesh.vertices * np.float32(1.01)), recipe) is None
     assert embedded_shape(raw.mesh, replace(recipe, pieces=recipe.pieces - 1)) is None
-
-
-def test_the_file_has_no_other_shapes():
     assert len(shapes.read_embedded_shapes()) == len(NAMED)

@@ -24,29 +24,9 @@ FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS) + "vt 0 0\nvt 1 0\nvt 1 1\nusemtl skin\n"
 OBJ += "f 1/1 3/2 2/3\nf 1/1 2/2 4/3\nf 1/1 4/2 3/3\nf 2/1 3/2 4/3\n"
 """The tetrahedron with texture coordinates, in the material `skin` of a.mtl."""
-REAL_HULLS = {
-    1: 1.142,
-    2: 2.310,
-    3: 0.661,
-    4: 0.357,
-    5: 0.699,
-    6: 0.187,
-    7: 0.352,
-    8: 0.179,
-    9: 0.420,
-    10: 0.265,
-    11: 3.125,
-    12: 1.067,
-    13: 0.749,
-    14: 0.525,
-    15: 1.292,
-    16: 1.605,
-    17: 0.129,
-    18: 0.033,
-    19: 0.377,
-    20: 0.601,
-    21: 0.197,
-}
+LITRES = (1.142, 2.310, 0.661, 0.357, 0.699, 0.187, 0.352, 0.179, 0.420, 0.265, 3.125)
+LITRES += (1.067, 0.749, 0.525, 1.292, 1.605, 0.129, 0.033, 0.377, 0.601, 0.197)
+REAL_HULLS = dict(enumerate(LITRES, start=1))
 """Litres of the convex hulls of the real objects by obj_id, as the README of the real data gives them: what an arrangement's volume
 budget counts."""
 
@@ -190,3 +170,19 @@ def put(path: Path, content: str | bytes) -> Path:
 def read(path: Path, content: str | bytes, options: MeshOptions | None = None, scale: float = 1.0) -> tuple[Any, Any]:
     """Write a model file, and read it: mesh and finish."""
     return read_mesh(put(path, content), scale, options or MeshOptions())
+
+
+def read_told(path: Path, content: str | bytes | None = None, options: MeshOptions | None = None) -> tuple[Any, Any, list[str]]:
+    """Write a model file, if its content is given, and read it: mesh, finish, and what is told of it, without its path."""
+    if content is not None:
+        put(path, content)
+    lines: list[str] = []
+    mesh, finish = read_mesh(path, 1.0, options or MeshOptions(), lines.append)
+    return mesh, finish, [line.removeprefix(f"{path}: ") for line in lines]
+
+
+def texels(mesh: Any, texture: np.ndarray) -> np.ndarray:
+    """Texel (V, 3) at the texture coordinates of each vertex; beyond the borders, the one there."""
+    height, width = texture.shape[:2]
+    rows, columns = ((1.0 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)
+    return texture[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
