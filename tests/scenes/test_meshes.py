@@ -1,11 +1,16 @@
-"""Mesh import: PLY, OBJ and GLB, materials, vertex colours, and invalid files."""
+"""Mesh import: PLY, STL, GLB and STEP, materials, colours, textures of any depth, and invalid files."""
 
 from __future__ import annotations
 
 import json
+import re
 import struct
+import sys
+from pathlib import Path
 
+import cv2
 import numpy as np
+import OpenEXR
 import pytest
 import trimesh
 from hypothesis import given
@@ -15,10 +20,12 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
+from synpick_warp.scenes.assets.appearance import bake_vertex_colors, decode_texture, linear_to_srgb, rgb8, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import smooth_normals
-from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, exported, glb, picture, put, read
+from tests.builders import refusal
+from tests.worlds import model_files
+from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, glb, picture, put, read, read_told, texels
 
 SMOOTH = MeshOptions(crease_angle=180.0)
 
@@ -65,81 +72,63 @@ def test_texture_coordinates_at_the_faces_split_vertices(tmp_path):
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
 
 
-def test_an_inside_out_mesh_is_flipped(tmp_path):
-    mesh, _ = read(tmp_path / "a.ply", ascii_ply(CORNERS, [face[::-1] for face in FACES]), SMOOTH)
+def test_a_mesh_is_turned_outward_and_what_is_not_needed_is_dropped(tmp_path):
+    """Inside out, with and without normals; unused vertices, unknown columns, triangles without an area."""
+    inside_out = [face[::-1] for face in FACES]
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(CORNERS, inside_out), SMOOTH)
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
     assert mesh.normals[1, 0] > 0.0
-
-
-def test_inside_out_normals_are_flipped_with_their_triangles(tmp_path):
     inward = [(*corner, *(0.25 - np.array(corner))) for corner in CORNERS]
-    mesh, _ = read(tmp_path / "a.ply", ascii_ply(inward, [face[::-1] for face in FACES], ("x", "y", "z", "nx", "ny", "nz")))
+    mesh, _ = read(tmp_path / "a.ply", ascii_ply(inward, inside_out, ("x", "y", "z", "nx", "ny", "nz")))
     assert np.all(np.einsum("vi,vi->v", mesh.normals, mesh.vertices - 0.25) > 0.0)
-
-
-def test_unused_vertices_and_degenerate_triangles_are_dropped(tmp_path):
-    mesh, _ = read(
-        tmp_path / "a.ply", ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]), SMOOTH
-    )
+    rows = [(*corner, 1, 2) for corner in [(9, 9, 9), *CORNERS]]
+    faces = [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]
+    mesh, _, said = read_told(tmp_path / "a.ply", ascii_ply(rows, faces, ("x", "y", "z", "quality", "radius")), SMOOTH)
     assert np.array_equal(mesh.vertices, np.asarray(CORNERS, np.float32))
     assert np.array_equal(mesh.faces, FACES)
+    assert said == ["ignored: quality, radius"]
 
 
-def test_quads_become_triangles(tmp_path):
-    box = trimesh.creation.box((1, 1, 1))
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    mesh, _ = read(tmp_path / "a.ply", ascii_ply(box.vertices, quads))
-    assert len(mesh.faces) == 12
-    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1.0)
-
-
-def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
-    columns = ("x", "y", "z", "red", "green", "blue")
-    _, finish = read(tmp_path / "a.ply", ascii_ply([(*corner, 255, 0, 51) for corner in CORNERS], FACES, columns))
-    assert finish.texture is None
-    assert finish.color == pytest.approx((1.0, 0.0, 0.2))
-    content = ascii_ply([(*corner, 60 * i, 255 - 60 * i, 7) for i, corner in enumerate(CORNERS)], FACES, columns)
-    mesh, finish = read(tmp_path / "a.ply", content)
-    assert finish.texture is not None
-    assert finish.color == (1.0, 1.0, 1.0)
-    height, width = finish.texture.shape[:2]
-    column = np.rint(mesh.uv[:, 0] * width - 0.5).astype(int)
-    row = np.rint((1 - mesh.uv[:, 1]) * height - 0.5).astype(int)
-    tote_corner = [CORNERS.index(tuple(int(x) for x in vertex)) for vertex in mesh.vertices]
-    assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in tote_corner])
+RGB = ("red", "green", "blue")
 
 
 @pytest.mark.parametrize(
     ("kind", "largest", "names"),
     [
-        ("uchar", 255, ("red", "green", "blue")),
+        ("uchar", 255, RGB),
         ("uchar", 255, ("diffuse_red", "diffuse_green", "diffuse_blue")),
         ("uchar", 255, ("r", "g", "b")),
-        ("ushort", 65535, ("red", "green", "blue")),
-        ("int", 255, ("red", "green", "blue")),
-        ("float", 1, ("red", "green", "blue")),
-        ("float", 255, ("red", "green", "blue")),
+        ("ushort", 65535, RGB),
+        ("int", 255, RGB),
+        ("float", 1, RGB),
+        ("float", 255, RGB),
     ],
 )
 @pytest.mark.parametrize("at", ["vertex", "face"])
 def test_colors_of_any_type_and_name(tmp_path, kind, largest, names, at):
     color = [largest, 0, largest // 5 if kind != "float" else largest / 5]
-    text = ascii_ply([(*corner, *color) if at == "vertex" else corner for corner in CORNERS], FACES, ("x", "y", "z"))
+    text = ascii_ply([(*corner, *color) if at == "vertex" else corner for corner in CORNERS])
     columns = "".join(f"property {kind} {name}\n" for name in names)
     before = "element face" if at == "vertex" else "end_header"
     text = text.replace(before, columns + before)
     if at == "face":
         text = "\n".join(f"{line} {color[0]} {color[1]} {color[2]}" if line.startswith("3 ") else line for line in text.split("\n"))
     _, finish = read(tmp_path / "a.ply", text)
+    assert finish.texture is None
     assert finish.color == pytest.approx((1.0, 0.0, 0.2))
 
 
-def test_each_face_has_its_color_also_polygons(tmp_path):
+def test_each_vertex_and_each_face_has_its_color_also_polygons(tmp_path):
     """A box of quads and triangles mixed, text and binary."""
+    content = ascii_ply([(*corner, 60 * i, 255 - 60 * i, 7) for i, corner in enumerate(CORNERS)], FACES, ("x", "y", "z", *RGB))
+    mesh, finish = read(tmp_path / "a.ply", content)
+    assert finish.color == (1.0, 1.0, 1.0)
+    vertex = [CORNERS.index(tuple(int(x) for x in vertex)) for vertex in mesh.vertices]
+    assert np.array_equal(texels(mesh, finish.texture), [(60 * i, 255 - 60 * i, 7) for i in vertex])
     box = trimesh.creation.box((2, 2, 2)).vertices
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
     header = f"ply\nformat FORMAT 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face {len(sides)}\n"
-    header += "property list uchar int vertex_indices\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    header += "property list uchar int vertex_indices\n" + "".join(f"property uchar {name}\n" for name in RGB) + "end_header\n"
     rows = [(len(side), *side, 30 * number, 255, 0) for number, side in enumerate(sides)]
     text = header.replace("FORMAT", "ascii") + "\n".join(" ".join(map(str, row)) for row in [*box.tolist(), *rows])
     contents = [text.encode()]
@@ -191,22 +180,15 @@ def test_an_stl_is_read_with_its_equal_corners_merged(tmp_path, kind):
 )
 def test_a_binary_stl_has_as_many_triangles_as_its_body(tmp_path, header, announced, more, count):
     """Unless bytes that are no triangles follow those announced."""
-    data, said = exported(trimesh.creation.box((1, 1, 1)), "stl"), []
-    path = put(tmp_path / "a.stl", header + struct.pack("<I", announced) + data[84:] + bytes(more))
+    content = header + struct.pack("<I", announced) + model_files.box(1, 1, 1, kind="stl")[84:] + bytes(more)
     if not count:
         with pytest.raises(CatalogError, match=f"announces {announced} triangles"):
-            read_mesh(path, 1.0)
+            read(tmp_path / "a.stl", content)
         return
-    assert len(read_mesh(path, 1.0, report=said.append)[0].faces) == count
+    mesh, _, said = read_told(tmp_path / "a.stl", content)
+    assert len(mesh.faces) == count
     assert len(said) == ((announced, more) != (12, 0))
     assert all(f"its header announces {announced} triangles, its body holds " in line for line in said)
-
-
-def test_what_is_ignored_of_a_ply_is_one_line(tmp_path):
-    (tmp_path / "a.ply").write_text(ascii_ply([(*corner, 1, 2) for corner in CORNERS], FACES, ("x", "y", "z", "quality", "radius")))
-    said: list[str] = []
-    read_mesh(tmp_path / "a.ply", 1.0, report=said.append)
-    assert said == [f"{tmp_path / 'a.ply'}: ignored: quality, radius"]
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3), st.tuples(*[st.floats(0.0, 1.0)] * 3))
@@ -241,17 +223,13 @@ def test_srgb_and_back(value):
         ("F", 0.5, (128, 128, 128)),
         ("CMYK", (0, 255, 255, 0), (255, 0, 0)),
         ("1", 1, (255, 255, 255)),
+        ("P", (250, 0, 0), (250, 0, 0)),
     ],
 )
 def test_images_of_any_mode_become_rgb(mode, value, expected):
-    array = rgb8(Image.new(mode, (3, 2), value))
-    assert array.shape == (2, 3, 3)
-    assert array.dtype == np.uint8
+    array = rgb8(Image.new("RGB", (3, 2), value).quantize(2) if mode == "P" else Image.new(mode, (3, 2), value))
+    assert (array.shape, array.dtype) == ((2, 3, 3), np.uint8)
     assert np.all(array == expected)
-
-
-def test_a_palette_is_resolved():
-    assert np.all(rgb8(Image.new("RGB", (2, 2), (250, 0, 0)).quantize(2)) == (250, 0, 0))
 
 
 def textured_box(color, **material) -> trimesh.Trimesh:
@@ -261,38 +239,24 @@ def textured_box(color, **material) -> trimesh.Trimesh:
     return box
 
 
-def test_a_glb_has_its_material(tmp_path):
-    box = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2)
-    mesh, finish = read(tmp_path / "a.glb", glb(box), SMOOTH)
-    assert np.allclose(mesh.uv, box.visual.uv, atol=1e-6)
-    assert finish.texture is not None
+def test_parts_of_a_glb_are_merged_with_their_transforms_and_materials(tmp_path):
+    red, plain = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2), trimesh.creation.box((0.1, 0.1, 0.1))
+    mesh, finish = read(tmp_path / "a.glb", glb(red), SMOOTH)
+    assert np.allclose(mesh.uv, red.visual.uv, atol=1e-6)
     assert np.all(finish.texture == (200, 10, 10))
     assert (finish.metallic, finish.roughness) == pytest.approx((0.7, 0.2))
-
-
-def test_parts_of_a_glb_are_merged_with_their_transforms(tmp_path):
-    red, plain = textured_box((200, 10, 10), metallicFactor=1.0), trimesh.creation.box((0.1, 0.1, 0.1))
-    plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.0))
-    plain.apply_translation((0.3, 0, 0))
-    mesh, finish = read(tmp_path / "a.glb", glb(red, plain))
+    plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.1))
+    mesh, finish = read(tmp_path / "a.glb", glb(red, plain.apply_translation((0.3, 0, 0))))
     assert len(mesh.faces) == 24
     assert np.allclose((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)), ((-0.05, -0.05, -0.05), (0.35, 0.05, 0.05)))
-    assert finish.texture is not None
-    height, width = finish.texture.shape[:2]
-    texel = finish.texture[((1 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)]
+    texel = texels(mesh, finish.texture)
     assert np.all(texel[mesh.vertices[:, 0] < 0.1] == (200, 10, 10))
     assert np.all(texel[mesh.vertices[:, 0] > 0.1] == (0, 255, 0))
-    assert finish.metallic == pytest.approx(0.5)
-
-
-def test_parts_with_one_material_share_its_texture(tmp_path):
-    one = textured_box((1, 2, 3))
-    two = one.copy()
-    two.apply_translation((0.3, 0, 0))
-    mesh, finish = read(tmp_path / "a.glb", glb(one, two))
+    assert finish.metallic == pytest.approx(0.4)
+    # Parts with one material share its texture.
+    mesh, finish = read(tmp_path / "a.glb", glb(red, red.copy().apply_translation((0.3, 0, 0))))
     assert len(mesh.faces) == 24
-    assert finish.texture is not None
-    assert np.all(finish.texture == (1, 2, 3))
+    assert np.all(finish.texture == (200, 10, 10))
 
 
 def test_a_reflected_part_keeps_outward_orientation(tmp_path):
@@ -314,6 +278,19 @@ def test_an_obj_with_an_image(tmp_path):
 
 
 GOOD = ascii_ply(CORNERS, FACES)
+UNWRAPPED = ("x", "y", "z", "texture_u", "texture_v")
+BARE_OBJ = "mtllib a.mtl\n" + "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS)
+BARE_FACES = "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+REFUSED = r"not readable as STEP \(OpenCASCADE refuses it\)"
+STEP_FAULTS = (
+    ("a.step", "no STEP file", REFUSED),
+    ("a.step", model_files.step_cylinder(20, 60)[:700], REFUSED),
+    ("a.step", model_files.step_cylinder(20, 60).replace("MANIFOLD_SOLID_BREP", "GEOMETRIC_SET"), "no triangles"),
+)
+
+
+def textured_ply(image: str, rows=CORNERS, columns=("x", "y", "z")) -> str:
+    return ascii_ply(rows, FACES, columns, f"comment TextureFile {image}")
 
 
 @pytest.mark.parametrize(
@@ -349,26 +326,21 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.gltf", "hello", "a.gltf is damaged"),
         ("a.glb", b"glTF", "not readable"),
         ("a.glb", "", "not readable"),
+        ("a.ply", textured_ply("good.png"), "texture_u"),
+        ("a.ply", textured_ply("bad.png"), r"bad\.png: not readable as an image"),
+        ("a.obj", BARE_OBJ + "usemtl skin\n" + BARE_FACES, "without texture coordinates; unwrap it"),
+        *((name, content, said) for name, content, said in STEP_FAULTS),
     ],
 )
 def test_invalid_files_are_one_line(tmp_path, name, content, message):
-    with pytest.raises(CatalogError, match=message) as caught:
-        read(tmp_path / name, content)
-    assert str(tmp_path / name) in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_texture_needs_coordinates_and_a_readable_image(tmp_path):
-    for skin, said in ((picture(tmp_path / "good.png").read_bytes(), "texture_u"), (b"no picture", "not readable as an image")):
-        put(tmp_path / "t.png", skin)
-        with pytest.raises(CatalogError, match=said):
-            read(tmp_path / "a.ply", ascii_ply(CORNERS, comment="comment TextureFile t.png"))
-
-
-def test_normals_where_triangles_cancel_out():
-    vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
-    normals = smooth_normals(vertices, np.array([(0, 1, 2), (0, 2, 1)]))
-    assert np.array_equal(normals, [(0, 0, 1)] * 3)
+    if name.endswith(".step"):
+        pytest.importorskip("cascadio")
+    picture(tmp_path / "good.png")
+    put(tmp_path / "bad.png", b"no picture")
+    put(tmp_path / "a.mtl", "newmtl skin\nmap_Kd good.png\n")
+    said = refusal(read, tmp_path / name, content)
+    assert re.search(message, said)
+    assert said.count(str(tmp_path / ("bad.png" if "bad" in message else name))) == 1
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -382,6 +354,8 @@ def test_normals_do_not_depend_on_seams(seed):
     assert np.allclose(apart, whole[split], atol=1e-6)
     places, faces = merge_positions(vertices[split], np.arange(len(split)).reshape(-1, 3))
     assert (len(places), len(faces)) == (len(ball.vertices), len(ball.faces))
+    # Where triangles cancel out.
+    assert np.array_equal(smooth_normals(vertices[:3] * (1, 1, 0), np.array([(0, 1, 2), (0, 2, 1)])), [(0, 0, 1)] * 3)
 
 
 def test_the_real_objects_agree_with_their_table(real_models):
@@ -394,3 +368,125 @@ def test_the_real_objects_agree_with_their_table(real_models):
         assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
         assert mesh.uv.min() >= -1e-3
         assert mesh.uv.max() <= 1.001
+
+
+# ---- textures ----
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (37, 50)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_images_of_any_bit_depth_channels_and_size(channels, size, dtype):
+    """Each pixel to the byte above its value or the one below; with alpha 0, the colour is still there."""
+    largest = np.iinfo(dtype).max
+    pixels = np.random.default_rng(0).integers(0, largest + 1, (*size, channels)).astype(dtype)
+    if channels == 4:
+        pixels[..., 3] = 0
+    texture = decode_texture(cv2.imencode(".png", pixels)[1].tobytes(), "t.png")
+    assert texture.shape == (*size, 3)
+    assert texture.dtype == np.uint8
+    expected = pixels[..., 2::-1] if channels > 1 else np.repeat(pixels, 3, axis=2)
+    assert np.abs(texture - expected / largest * 255.0).max() <= (0 if dtype == np.uint8 else 1)
+
+
+def test_a_mesh_without_texture_needs_no_coordinates(tmp_path):
+    put(tmp_path / "a.mtl", "newmtl skin\nKd 0.2 0.4 0.6\n")
+    for name, content, color in (("a.obj", BARE_OBJ + "usemtl skin\n" + BARE_FACES, (0.2, 0.4, 0.6)), ("a.ply", GOOD, (0.7, 0.7, 0.7))):
+        mesh, finish = read(tmp_path / name, content)
+        assert finish.texture is None
+        assert finish.color == pytest.approx(color, abs=0.003)
+        assert mesh.uv.shape == (len(mesh.vertices), 2)
+        assert not mesh.uv.any()
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1e30", "10001"])
+def test_invalid_texture_coordinates(tmp_path, value):
+    picture(tmp_path / "t.png")
+    rows = [(*corner, 0.5, 0.5) for corner in CORNERS]
+    with pytest.raises(CatalogError, match="not finite or beyond 10000; repair the mesh"):
+        read(tmp_path / "a.ply", textured_ply("t.png", [*rows[:3], (*CORNERS[3], value, 0.5)], UNWRAPPED))
+    # A vertex that no triangle uses may have any.
+    mesh, _ = read(tmp_path / "a.ply", textured_ply("t.png", [*rows, (9, 9, 9, value, 0.5)], UNWRAPPED), SMOOTH)
+    assert len(mesh.vertices) == 4
+
+
+# ---- OpenEXR ----
+
+
+def exr(path: Path, **channels: np.ndarray) -> bytes:
+    names = {name.replace("_", "."): np.ascontiguousarray(plane) for name, plane in channels.items()}
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, names) as file:
+        file.write(str(path))
+    return path.read_bytes()
+
+
+def plane(value: float, kind: type = np.float32) -> np.ndarray:
+    return np.full((2, 3), value, kind)
+
+
+@pytest.mark.parametrize(
+    ("channels", "linear", "expected"),
+    [
+        ({"R": plane(0.2), "G": plane(1.0), "B": plane(0.0)}, False, (124, 255, 0)),
+        ({"R": plane(0.2), "G": plane(7.5), "B": plane(-1.0)}, True, (51, 255, 0)),
+        ({"Y": plane(0.25, np.float16)}, True, (64, 64, 64)),
+        ({"rough": plane(0.25)}, True, (64, 64, 64)),
+        ({"v_Combined_R": plane(0.2), "v_Combined_G": plane(1.0), "v_Combined_B": plane(0.0)}, False, (124, 255, 0)),
+        ({"R": plane(np.nan), "G": plane(np.inf), "B": plane(0.0)}, False, (0, 255, 0)),
+    ],
+)
+def test_channels_of_any_name_and_kind(tmp_path, channels, linear, expected):
+    image = decode_texture(exr(tmp_path / "a.exr", **channels), "a.exr", linear)
+    assert image.shape == (2, 3, 3)
+    assert (image == expected).all()
+
+
+def test_maps_of_a_material_library(tmp_path):
+    """Base colour maps are converted to sRGB, roughness and metallic maps stay linear, and normal maps are reported as ignored."""
+    put(tmp_path / "a.mtl", "newmtl skin\nmap_Kd albedo.exr\nmap_Pr maps/rough.exr\nmap_Pm maps/rough.exr\nnorm maps/normal.exr\n")
+    exr(tmp_path / "albedo.exr", R=plane(0.2), G=plane(0.5), B=plane(1.0))
+    put(tmp_path / "maps" / "rough.exr", exr(tmp_path / "rough.exr", Y=plane(0.3, np.float16)))
+    _, material, said = read_told(tmp_path / "a.obj", OBJ)
+    assert (material.texture[0, 0] == (124, 188, 255)).all()
+    assert (material.metallic, material.roughness) == (pytest.approx(0.3, abs=0.003), pytest.approx(0.3, abs=0.003))
+    assert said == ["ignored: norm"]
+
+
+def test_damaged_exr_files_are_one_line(tmp_path):
+    magic, unknown = b"\x76\x2f\x31\x01", exr(tmp_path / "a.exr", U=plane(0.1), V=plane(0.1))
+    for content, said in (
+        (magic, "not readable as OpenEXR"),
+        (magic + bytes(200), "not readable as OpenEXR"),
+        (unknown, "without channels R, G, B or Y"),
+    ):
+        with pytest.raises(CatalogError, match=rf"^a\.exr: .*{said}"):
+            decode_texture(content, "a.exr")
+
+
+# ---- STEP files: cylinders, whose size is known ----
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "prefix"), [("a.step", (20.0, 60.0), ".MILLI."), ("a.STP", (2.0, 6.0), ".CENTI."), ("a.stp", (0.02, 0.06), "$")]
+)
+def test_lengths_are_in_the_unit_that_a_step_file_names(tmp_path, name, size, prefix):
+    pytest.importorskip("cascadio")
+    put(tmp_path / "parts" / name, model_files.step_cylinder(size[0], size[1], prefix))
+    catalog, lines = model_files.load_models(tmp_path / "parts", tmp_path, unit="in", center=True)
+    (entry,), (line,) = catalog.entries, lines
+    assert all(words in line for words in (" x 60 mm, unit of the file; centred: moved by ", ", -0.03 m"))
+    assert np.ptp(entry.mesh.vertices, axis=0) == pytest.approx((0.04, 0.04, 0.06), rel=2e-3)
+    # Within the distance of chords from the circle.
+    assert signed_volume(entry.mesh.vertices, entry.mesh.faces) == pytest.approx(np.pi * 0.02**2 * 0.06, rel=0.01)
+
+
+def test_step_files_beside_their_meshes_and_without_cascadio(tmp_path, monkeypatch):
+    put(tmp_path / "parts" / "a.step", "no STEP file")
+    put(tmp_path / "parts" / "a.stl", model_files.box(0.1, 0.1, 0.1, kind="stl"))
+    catalog, lines = model_files.load_models(tmp_path / "parts", tmp_path)
+    assert [entry.name for entry in catalog.entries] == ["a"]
+    assert lines == [f"{tmp_path / 'parts'}: 1 STEP files beside meshes of the same name are ignored"]
+    monkeypatch.setitem(sys.modules, "cascadio", None)
+    said = r"a\.step: STEP files need cascadio, which is not installed: pip install 'synpick-warp\[step\]', or save"
+    with pytest.raises(CatalogError, match=said):
+        read(tmp_path / "a.step", model_files.step_cylinder(20, 60))

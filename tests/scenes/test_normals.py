@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_gltf
 
 from synpick_warp.exporters.bop.shared.models import write_models
-from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.meshes import merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals
 from tests.twins.layers import render_layers
 from tests.worlds.model_files import exported, load_models, put
@@ -83,12 +83,13 @@ def test_creases_do_not_depend_on_how_vertices_are_stored(seed, angle):
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
 
 
-def test_without_creases_normals_are_the_smooth_ones():
+def test_without_creases_normals_are_the_smooth_ones_also_of_triangles_without_an_area():
     ball = trimesh.creation.icosphere(2)
     source, faces, normals = crease_normals(ball.vertices, ball.faces, 180.0)
     assert np.array_equal(faces, ball.faces)
     assert np.array_equal(source, np.arange(len(ball.vertices)))
     assert np.allclose(normals, smooth_normals(ball.vertices, ball.faces), atol=1e-6)
+    assert np.array_equal(crease_normals(np.zeros((3, 3)), np.array([[0, 1, 2]]), 35.0)[2], [[0, 0, 1]] * 3)
 
 
 def test_a_fan_of_many_triangles_is_one_group():
@@ -99,11 +100,6 @@ def test_a_fan_of_many_triangles_is_one_group():
     source, _, normals = crease_normals(vertices, faces, 35.0)
     assert np.array_equal(source, np.arange(3001))
     assert normals[0] == pytest.approx((0, 0, 1), abs=1e-5)
-
-
-def test_nothing_but_triangles_without_an_area_has_normals():
-    _, _, normals = crease_normals(np.zeros((3, 3)), np.array([[0, 1, 2]]), 35.0)
-    assert np.array_equal(normals, [[0, 0, 1]] * 3)
 
 
 def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
@@ -127,13 +123,3 @@ def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
     exported.merge_vertices(merge_norm=True)
     assert exported.is_watertight
     assert exported.volume == pytest.approx(4.8e5)
-
-
-@pytest.mark.parametrize("center", [False, True])
-def test_a_mesh_is_centred_on_request(tmp_path, center):
-    box = trimesh.creation.box((0.1, 0.08, 0.06))
-    box.apply_translation((0.4, 0.1, 0.2))
-    said: list[str] = []
-    mesh, _ = read_mesh(write(tmp_path, box, "obj"), 1.0, MeshOptions(center=center), said.append)
-    assert mesh.vertices.mean(axis=0) == pytest.approx((0, 0, 0) if center else (0.4, 0.1, 0.2), abs=1e-6)
-    assert said == ([f"{tmp_path / 'part.obj'}: centred: moved by -0.4, -0.1, -0.2 m"] if center else [])

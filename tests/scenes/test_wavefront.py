@@ -1,4 +1,4 @@
-"""OBJ and MTL import: options of textures, PBR, what is missing or ignored, encodings, textures that repeat."""
+"""OBJ and MTL import: spellings of the same, options of textures, PBR, what is missing or ignored, textures that repeat; polygons."""
 
 from __future__ import annotations
 
@@ -11,28 +11,80 @@ import pytest
 from PIL import Image
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh
+from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
+from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
+from tests.worlds.model_files import picture, put, read_told, texels
 
-STRICT = MeshOptions()
 RED = "newmtl skin\nKd 1 0 0\n"
 GREY = (0.7, 0.7, 0.7)
 UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-HEAD = "mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+VERTICES = ("v 0 0 0", "v 1 0 0", "v 0 1 0", "v 0 0 1")
+HEAD = "mtllib a.mtl\n" + "\n".join(VERTICES) + "\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 FACES = ("f 1/1 3/2 2/3\n", "f 1/1 2/2 4/3\n", "f 1/1 4/2 3/3\n", "f 2/1 3/2 4/3\n")
 OBJ = HEAD + "usemtl skin\n" + "".join(FACES)
+PLAIN = "\n".join(["mtllib a.mtl", *VERTICES, "usemtl skin", "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4", ""])
+"""Without texture coordinates."""
+RELATIVE = "\n".join(["mtllib a.mtl", *VERTICES[:3], "usemtl skin", "f -3 -1 -2", VERTICES[3], "f 1 2 -1", "f -4 -1 -2", "f 2 3 4", ""])
 
 
-def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8", options: MeshOptions = STRICT) -> tuple[Any, Any, str]:
-    """Read an OBJ with this library and two images; the last is the line without the file's name."""
-    (folder / "a.obj").write_bytes(obj.encode(encoding))
+def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8", **options: bool) -> tuple[Any, Any, str]:
+    """Read an OBJ with this library and three images; the last is the one line that may be told."""
     if mtl is not None:
-        (folder / "a.mtl").write_bytes(mtl.encode(encoding))
+        put(folder / "a.mtl", mtl.encode(encoding))
     for name, color in (("skin.png", (200, 10, 30)), ("two words.png", (0, 255, 0)), ("grey.png", (51, 51, 51))):
-        Image.new("RGB", (4, 2), color).save(folder / name)
-    said: list[str] = []
-    mesh, finish = read_mesh(folder / "a.obj", 1.0, options, said.append)
+        picture(folder / name, color)
+    mesh, finish, said = read_told(folder / "a.obj", obj.encode(encoding), MeshOptions(**options))
     assert len(said) <= 1
-    return mesh, finish, said[0].removeprefix(f"{folder / 'a.obj'}: ") if said else ""
+    return mesh, finish, "".join(said)
+
+
+# ---- text ----
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize(
+    ("obj", "mtl"),
+    [
+        (PLAIN, RED),
+        (RELATIVE, RED),
+        (PLAIN.replace("f 1 3 2", "f 1 \\\n 3 2"), RED.replace("1 0 0", "1 \\\n0 0")),
+        (PLAIN.replace("\n", "\n  "), RED.replace("\n", "\n\t")),
+        (PLAIN.replace(" ", "\t"), RED),
+        (PLAIN.replace("f ", "fo "), RED),
+        (PLAIN.replace("v 1 0 0", "v 1 0 0 # x").replace("f 1 3 2", "f 1 3 2 # a").replace("l skin", "l skin # red"), RED),
+        (PLAIN, RED.replace("1 0 0", "1 0 0 # red")),
+        (PLAIN.replace("skin", "Skin"), RED),
+        (PLAIN.replace("skin", "my  skin #3"), RED.replace("skin", "my  skin #3")),
+        (PLAIN.replace("a.mtl", '"a.mtl"'), RED),
+        (PLAIN.replace("a.mtl", "a.mtl # colours"), RED),
+        (PLAIN.replace("a.mtl", "b.mtl A.mtl"), RED),
+        ("# usemtl other\n" + PLAIN, "# newmtl other\n" + RED),
+    ],
+)
+def test_spellings_of_the_same_file(tmp_path, obj, mtl, end):
+    put(tmp_path / "b.mtl", "newmtl other\nKd 0 1 0\n")
+    mesh, finish, said = read(tmp_path, mtl.replace("\n", end), obj.replace("\n", end))
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
+    assert len(mesh.faces) == 4
+    assert finish.color == (1.0, 0.0, 0.0)
+    assert not said
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "latin-1"])
+def test_text_of_any_encoding(tmp_path, encoding):
+    mesh, finish, said = read(tmp_path, "newmtl grün\nKd 0 1 0\n", "# Grüße\n" + PLAIN.replace("skin", "grün"), encoding)
+    assert len(mesh.faces) == 4
+    assert (finish.color, said) == ((0.0, 1.0, 0.0), "")
+
+
+@pytest.mark.parametrize("face", ["f 0 3 2", "f 1 0 2", "f 1 3 0", "f 1/1 3/1 0/1"])
+def test_vertex_0_is_refused(tmp_path, face):
+    """It would be the last one."""
+    with pytest.raises(CatalogError, match="a face refers to vertex 0, but indices begin at 1"):
+        read(tmp_path, None, PLAIN.replace("f 1 3 2", face).replace("mtllib a.mtl\n", "vt 0 0\n"))
+
+
+# ---- materials ----
 
 
 @pytest.mark.parametrize(
@@ -49,13 +101,15 @@ def read(folder: Path, mtl: str | None, obj: str = OBJ, encoding: str = "utf-8",
         ("-mm 0.1 0.8 -cc on", (1, 1), (0, 0), "ignored: map_Kd -mm, map_Kd -cc"),
     ],
 )
-@pytest.mark.parametrize("name", ["skin.png", "two words.png"])
+@pytest.mark.parametrize("name", ["skin.png", "two words.png", "skin.png # wood"])
 def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
     mesh, finish, line = read(tmp_path, f"newmtl skin\nmap_Kd {options} {name}\n")
-    assert tuple(finish.texture[0, 0]) == ((200, 10, 30) if name == "skin.png" else (0, 255, 0))
-    expected = np.unique(UV[:3] * scale + offset, axis=0)
-    assert np.unique(mesh.uv, axis=0) == pytest.approx(expected)
+    assert tuple(finish.texture[0, 0]) == ((0, 255, 0) if name == "two words.png" else (200, 10, 30))
+    assert np.unique(mesh.uv, axis=0) == pytest.approx(np.unique(UV[:3] * scale + offset, axis=0))
     assert line == said
+
+
+ABSENT = "no material 'skin' in its libraries, the default is used; ignored: texture coordinates without a texture"
 
 
 @pytest.mark.parametrize(
@@ -64,22 +118,15 @@ def test_options_of_a_texture(tmp_path, options, scale, offset, said, name):
         ("newmtl skin\nKd 0.2 0.4 0.6\nPm 0.9\nPr 0.25\n", (0.2, 0.4, 0.6), 0.9, 0.25, ""),
         ("newmtl skin\nKd 1 1 1\nmap_Pm grey.png\nmap_Pr grey.png\n", (1, 1, 1), 0.2, 0.2, ""),
         ("newmtl skin\nKa 1 1 1\nKs 1 1 1\nNs 30\nillum 2\nd 1\n", GREY, None, None, ""),
-        (
-            RED + "norm n.png\nmap_d a.png\nKe 1 1 1\nd 0.5\n",
-            (1, 0, 0),
-            None,
-            None,
-            "ignored: norm, map_d, emission, transparency",
-        ),
+        (RED + "norm n.png\nmap_d a.png\nKe 1 1 1\nd 0.5\n", (1, 0, 0), None, None, "ignored: norm, map_d, emission, transparency"),
         ("newmtl skin\nKd spectral file.rfl\n", GREY, None, None, "ignored: Kd spectral"),
+        ("newmtl skin\nKd 255 128 0\n", (1, 1, 0), None, None, "ignored: Kd beyond 1 (255 128 0)"),
         (RED + "newmtl old\nmap_Kd grey.png\n", (1, 0, 0), None, None, ""),
-        (
-            "newmtl other\nKd 1 0 0\n",
-            GREY,
-            None,
-            None,
-            "no material 'skin' in its libraries, the default is used; ignored: texture coordinates without a texture",
-        ),
+        # An image of an unused material is sought as that of a used one.
+        (RED + "newmtl old\nmap_Kd MAPS\\Skin.PNG\n", (1, 0, 0), None, None, ""),
+        (RED + "newmtl old\nmap_Kd Grey.png\n", (1, 0, 0), None, None, ""),
+        (RED + "newmtl old\nmap_Kd /data/tex/skin.png\n", (1, 0, 0), None, None, ""),
+        ("newmtl other\nKd 1 0 0\n", GREY, None, None, ABSENT),
     ],
 )
 def test_materials(tmp_path, mtl, color, metallic, roughness, said):
@@ -92,28 +139,15 @@ def test_materials(tmp_path, mtl, color, metallic, roughness, said):
 
 @pytest.mark.parametrize("obj", [OBJ.replace("mtllib a.mtl\n", ""), OBJ.replace("usemtl skin\n", "")])
 def test_without_a_known_material_the_default_is_used(tmp_path, obj):
-    _, finish, line = read(tmp_path, "newmtl skin\nKd 1 0 0\n", obj)
+    _, finish, line = read(tmp_path, RED, obj)
     assert finish.color == GREY
     assert "ignored: texture coordinates without a texture" in line
 
 
 def test_vertex_colours_beside_texture_coordinates(tmp_path):
-    rows = "".join(f"v {corner} 1 0.5 0\n" for corner in ("0 0 0", "1 0 0", "0 1 0", "0 0 1"))
+    rows = "".join(f"{row} 1 0.5 0\n" for row in VERTICES)
     _, finish, _ = read(tmp_path, None, rows + OBJ[OBJ.index("vt") :])
     assert finish.color == pytest.approx((1.0, 0.5, 0.0), abs=0.003)
-
-
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "latin-1"])
-def test_text_of_any_encoding(tmp_path, encoding):
-    mesh, finish, said = read(tmp_path, "newmtl grün\nKd 0 1 0\n", "# Grüße\n" + OBJ.replace("skin", "grün"), encoding)
-    assert len(mesh.faces) == 4
-    assert finish.color == (0.0, 1.0, 0.0)
-    assert not said
-
-
-def test_a_used_image_that_is_missing_is_refused(tmp_path):
-    with pytest.raises(CatalogError, match=r"refers to 'gone\.png', but there is no file"):
-        read(tmp_path, "newmtl skin\nmap_Kd gone.png\n")
 
 
 @pytest.mark.parametrize(
@@ -126,38 +160,31 @@ def test_a_used_image_that_is_missing_is_refused(tmp_path):
         ("Kd 1 0 0\nmap_Pr gone.png\nPr 0.5", (1, 0, 0), 0.5),
     ],
 )
-def test_a_used_image_that_is_missing_is_replaced_by_a_colour(tmp_path, mtl, color, roughness):
-    """As in bakes without objects.strict."""
-    _, finish, line = read(tmp_path, f"newmtl skin\n{mtl}\n", options=MeshOptions(substitute=True))
+def test_a_used_image_that_is_missing_is_refused_or_replaced_by_a_colour(tmp_path, mtl, color, roughness):
+    """The latter in bakes without objects.strict."""
+    with pytest.raises(CatalogError, match=r"refers to '.*gone\.png', but there is no file"):
+        read(tmp_path, f"newmtl skin\n{mtl}\n")
+    _, finish, line = read(tmp_path, f"newmtl skin\n{mtl}\n", substitute=True)
     assert finish.texture is None
     assert finish.color == pytest.approx(color)
     assert finish.roughness == pytest.approx(roughness)
     assert re.fullmatch(r"the image '.*gone\.png' is missing, a plain colour is used", line)
 
 
-@pytest.mark.parametrize("name", ["MAPS\\Skin.PNG", "Grey.png", "/data/tex/skin.png"])
-def test_an_image_of_an_unused_material_is_sought_as_that_of_a_used_one(tmp_path, name):
-    _, _, line = read(tmp_path, RED + f"newmtl old\nmap_Kd {name}\n")
-    assert not line
+# ---- textures that are clamped or repeat ----
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.5, 1.0), (0.0, 2.5), (-1.25, 3.0)])
 def test_a_clamped_texture_has_its_border_beyond(tmp_path, low, high):
     columns = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [200, 100, 50]], np.uint8)
     obj = OBJ.replace("vt 0 0", f"vt {low} {low}").replace("vt 1 0", f"vt {high} 0.5").replace("vt 1 1", f"vt 0.375 {high}")
-    read(tmp_path, None)
     Image.fromarray(np.tile(columns, (4, 1, 1))).save(tmp_path / "strip.png")
     mesh, finish, line = read(tmp_path, "newmtl skin\nmap_Kd -clamp on strip.png\n", obj)
-    height, width = finish.texture.shape[:2]
     assert not line
-    rows, places = ((1.0 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)
-    texel = finish.texture[np.clip(rows, 0, height - 1), np.clip(places, 0, width - 1)]
+    texel = texels(mesh, finish.texture)
     for corner, column in ((0, 0), (1, 3), (2, 1)):
         at = np.flatnonzero(np.abs(mesh.uv[:, 0] - np.unique(mesh.uv[:, 0])[(0, 2, 1)[corner]]) < 1e-6)
         assert (texel[at] == columns[column]).all()
-
-
-def test_a_texture_that_is_clamped_far_beyond_its_border_is_told(tmp_path):
     _, _, line = read(tmp_path, "newmtl skin\nmap_Kd -clamp on -s 9000 9000 skin.png\n")
     assert line == "ignored: clamping of a texture far beyond its borders"
 
@@ -170,14 +197,12 @@ def test_textures_that_repeat_beside_others(tmp_path, low, high):
     first, second, third = f"vt {low + 0.25} {low + 0.5}", f"vt {high - 0.25} 0.5", f"vt {low + 0.75} {high}"
     obj = HEAD.replace("vt 0 0", first).replace("vt 1 0", second).replace("vt 1 1", third)
     obj += "usemtl skin\n" + "".join(FACES[:2]) + "usemtl other\n" + "".join(FACES[2:])
-    read(tmp_path, None)
     Image.fromarray(image).save(tmp_path / "half.png")
     mesh, finish, said = read(tmp_path, "newmtl skin\nmap_Kd half.png\nnewmtl other\nKd 0 1 0\n", obj)
     assert ("scaled to" in said) == (high == 200)
     assert mesh.uv.min() >= 0.0
     assert mesh.uv.max() <= 1.0
-    height, width = finish.texture.shape[:2]
-    texel = finish.texture[((1.0 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)]
+    texel = texels(mesh, finish.texture)
     painted = [face for face in mesh.faces if texel[face[0]].tolist() != [0, 255, 0]]
     assert len(painted) == 2
     for index in np.concatenate(painted) if high < 200 else ():
@@ -188,8 +213,85 @@ def test_textures_that_repeat_beside_others(tmp_path, low, high):
 def test_the_atlas_is_scaled_down_where_textures_are_too_many(tmp_path, monkeypatch):
     monkeypatch.setattr("synpick_warp.scenes.assets.appearance.MAX_TEXTURE_PIXELS", 2**12)
     for name in ("one.png", "two.png"):
-        Image.new("RGB", (64, 60), (200, 10, 30)).save(tmp_path / name)
+        picture(tmp_path / name, size=(64, 60))
     obj = HEAD + "usemtl one\n" + "".join(FACES[:2]) + "usemtl two\n" + "".join(FACES[2:])
     _, finish, said = read(tmp_path, "newmtl one\nmap_Kd one.png\nnewmtl two\nmap_Kd two.png\n", obj)
     assert said == "its textures together are too large: scaled by 1/2"
     assert finish.texture.shape == (60, 32, 3)
+
+
+# ---- concave polygons ----
+
+_TURN = np.arange(10) * np.pi / 5
+_RADIUS = np.where(np.arange(10) % 2, 0.3, 1.0)
+OUTLINES = {
+    "L": [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)],
+    "dart": [(0, 0), (2, 0), (0.5, 0.5), (0, 2)],
+    "star": list(zip(_RADIUS * np.cos(_TURN), _RADIUS * np.sin(_TURN), strict=True)),
+    "square with a middle": [(0, 0), (1, 0), (2, 0), (2, 2), (0, 2)],
+}
+
+
+def prism(outline: list[tuple[float, float]], start: int) -> tuple[np.ndarray, list[list[int]]]:
+    """Vertices and polygons of a prism of height 1; its caps begin at the corner `start`."""
+    count = len(outline)
+    vertices = np.array([(x, y, z) for z in (0, 1) for x, y in outline], np.float64)
+    around = [(start + index) % count for index in range(count)]
+    caps = [[count + index for index in around], around[::-1]]
+    return vertices, [*caps, *([at, (at + 1) % count, count + (at + 1) % count, count + at] for at in range(count))]
+
+
+def write(path: Path, vertices: np.ndarray, polygons: list[list[int]]) -> Path:
+    if path.suffix == ".obj":
+        rows = [f"v {x} {y} {z}" for x, y, z in vertices] + ["f " + " ".join(str(at + 1) for at in each) for each in polygons]
+        return put(path, "\n".join(rows))
+    binary = path.stem == "binary"
+    head = [f"ply\nformat {'binary_big_endian' if binary else 'ascii'} 1.0\nelement vertex {len(vertices)}"]
+    head += [*(f"property double {axis}" for axis in "xyz"), f"element face {len(polygons)}", "property list uchar uint vertex_index"]
+    lists = [np.array(each, ">u4").tobytes() for each in polygons]
+    rows = [*(" ".join(map(str, row)) for row in vertices), *(f"{len(each)} " + " ".join(map(str, each)) for each in polygons)]
+    body = vertices.astype(">f8").tobytes() + b"".join(bytes([len(data) // 4]) + data for data in lists)
+    return put(path, "\n".join([*head, "end_header\n"]).encode() + (body if binary else "\n".join(rows).encode() + b"\n"))
+
+
+def normals_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals of triangles, as long as twice their area."""
+    corners = vertices[faces].astype(np.float64)
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+@pytest.mark.parametrize("name", ["a.obj", "text.ply", "binary.ply"])
+@pytest.mark.parametrize("outline", OUTLINES)
+def test_concave_polygons_cover_their_outline_alone(tmp_path, outline, name):
+    """Fans cover the notches, too: their area is larger."""
+    points = np.array(OUTLINES[outline])
+    following = np.roll(points, -1, axis=0)
+    flat = abs(float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())) / 2
+    sides = float(np.linalg.norm(following - points, axis=1).sum())
+    for start in range(len(points)):
+        mesh, _ = read_mesh(write(tmp_path / name, *prism(OUTLINES[outline], start)), 1.0)
+        area = np.linalg.norm(normals_of(mesh.vertices, mesh.faces), axis=1).sum() / 2.0
+        assert area == pytest.approx(2 * flat + sides, rel=1e-6)
+        assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(flat, rel=1e-6)
+
+
+def test_polygons_in_any_plane_are_clipped_as_they_are_wound():
+    random = np.random.default_rng(1)
+    for outline in OUTLINES.values():
+        rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        corners = np.column_stack([outline, np.zeros(len(outline))]) @ rotation.T
+        triangles = np.array(clip_ears(corners))
+        assert len(triangles) == len(corners) - 2
+        # All on one side, that of the polygon.
+        assert (normals_of(corners, triangles) @ (rotation[:, 2] * np.linalg.det(rotation)) >= -1e-12).all()
+
+
+def test_too_many_corners_are_told_and_convex_polygons_are_not_concave(monkeypatch):
+    square = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0.1), (0, 1, 0)], np.float64)
+    dart = np.array([(0, 0, 0), (2, 0, 0), (0.5, 0.5, 0), (0, 2, 0)], np.float64)
+    corners, lengths, ignored = np.arange(8), np.array([4, 4]), []
+    assert find_concave(np.concatenate([square, dart]), corners, lengths, ignored).tolist() == [1]
+    assert not ignored
+    monkeypatch.setattr("synpick_warp.scenes.assets.polygons._MAX_WORK", 15)
+    assert not len(find_concave(np.concatenate([square, dart]), corners, lengths, ignored))
+    assert ignored == ["concavity of polygons with many corners"]
