@@ -12,20 +12,8 @@ from synpick_warp.apps.evaluation.figures import write_figures
 from synpick_warp.apps.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
 from synpick_warp.apps.evaluation.tracking import filter_poses, sweep_alpha
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.system.codecs.charts import (
-    INK,
-    PALETTE,
-    SCALE,
-    ChartError,
-    Legend,
-    axis,
-    chart,
-    line,
-    panel,
-    points,
-    printable,
-    render_charts,
-)
+from synpick_warp.system.codecs import charts
+from synpick_warp.system.codecs.charts import INK, PALETTE, SCALE, ChartError, Legend, axis, chart, panel, points, printable, render_charts
 from tests.harness.charts import near, picture_of, tick_texts
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import Motion, estimates, true_poses
@@ -43,7 +31,7 @@ def rows_at(picture: np.ndarray, column: float, color: str, panel: int) -> np.nd
 
 def one_line(x: np.ndarray, y: np.ndarray, end: float, low: float, high: float, width: float = 2.0) -> np.ndarray:
     """Picture of a red line on axes from 0 to `end` and from `low` to `high`, in a panel of 400 px."""
-    layer = points(line(width, {"value": RED}), low, high, y, x=x)
+    layer = points(charts.line(width, {"value": RED}), low, high, y, x=x)
     return picture_of(chart(axis("x", "x", 0.0, end), [panel(axis("y", "y", low, high), 200, [layer])]))
 
 
@@ -62,9 +50,7 @@ def test_nan_breaks_a_line_and_what_is_outside_is_clipped():
     columns = LEFT + np.array([0.5, 1.5, 2.5, 3.0]) / 4 * (RIGHT - LEFT)
     assert drawn[columns.round().astype(int)].tolist() == [True, False, False, True]
     assert not near(picture, RED)[: len(picture) - BOTTOM - 402].any()
-
-
-def test_a_single_point_between_breaks_is_a_dot():
+    # A single point between breaks is a dot.
     picture = one_line(np.arange(3.0), np.array([np.nan, 0.5, np.nan]), 2.0, 0.0, 1.0, width=3.0)
     assert near(picture, RED)[:, (LEFT + RIGHT) // 2].sum() >= 5
 
@@ -75,7 +61,7 @@ def test_fuzz_ticks_are_few_round_and_inside(low, span, count):
     high = low + span
     if high - low < 1e-6 * max(abs(low), abs(high)):
         return
-    layer = points(line(1.0, {"value": RED}), low, high, [low], x=[0.0])
+    layer = points(charts.line(1.0, {"value": RED}), low, high, [low], x=[0.0])
     y = axis("y", None, low, high, tickCount=count)
     texts = tick_texts(chart(axis("x", None, 0.0, 1.0, labels=False), [panel(y, 600, [layer])]))
     values = np.array([float(text.replace(",", "").replace("−", "-")) for text in texts])
@@ -108,20 +94,20 @@ def test_trajectories_bridge_short_gaps_and_leave_long_ones_open(missing):
 
 def test_pick_attempts_are_marked_in_red_and_the_legend_names_all():
     truth = true_poses(Motion(images=101))
-    plain = picture_of(plot_trajectory(truth, truth, {}))
-    marked = picture_of(plot_trajectory(truth, truth, {}, attempts=[25, 75]))
-    red = "#c82828"
-    assert not near(plain, red).any()
+    plain, marked = (picture_of(plot_trajectory(truth, truth, {}, attempts=attempts)) for attempts in ([], [25, 75]))
+    assert not near(plain, "#c82828").any()
     # One disc for each attempt in the upper panel, and one in the legend.
-    count, _ = cv2.connectedComponents(near(marked, red).astype(np.uint8))
+    count, _ = cv2.connectedComponents(near(marked, "#c82828").astype(np.uint8))
     assert count - 1 == 3
 
 
-def test_the_order_of_rows_does_not_matter_to_a_trajectory():
+def test_a_trajectory_is_of_one_track_whatever_the_order_of_its_rows():
     truth = true_poses(Motion(images=40, velocity=(0.1, 0, 0)))
     table = estimates(truth, noise=0.01, missing=0.1)
     shuffled = np.random.default_rng(0).permutation(len(table))
     assert plot_trajectory(truth, table, {}) == plot_trajectory(truth, table.select(shuffled), {})
+    with pytest.raises(DatasetError, match="Estimate has several rows of an image"):
+        plot_trajectory(truth, truth.select(np.array([0, 0, 1])), {})
 
 
 def test_bins_show_medians_with_misses_as_the_largest_error():
@@ -137,9 +123,8 @@ def test_bins_show_medians_with_misses_as_the_largest_error():
 
 
 def test_sweeps_ring_the_optimum():
-    sweep = sweep_alpha(
-        {"move": true_poses(Motion(velocity=(1, 0, 0)))}, lambda mode, table: -abs(table.translation[-1, 0] - 6.4), [0.1, 0.5, 1.0]
-    )
+    moving = {"move": true_poses(Motion(velocity=(1, 0, 0)))}
+    sweep = sweep_alpha(moving, lambda mode, table: -abs(table.translation[-1, 0] - 6.4), [0.1, 0.5, 1.0])
     assert sweep.best("move")[0] == 0.5
     picture = picture_of(plot_sweep(sweep, "score"))
     x = np.log([0.1 / 1.2, 0.5, 1.2])
@@ -148,26 +133,22 @@ def test_sweeps_ring_the_optimum():
     assert np.ptp(np.flatnonzero(drawn[:, column])) >= 28
 
 
-def test_long_and_strange_names_are_shortened_and_stay_distinct():
+def test_long_and_strange_names_are_shortened_stay_distinct_and_stand_in_values_only():
     assert printable("α\n\0é\udc80") == "???é?"
     assert len(printable("x" * 500)) <= 36
     names = ["W" * 99, "W" * 98 + "V" * 9 + "W" * 30, "Pick attempt"]
-    shown = [Legend(dict.fromkeys(names, RED)).color(name)["datum"] for name in names]
-    assert len(set(shown)) == 3
+    assert len({Legend(dict.fromkeys(names, RED)).color(name)["datum"] for name in names}) == 3
     assert picture_of(plot_recall({"W" * count: np.zeros(1) for count in range(90, 99)}, "ADD")).shape[1] == WIDTH
-
-
-def test_names_stand_in_values_only():
     evil = "datum['x'] + {'signal': 'width'}"
-    rest = plot_error_by_speed(np.ones(2), {evil: np.zeros(2)}, "ADD")
 
     def drop(part: object) -> object:
         if isinstance(part, dict):
             return {key: drop(value) for key, value in part.items() if key not in ("values", "domain", "datum")}
         return [drop(each) for each in part] if isinstance(part, list) else part
 
-    assert evil in str(rest)
-    assert evil not in str(drop(rest))
+    spec = plot_error_by_speed(np.ones(2), {evil: np.zeros(2)}, "ADD")
+    assert evil in str(spec)
+    assert evil not in str(drop(spec))
 
 
 def test_written_charts_read_back(tmp_path, monkeypatch):
@@ -193,16 +174,9 @@ def test_a_file_that_cannot_be_written_is_refused_and_leaves_nothing(tmp_path):
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
     for folder, name in ((tmp_path, "folder.png"), (tmp_path / "file", "a.png"), (tmp_path, "a" * 300 + ".png")):
-        with pytest.raises(OutputError, match="cannot write") as caught:
+        with pytest.raises(OutputError, match=r"\A.*cannot write.*\Z"):
             list(write_figures(folder, {name: b"picture"}))
-        assert "\n" not in str(caught.value)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder.png"]
-
-
-def test_a_trajectory_is_of_one_track():
-    truth = true_poses(Motion(images=3))
-    with pytest.raises(DatasetError, match="Estimate has several rows of an image"):
-        plot_trajectory(truth, truth.select(np.array([0, 0, 1])), {})
 
 
 @given(st.data())

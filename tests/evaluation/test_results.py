@@ -1,6 +1,10 @@
-"""BOP result files: what is read, what is written, and one line with a number for each fault."""
+"""Result files, target lists and ground truth: what is read, what is written, and one line with a number for each fault."""
 
 from __future__ import annotations
+
+import json
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -10,20 +14,24 @@ from scipy.spatial.transform import Rotation
 
 import synpick_warp
 from synpick_warp.apps.evaluation import results
+from synpick_warp.apps.evaluation.models import read_models
 from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.results import HEADER, check_results, encode_results, read_results, write_results
-from synpick_warp.apps.evaluation.truth import read_truth
-from synpick_warp.errors import OutputError, ResultError
+from synpick_warp.apps.evaluation.results import HEADER, ResultFile, check_results, encode_results, read_results, write_results
+from synpick_warp.apps.evaluation.run import make_methods
+from synpick_warp.apps.evaluation.targets import TargetRow, count_targets, encode_targets, in_layout, read_targets, select_targets
+from synpick_warp.apps.evaluation.tracking import filter_poses
+from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
+from synpick_warp.errors import CatalogError, DatasetError, ResultError
+from synpick_warp.scenes.assets.ply import read_ply_vertices
+from tests.builders import refusal
 from tests.harness.fuzz import fuzz_examples
-from tests.worlds.evaluation_set import moved, write_evaluation_set
+from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, OBJECTS, PERIOD, PRISM, SPEED, VISIBILITY, moved, shapes
+from tests.worlds.model_files import ascii_ply, put
 
+SENSORS = ("cam0", "cam1", "cam2")
+CAM7 = '[{"scene_id": 0, "im_id": 0, "sensor": "cam7"}]'
 GOOD = "0,1,2,0.5,1 0 0 0 1 0 0 0 1,10 20 1900,-1"
 OTHER = "0,1,2,0.5,1 0 0 0 1 0 0 0 1,11 20 1900,-1"
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory):
-    return read_truth(synpick_warp.open(write_evaluation_set(tmp_path_factory.mktemp("results") / "set")))
 
 
 def read(tmp_path, text: str | bytes):
@@ -125,10 +133,9 @@ FAULTS = [
 
 @pytest.mark.parametrize(("text", "message"), FAULTS, ids=range(len(FAULTS)))
 def test_faults_of_a_file_are_one_line(tmp_path, text, message):
-    with pytest.raises(ResultError, match=message) as caught:
-        read(tmp_path, text)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 400 + len(str(tmp_path))
+    said = refusal(read, tmp_path, text)
+    assert re.search(message, said)
+    assert len(said) < 400 + len(str(tmp_path))
 
 
 @given(data=st.binary(max_size=200) | st.text("0123456789+-.,einfa \n", max_size=200).map(str.encode), where=st.integers(0, 300))
@@ -149,25 +156,29 @@ def test_any_bytes_are_read_or_refused(tmp_path_factory, data, where):
             assert np.abs(poses.rotation @ poses.rotation.transpose(0, 2, 1) - np.eye(3)).max() < 2e-3
 
 
-def test_missing_files_and_folders_are_refused(tmp_path):
-    with pytest.raises(ResultError, match="there is no file"):
-        read_results(tmp_path / "none.csv")
-    with pytest.raises(ResultError, match="is not a regular file"):
-        read_results(tmp_path)
-    with pytest.raises(OutputError, match="is a folder; name a file"):
-        write_results(tmp_path, table(1, 0))
-    with pytest.raises(OutputError, match="cannot write"):
-        write_results(tmp_path / "none" / "a.csv", table(1, 0))
-
-
 def check(tmp_path, truth, poses: PoseTable) -> None:
     write_results(tmp_path / "method.csv", poses)
     check_results(read_results(tmp_path / "method.csv"), truth, {1, 2, 3})
 
 
 def test_poses_of_the_data_set_pass(tmp_path, truth):
-    check(tmp_path, truth, truth.poses)
-    check(tmp_path, truth, moved(truth.poses, (0.0, 0.0, -1.0)))
+    for poses in (truth.poses, moved(truth.poses, (0.0, 0.0, -1.0))):
+        check(tmp_path, truth, poses)
+
+
+def test_missing_files_and_folders_are_refused(tmp_path):
+    one = table(1, 0)
+    for call, path, said in (
+        (read_results, tmp_path / "none.csv", "there is no file"),
+        (read_results, tmp_path, "is not a regular file"),
+        (lambda path: write_results(path, one), tmp_path, "is a folder; name a file"),
+        (lambda path: write_results(path, one), tmp_path / "none" / "a.csv", "cannot write"),
+    ):
+        assert said in refusal(call, path)
+
+
+METRES = r"line 2: t seems to be in metres; BOP result files have millimetres: multiply t by 1000 \(median distance .* 1\.9.* mm, "
+TOO_LARGE = "line 2: t seems to be 1000 times too large; BOP result files have millimetres: divide t by 1000"
 
 
 @pytest.mark.parametrize(
@@ -176,23 +187,195 @@ def test_poses_of_the_data_set_pass(tmp_path, truth):
         ("scene", 6, r"line 9: the data set has no scene 6; its scenes: 0, 1, 2, 3, 4, 5$"),
         ("object_id", 9, r"line 9: the data set has no object 9; its objects: 1, 2, 3$"),
         ("image", 4, r"line 9: scene 0 has no image 4; its images are 0 to 3$"),
+        ("translation", 1e-3, METRES),
+        ("translation", 1e3, TOO_LARGE),
     ],
 )
-def test_unknown_scenes_objects_and_images_are_named(tmp_path, truth, column, value, message):
+def test_unknown_scenes_objects_and_images_and_wrong_units_are_named(tmp_path, truth, column, value, message):
     values = getattr(truth.poses, column).copy()
-    values[7] = value
+    if column == "translation":
+        values *= value
+    else:
+        values[7] = value
     with pytest.raises(ResultError, match=message):
         check(tmp_path, truth, PoseTable(**(vars(truth.poses) | {column: values})))
 
 
+# ---- target lists ----
+
+
+def listed(tmp_path, content):
+    """Target list of a file."""
+    return read_targets(put(tmp_path / "list.json", content if isinstance(content, (str, bytes)) else json.dumps(content)))
+
+
+def test_lists_are_read_as_they_were_written(tmp_path):
+    targets = count_targets([(1, 2, 5), (0, 3, 4), (1, 2, 5)])
+    assert json.loads(encode_targets(targets)) == [
+        {"scene_id": 0, "im_id": 3, "obj_id": 4, "inst_count": 1},
+        {"scene_id": 1, "im_id": 2, "obj_id": 5, "inst_count": 2},
+    ]
+    found = listed(tmp_path, encode_targets(targets))
+    assert found.targets == (TargetRow(0, 3, 4, 1), TargetRow(1, 2, 5, 2))
+    assert found.objects == {(0, 3): frozenset({4}), (1, 2): frozenset({5})}
+    # Lists of several sensors.
+    classic = count_targets([(1, 2, 5), (3, 3, 4), (1, 2, 5)])
+    written = encode_targets(in_layout(classic, SENSORS))
+    assert json.loads(written)[0] == {"scene_id": 0, "im_id": 2, "obj_id": 5, "inst_count": 2, "sensor": "cam1"}
+    assert sorted(listed(tmp_path, written).in_classic_layout(SENSORS).targets) == sorted(classic)
+    assert in_layout(classic, ()) == classic
+
+
+def test_the_truth_is_reduced_to_images_and_objects(truth, tmp_path):
+    rows = [{"im_id": 1, "scene_id": 4}, {"im_id": 2, "scene_id": 0, "obj_id": BOX}, {"im_id": 1, "scene_id": 4, "obj_id": 9}]
+    part = select_targets(truth, listed(tmp_path, rows))
+    assert part.images.tolist() == [[0, 2], [4, 1]]
+    keys = list(zip(part.poses.scene.tolist(), part.poses.image.tolist(), part.poses.object_id.tolist(), strict=True))
+    assert keys == [(0, 2, BOX), (4, 1, BRICK), (4, 1, BRICK), (4, 1, 2), (4, 1, 3)]
+    rows = (truth.poses.scene == 4) & (truth.poses.image == 1)
+    for name in ("visibility", "speed", "mode", "episode", "camera"):
+        np.testing.assert_array_equal(getattr(part, name)[1:], getattr(truth, name)[rows])
+
+
 @pytest.mark.parametrize(
-    ("factor", "message"),
+    ("entry", "images"),
     [
-        (1e-3, r"line 2: t seems to be in metres; BOP result files have millimetres: multiply t by 1000 \(median distance .* 1\.9.* mm, "),
-        (1e3, "line 2: t seems to be 1000 times too large; BOP result files have millimetres: divide t by 1000"),
+        ({"scene_id": 2, "im_id": 5}, [(6, 5)]),
+        ({"scene_id": 2, "im_id": 5, "sensor": "cam2"}, [(8, 5)]),
+        ({"scene_id": 1, "im_id": [["cam0", 4], ["cam1", 4]]}, [(3, 4), (4, 4)]),
     ],
 )
-def test_wrong_units_are_recognised(tmp_path, truth, factor, message):
-    poses = PoseTable(**(vars(truth.poses) | {"translation": factor * truth.poses.translation}))
+def test_lists_of_several_sensors_name_images_of_the_first_one_or_their_own(tmp_path, entry, images):
+    assert sorted(listed(tmp_path, [entry]).in_classic_layout(SENSORS).objects) == images
+
+
+@pytest.mark.parametrize(
+    ("text", "sensors", "message"),
+    [
+        ("[]", (), "lists no images"),
+        ("{}", (), "is damaged"),
+        ('[{"scene_id": -1, "im_id": 0}]', (), "is damaged"),
+        ('[{"scene_id": 0}]', (), "im_id"),
+        ('[{"scene_id": 0, "im_id": 4}]', (), "the data set has no image 4 in scene 0"),
+        (CAM7, (), 'the sensor "cam7", which the data set does not have; .*a scene for each'),
+        (CAM7, SENSORS, 'the sensor "cam7", which the data set does not have; .*cam0, cam1, cam2'),
+    ],
+)
+def test_lists_that_cannot_be_used_are_refused(truth, tmp_path, text, sensors, message):
     with pytest.raises(ResultError, match=message):
-        check(tmp_path, truth, poses)
+        select_targets(truth, listed(tmp_path, text).in_classic_layout(sensors))
+
+
+# ---- ground truth as a pose table: columns, speeds, order; models and symmetries ----
+
+
+def test_truth_has_a_row_per_instance_image_and_camera(folder, truth):
+    data = synpick_warp.open(folder)
+    assert len(truth) == len(truth.poses) == len(MODES) * CAMERAS * FRAMES * len(OBJECTS)
+    assert truth.images.tolist() == [[scene, image] for scene in range(len(MODES) * CAMERAS) for image in range(FRAMES)]
+    keys = np.stack((truth.poses.scene, truth.poses.image, truth.poses.object_id))
+    assert (np.lexsort(keys[::-1]) == np.arange(len(truth))).all()
+    for row in (0, 17, len(truth) - 1):
+        instance, scene = truth.poses.instance[row], truth.poses.scene[row]
+        view = data[scene // CAMERAS].view(int(truth.poses.image[row]), int(scene % CAMERAS))
+        np.testing.assert_array_equal(truth.poses.rotation[row], view.object_to_camera[instance, :3, :3])
+        np.testing.assert_allclose(truth.poses.translation[row], view.object_to_camera[instance, :3, 3])
+        assert truth.poses.object_id[row] == OBJECTS[instance]
+        assert truth.visibility[row] == VISIBILITY[instance]
+        assert truth.speed[row] == pytest.approx(SPEED[instance], abs=1e-9)
+        assert (truth.episode[row], truth.camera[row], truth.mode[row]) == (scene // CAMERAS, scene % CAMERAS, MODES[scene // CAMERAS])
+    assert set(truth.poses.score) == {1.0}
+
+
+def test_speed_is_from_the_frame_before_or_else_from_the_next():
+    image = np.array([0, 1, 2, 4, 0])
+    count = len(image)
+    places = np.zeros((count, 3))
+    places[:, 0] = [0.0, 0.1, 0.4, 2.0, 7.0]
+    zero, one, instance = np.zeros(count, np.int64), np.ones(count), np.array([0, 0, 0, 0, 1])
+    poses = PoseTable(zero, image, zero, np.tile(np.eye(3), (count, 1, 1)), places, one, -one, instance)
+    assert instance_speeds(poses, 0.1) == pytest.approx([1.0, 1.0, 3.0, np.nan, np.nan], nan_ok=True)
+    assert len(instance_speeds(poses.select(np.zeros(count, bool)), 0.1)) == 0
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 25))
+@settings(max_examples=fuzz_examples(100))
+def test_speeds_are_those_of_each_row(seed, count):
+    random = np.random.default_rng(seed)
+    keys = random.permutation(60)[:count]
+    scene, instance, image = keys // 30, keys // 10 % 3, keys % 10
+    places = random.normal(size=(count, 3))
+    turns, one = np.zeros((count, 3, 3)), np.ones(count)
+    speed = instance_speeds(PoseTable(scene, image, instance, turns, places, one, one, instance), PERIOD)
+    rows = {tuple(key): row for row, key in enumerate(np.stack((scene, instance, image), axis=1).tolist())}
+    for (a, b, frame), row in rows.items():
+        other = rows.get((a, b, frame - 1), rows.get((a, b, frame + 1)))
+        expected = np.nan if other is None else np.linalg.norm(places[row] - places[other]) / PERIOD
+        assert speed[row] == pytest.approx(expected, nan_ok=True)
+
+
+def test_models_are_in_metres_with_the_symmetries_of_the_set(folder):
+    models = read_models(folder, OBJECTS)
+    np.testing.assert_allclose(models[BRICK].vertices, 1e-3 * shapes()[BRICK].vertices, atol=1e-7)
+    assert [models[key].symmetric for key in (BRICK, BOX, PRISM)] == [False, True, True]
+    assert [len(models[key].symmetries) for key in (BRICK, BOX, PRISM)] == [1, 2, 315]
+    thinned = read_models(folder, [PRISM], vertices=10)[PRISM].vertices
+    assert len(thinned) == 10
+    assert {tuple(row) for row in thinned} <= {tuple(row) for row in models[PRISM].vertices}
+    assert len(read_models(folder, [BOX], vertices=10**6)[BOX].vertices) == len(models[BOX].vertices)
+
+
+def test_sets_that_cannot_be_evaluated_on_are_named(folder, tmp_path):
+    broken = tmp_path / "set"
+    shutil.copytree(folder, broken)
+    (broken / "models" / "obj_000002.ply").unlink()
+    with pytest.raises(DatasetError, match=r"has no models/obj_000002\.ply, the model of an object in its ground truth"):
+        read_models(broken, OBJECTS)
+    (broken / "models" / "models_info.json").write_text(json.dumps({"1": {"diameter": 1.0}}))
+    with pytest.raises(CatalogError, match="no entry for object 2"):
+        read_models(broken, OBJECTS)
+    (broken / "models" / "models_info.json").unlink()
+    with pytest.raises(DatasetError, match=r"has no models/models_info\.json, .*; bake with --formats bop or shards"):
+        read_models(broken, OBJECTS)
+    entry = broken / "manifest" / "000000.json"
+    entry.write_text(entry.read_text().replace('"mode"', '"mood"'))
+    with pytest.raises(DatasetError, match="episode 0 has no mode"):
+        read_truth(synpick_warp.open(broken))
+    for path in (broken / "manifest").iterdir():
+        path.unlink()
+    with pytest.raises(DatasetError, match="has no episode to evaluate on"):
+        read_truth(synpick_warp.open(broken))
+
+
+def test_estimates_of_a_camera_that_moves_are_filtered_in_the_world(folder, truth, tmp_path):
+    """A camera turns over a pile at rest: exact estimates stay exact, and nothing has a speed that has none in the world."""
+    out = shutil.copytree(folder, tmp_path / "set")
+    scene = sorted((out / "train_pbr").iterdir())[0]
+    cameras, poses = (json.loads((scene / f"scene_{name}.json").read_text()) for name in ("camera", "gt"))
+    for frame, camera in cameras.items():
+        turn = Rotation.from_euler("xyz", [10 * int(frame), 0, 25 * int(frame)], degrees=True).as_matrix()
+        shift = np.array([40.0, -30.0, 15.0]) * int(frame)
+        camera |= {"cam_R_w2c": turn.ravel().tolist(), "cam_t_w2c": shift.tolist()}
+        for row in poses[frame]:
+            row["cam_t_m2c"] = (turn @ row["cam_t_m2c"] + shift).tolist()
+            row["cam_R_m2c"] = (turn @ np.reshape(row["cam_R_m2c"], (3, 3))).ravel().tolist()
+    for name, content in (("camera", cameras), ("gt", poses)):
+        (scene / f"scene_{name}.json").write_text(json.dumps(content))
+    before, truth = truth, read_truth(synpick_warp.open(out))
+    assert (truth.motion.scene.tolist(), truth.motion.image.tolist()) == ([0] * FRAMES, list(range(FRAMES)))
+    np.testing.assert_allclose(truth.speed, before.speed, atol=1e-9)
+    world, back = truth.motion.to_world(truth.poses), truth.motion.to_camera(truth.motion.to_world(truth.poses))
+    for name in ("rotation", "translation"):
+        np.testing.assert_allclose(getattr(world, name), getattr(before.poses, name), atol=1e-12)
+        np.testing.assert_allclose(getattr(back, name), getattr(truth.poses, name), atol=1e-12)
+    (method,) = make_methods([tmp_path / "a.csv"], [ResultFile(tmp_path / "a.csv", truth.poses, np.arange(len(truth)))], 0.2, truth.motion)
+    resting = np.array(SPEED)[truth.poses.instance] == 0.0
+    np.testing.assert_allclose(method.filtered.translation[resting], truth.poses.translation[resting], atol=1e-9)
+    assert np.abs(filter_poses(truth.poses, 0.2).translation - truth.poses.translation)[resting].max() > 0.05
+
+
+@pytest.mark.parametrize("body", ["nan 0 0", "1e400 0 0", ""])
+def test_vertices_that_are_no_points_are_refused(tmp_path, body):
+    rows = [body.split()] if body else []
+    with pytest.raises(CatalogError, match=r"not a finite number|no vertices|not readable"):
+        read_ply_vertices(put(tmp_path / "a.ply", ascii_ply(rows, [])))

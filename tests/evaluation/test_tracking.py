@@ -10,16 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
+from synpick_warp.apps.evaluation import tracking
 from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.tracking import (
-    PAPER_ALPHAS,
-    SWEEP_ALPHAS,
-    filter_poses,
-    find_tracks,
-    split_by_mode,
-    sweep_alpha,
-    track_of_instance,
-)
+from synpick_warp.apps.evaluation.tracking import filter_poses, find_tracks, sweep_alpha, track_of_instance
 from synpick_warp.errors import ConfigError, DatasetError
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import FRAME, Motion, estimates, noisy_tables, true_poses
@@ -41,25 +34,28 @@ def test_a_single_instance_is_one_track_whatever_its_jumps_and_gaps():
 
 
 def test_tracks_are_sorted_by_scene_object_and_first_image():
-    table = true_poses(
-        Motion(scene=2), Motion(scene=1, object_id=5), Motion(scene=1, object_id=3), Motion(scene=1, object_id=3, start=(1, 0, 1))
-    )
+    third = Motion(scene=1, object_id=3)
+    table = true_poses(Motion(scene=2), Motion(scene=1, object_id=5), third, dataclasses.replace(third, start=(1, 0, 1)))
     tracks = find_tracks(table)
     keys = [(int(table.scene[tracks == one][0]), int(table.object_id[tracks == one][0])) for one in range(4)]
     assert keys == [(1, 3), (1, 3), (1, 5), (2, 17)]
     assert np.bincount(tracks).tolist() == [100] * 4
 
 
-def test_instances_of_an_object_that_pass_each_other_stay_apart():
-    truth = true_poses(Motion(start=(-0.2, 0.0, 2), velocity=(0.06, 0, 0)), Motion(start=(0.2, 0.1, 2), velocity=(-0.06, 0, 0), instance=1))
-    hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1))
-    assert purity(find_tracks(hidden), truth.instance) == 1.0
-
-
-def test_an_outlier_next_to_another_instance_does_not_swap_tracks():
-    truth = true_poses(Motion(start=(0, 0, 2)), Motion(start=(0.1, 0, 2), instance=1))
+@pytest.mark.parametrize(
+    ("first", "second", "outlier"),
+    [
+        (Motion(start=(-0.2, 0.0, 2), velocity=(0.06, 0, 0)), Motion(start=(0.2, 0.1, 2), velocity=(-0.06, 0, 0), instance=1), None),
+        (Motion(start=(0, 0, 2)), Motion(start=(0.1, 0, 2), instance=1), [0.5, 0, 2]),
+        (Motion(start=(0, 0, 2), images=30), Motion(start=(0.2, 0, 2), instance=1), None),
+    ],
+    ids=["they pass each other", "an outlier of one next to the other", "one is picked"],
+)
+def test_instances_of_an_object_keep_their_tracks(first, second, outlier):
+    truth = true_poses(first, second)
     hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1), translation=truth.translation.copy())
-    hidden.translation[(truth.image == 50) & (truth.instance == 0)] = [0.5, 0, 2]
+    if outlier:
+        hidden.translation[(truth.image == 50) & (truth.instance == 0)] = outlier
     assert purity(find_tracks(hidden), truth.instance) == 1.0
 
 
@@ -69,12 +65,6 @@ def test_the_choice_of_axes_does_not_matter_among_crowded_instances():
     turn = Rotation.from_rotvec([0.4, -0.7, 1.1])
     turned = dataclasses.replace(table, translation=turn.apply(table.translation))
     np.testing.assert_array_equal(find_tracks(turned), find_tracks(table))
-
-
-def test_the_instance_that_stays_keeps_its_track_when_the_other_is_picked():
-    truth = true_poses(Motion(start=(0, 0, 2), images=30), Motion(start=(0.2, 0, 2), instance=1))
-    hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1))
-    assert purity(find_tracks(hidden), truth.instance) == 1.0
 
 
 def test_known_instances_are_tracks_though_they_change_places():
@@ -112,20 +102,14 @@ def test_the_track_of_a_true_instance_is_the_one_most_often_nearest():
 @given(noisy_tables())
 @settings(max_examples=fuzz_examples(100), deadline=None)
 def test_fuzz_tracks_never_mix_scenes_objects_or_instances_nor_hold_two_rows_of_an_image(table):
+    """A group has as many tracks as its fullest image."""
     tracks = find_tracks(table)
     assert sorted(np.unique(tracks)) == list(range(len(np.unique(tracks))))
+    key = np.stack((table.scene, table.object_id, table.instance), axis=1)
     for track in np.unique(tracks):
         rows = tracks == track
-        for name in ("scene", "object_id", "instance"):
-            assert len(np.unique(getattr(table, name)[rows])) == 1
+        assert len(np.unique(key[rows], axis=0)) == 1
         assert len(np.unique(table.image[rows])) == rows.sum()
-
-
-@given(noisy_tables())
-@settings(max_examples=fuzz_examples(100), deadline=None)
-def test_fuzz_a_group_has_as_many_tracks_as_its_fullest_image(table):
-    tracks = find_tracks(table)
-    key = np.stack((table.scene, table.object_id, table.instance), axis=1)
     for group in np.unique(key, axis=0):
         rows = (key == group).all(axis=1)
         assert len(np.unique(tracks[rows])) == np.bincount(table.image[rows]).max()
@@ -134,9 +118,8 @@ def test_fuzz_a_group_has_as_many_tracks_as_its_fullest_image(table):
 # ---- filter ----
 
 
-def with_poses(table: PoseTable, rotation: Rotation | None = None, translation: np.ndarray | None = None) -> PoseTable:
-    changed = {} if rotation is None else {"rotation": rotation.as_matrix()}
-    return dataclasses.replace(table, **changed, **({} if translation is None else {"translation": translation}))
+def with_rotations(table: PoseTable, rotation: Rotation) -> PoseTable:
+    return dataclasses.replace(table, rotation=rotation.as_matrix())
 
 
 def angles(first: PoseTable, second: PoseTable) -> np.ndarray:
@@ -155,8 +138,8 @@ def by_hand(table: PoseTable, alpha: float) -> tuple[np.ndarray, Rotation]:
 
 
 def test_alpha_is_the_papers_and_weighs_the_new_estimate():
-    assert PAPER_ALPHAS == (0.05, 0.2)
-    table = with_poses(true_poses(Motion(images=2)), translation=np.array([[0.0, 0, 1], [1.0, 0, 1]]))
+    assert tracking.PAPER_ALPHAS == (0.05, 0.2)
+    table = dataclasses.replace(true_poses(Motion(images=2)), translation=np.array([[0.0, 0, 1], [1.0, 0, 1]]))
     assert filter_poses(table).translation[1, 0] == pytest.approx(0.05)
 
 
@@ -182,31 +165,22 @@ def test_at_rest_the_variance_falls_by_alpha_over_two_minus_alpha(alpha):
 
 
 @pytest.mark.parametrize("alpha", ALPHAS)
-def test_at_constant_velocity_the_position_lags_by_v_dt_one_minus_alpha_over_alpha(alpha):
-    velocity = np.array([0.1, -0.05, 0.2])
-    truth = true_poses(Motion(velocity=tuple(velocity), images=600))
-    lag = truth.translation - filter_poses(truth, alpha).translation
-    np.testing.assert_allclose(lag[-1], velocity * FRAME * (1 - alpha) / alpha, rtol=1e-9)
-
-
-@pytest.mark.parametrize("alpha", ALPHAS)
-def test_at_constant_rate_the_rotation_lags_by_w_dt_one_minus_alpha_over_alpha(alpha):
+def test_at_constant_velocity_and_rate_poses_lag_by_v_dt_one_minus_alpha_over_alpha(alpha):
     # 0.4 rad/s: at alpha 0.05 a lag of 0.51 rad, below half a turn, beyond which the shorter arc would change its side.
-    spin = np.array([0.0, 0.24, 0.32])
-    truth = true_poses(Motion(spin=tuple(spin), images=900))
-    lag = Rotation.from_matrix(truth.rotation) * Rotation.from_matrix(filter_poses(truth, alpha).rotation).inv()
-    np.testing.assert_allclose(lag[-1].as_rotvec(), spin * FRAME * (1 - alpha) / alpha, rtol=1e-6, atol=1e-12)
+    velocity, spin, frames = np.array([0.1, -0.05, 0.2]), np.array([0.0, 0.24, 0.32]), FRAME * (1 - alpha) / alpha
+    truth = true_poses(Motion(velocity=tuple(velocity), spin=tuple(spin), images=900))
+    filtered = filter_poses(truth, alpha)
+    np.testing.assert_allclose((truth.translation - filtered.translation)[-1], velocity * frames, rtol=1e-9)
+    turn = Rotation.from_matrix(truth.rotation) * Rotation.from_matrix(filtered.rotation).inv()
+    np.testing.assert_allclose(turn[-1].as_rotvec(), spin * frames, rtol=1e-6, atol=1e-12)
 
 
-def test_rotations_take_the_shorter_arc():
-    turns = Rotation.from_euler("z", [[10.0], [-10.0]], degrees=True), Rotation.from_euler("z", [[170.0], [-170.0]], degrees=True)
-    halves = [filter_poses(with_poses(true_poses(Motion(images=2)), turn), 0.5).rotation[1] for turn in turns]
+def test_rotations_take_the_shorter_arc_and_half_a_turn_ends_halfway_on_either():
+    two = true_poses(Motion(images=2))
+    turns = (Rotation.from_euler("z", [[first], [-first]], degrees=True) for first in (10.0, 170.0))
+    halves = [filter_poses(with_rotations(two, turn), 0.5).rotation[1] for turn in turns]
     np.testing.assert_allclose(halves, Rotation.from_euler("z", [[0.0], [180.0]], degrees=True).as_matrix(), atol=1e-12)
-
-
-def test_half_a_turn_ends_halfway_on_either_arc():
-    turn = Rotation.from_euler("z", [[0.0], [180.0]], degrees=True)
-    table = with_poses(true_poses(Motion(images=2)), turn)
+    table = with_rotations(two, Rotation.from_euler("z", [[0.0], [180.0]], degrees=True))
     assert np.degrees(angles(filter_poses(table, 0.5), table)) == pytest.approx([0.0, 90.0])
 
 
@@ -221,24 +195,17 @@ def test_a_gap_is_no_step_and_gets_no_rows():
 
 
 def test_alpha_one_changes_nothing_and_all_else_stays():
+    """The input is not written to, and a table without rows stays empty."""
     table = estimates(true_poses(Motion(spin=(1, 2, 3)), Motion(object_id=4)), noise=0.1, angle=1.0, missing=0.1)
+    for name in ("translation", "rotation"):
+        getattr(table, name).setflags(write=False)
     filtered = filter_poses(table, 1.0)
     np.testing.assert_array_equal(filtered.translation, table.translation)
     np.testing.assert_allclose(filtered.rotation, table.rotation, atol=1e-12)
     for name in ("scene", "image", "object_id", "score", "seconds", "instance"):
         np.testing.assert_array_equal(getattr(filter_poses(table, 0.05), name), getattr(table, name))
-
-
-def test_a_table_without_rows_stays_empty():
-    empty = true_poses(Motion()).select(np.zeros(100, bool))
+    empty = table.select(np.zeros(len(table), bool))
     assert len(filter_poses(empty)) == len(find_tracks(empty)) == 0
-
-
-def test_the_input_is_not_written_to():
-    table = estimates(true_poses(Motion()), noise=0.01, angle=0.1)
-    for name in ("translation", "rotation"):
-        getattr(table, name).setflags(write=False)
-    filter_poses(table)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -0.1, 1.0001, float("nan"), float("inf")])
@@ -247,18 +214,23 @@ def test_an_alpha_out_of_range_is_refused(alpha):
         filter_poses(true_poses(Motion()), alpha)
 
 
-@pytest.mark.parametrize(("name", "value"), [("translation", np.nan), ("rotation", np.inf), ("translation", 1e300), ("rotation", 7.0)])
-def test_a_pose_that_is_none_is_refused_with_its_place(name, value):
+NOT_FINITE = r"^the pose of scene 1, image 42, object 17 is not finite"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("translation", np.nan, NOT_FINITE),
+        ("rotation", np.inf, NOT_FINITE),
+        ("translation", 1e300, NOT_FINITE),
+        ("rotation", 7.0, NOT_FINITE),
+        ("rotation", np.diag([1.0, 1.0, -1.0]), "^matrix 42 of the estimates is no rotation"),
+    ],
+)
+def test_a_pose_that_is_none_is_refused_with_its_place(name, value, said):
     table = true_poses(Motion())
     getattr(table, name)[42] = value
-    with pytest.raises(DatasetError, match=r"^the pose of scene 1, image 42, object 17 is not finite"):
-        filter_poses(table)
-
-
-def test_a_left_handed_or_singular_rotation_is_refused():
-    table = true_poses(Motion())
-    table.rotation[3] = np.diag([1.0, 1.0, -1.0])
-    with pytest.raises(DatasetError, match=r"^matrix 3 of the estimates is no rotation"):
+    with pytest.raises(DatasetError, match=said):
         filter_poses(table)
 
 
@@ -317,19 +289,12 @@ def test_at_rest_the_smallest_alpha_is_best_and_in_motion_the_one_of_least_noise
     np.testing.assert_allclose(sweep.scores[:, -1], sweep.unfiltered)
 
 
-def test_among_equal_scores_the_largest_alpha_is_best():
-    sweep = sweep_alpha({"pick": true_poses(Motion())}, lambda mode, table: 1.0)
-    assert sweep.alphas == SWEEP_ALPHAS
-    assert sweep.best("pick") == (1.0, 1.0)
-
-
-def test_estimates_are_split_by_the_mode_of_their_scenes():
+def test_sweeps_choose_the_largest_of_equal_weights_also_for_modes_without_estimates():
     table = true_poses(*(Motion(scene=scene, images=3) for scene in (4, 5, 6)))
-    parts = split_by_mode(table, {6: "pick", 5: "move", 4: "pick", 9: "target"})
+    parts = tracking.split_by_mode(table, {6: "pick", 5: "move", 4: "pick", 9: "target"})
     assert list(parts) == ["pick", "move", "target"]
     assert [np.unique(part.scene).tolist() for part in parts.values()] == [[4, 6], [5], []]
-
-
-def test_a_mode_without_estimates_is_scored_too():
-    empty = true_poses(Motion()).select(np.arange(0))
-    assert sweep_alpha({"move": empty}, lambda mode, table: len(table)).scores.tolist() == [[0.0] * len(SWEEP_ALPHAS)]
+    sweep = sweep_alpha(parts, lambda mode, table: len(table))
+    assert sweep.alphas == tracking.SWEEP_ALPHAS
+    assert sweep.best("pick") == (1.0, 6.0)
+    assert sweep.scores.tolist() == [[count] * len(tracking.SWEEP_ALPHAS) for count in (6.0, 3.0, 0.0)]
