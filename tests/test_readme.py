@@ -82,11 +82,19 @@ def test_the_page_on_ones_own_cell_leads_to_a_valid_data_set(tmp_path, environme
         assert (tmp_path / name).stat().st_size > 100, name
 
 
+def anchors(document: Path) -> set[str]:
+    """Anchors of a Markdown file: those of its headings, as GitHub makes them, and those it names."""
+    text = document.read_text()
+    titles = re.findall(r"^#+ (.*)", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles} | set(re.findall(r'<a id="([^"]*)"', text))
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_of_documents_lead_somewhere(document):
-    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", document.read_text())
-    missing = [link for link in links if not link.startswith("http") and not (document.parent / link).exists()]
-    assert missing == []
+    links = [link for link in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", document.read_text()) if not link[0].startswith("http")]
+    assert [path for path, _ in links if not (document.parent / path).exists()] == []
+    targets = [(document.parent / path if path else document, anchor) for path, anchor in links if anchor]
+    assert [anchor for path, anchor in targets if anchor not in anchors(path)] == []
 
 
 @pytest.mark.parametrize("document", [path for path in DOCUMENTS if path != HISTORY], ids=lambda path: path.relative_to(ROOT).as_posix())

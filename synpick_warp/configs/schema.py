@@ -72,7 +72,7 @@ class Bake:
         4, "Episodes to generate; each becomes one BOP scene per camera. As many as bake.worlds, where only those are set."
     )
     seed: Annotated[int, Within(0, 2**63 - 1)] = setting(0, "Seed of all random numbers.")
-    device: str = setting("auto", "cpu, cuda:N, or auto (the first GPU if there is one).")
+    device: str = setting("auto", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
         "",
         "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: embedded objects.",

@@ -96,7 +96,7 @@ class CameraRow:
         Within(-MAX_NUMBER, MAX_NUMBER, "px"),
     ] = setting(None, "Camera matrix with fx, fy, cx and cy, instead of fov.")
     distortion: Annotated[tuple[float, ...] | None, Within(-MAX_NUMBER, MAX_NUMBER)] = setting(
-        None, "OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
+        None, "Lens distortion by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
     )
     model: str | None = setting(None, "Distortion model, pinhole unless it is given.", choices=MODELS)
     file: str | None = setting(

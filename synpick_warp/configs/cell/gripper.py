@@ -37,7 +37,7 @@ _LITRES_PER_MINUTE = 1e-3 / 60.0
 class Gripper:
     """A conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
 
-    kind: str = setting(SUCTION1, "suction1 (one cup) or suction_array (a plate with gripper.cups).", choices=GRIPPERS)
+    kind: str = setting(SUCTION1, "Kind: suction1 (one cup) or suction_array (a plate with gripper.cups).", choices=GRIPPERS)
     cups: Annotated[tuple[tuple[float, float], ...], Within(-0.5, 0.5, "m")] = setting(
         (),
         "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
