@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -21,8 +20,7 @@ EVIL = "</script><script>window.ran=1</script><img src=x onerror=window.ran=2><!
 def data(tmp_path_factory) -> Path:
     """Three episodes of mode pick as scenes, shards and trajectories, with layers."""
     folder = tmp_path_factory.mktemp("report") / "set"
-    config = settings(3, ("bop", "shards", "zarr"))
-    bake(folder, dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png")))
+    bake(folder, settings(3, ("bop", "shards", "zarr")).with_values({"bop.split": "train", "bop.color_format": "png"}))
     return folder
 
 
@@ -48,8 +46,7 @@ def hostile_page(data, tmp_path_factory) -> Path:
         scene.write_text(json.dumps(content))
     for entry in (folder / "manifest").glob("0*.json"):
         content = json.loads(entry.read_text())
-        content["row"]["sentence"] = EVIL
-        for attempt in content["attempts"]:
-            attempt["sentence"] = EVIL
+        for record in (content["row"], *content["attempts"]):
+            record["sentence"] = EVIL
         entry.write_text(json.dumps(content))
     return write_report(synpick_warp.open(folder), folder.parent / "report.html")

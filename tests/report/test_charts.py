@@ -9,6 +9,7 @@ from types import SimpleNamespace as Namespace
 
 import numpy as np
 import pytest
+import vl_convert
 
 import synpick_warp
 from synpick_warp.apps.report.charts import ChartData, make_charts, object_labels
@@ -84,8 +85,6 @@ def test_objects_over_time_last_as_long_as_the_longest_episode(statistics):
 
 
 def test_every_plot_compiles(charts):
-    import vl_convert
-
     for chart in charts.values():
         compiled = vl_convert.vegalite_to_vega({"width": 400, **chart.spec}, vl_version=VEGA_LITE)
         assert compiled["marks"], chart.name
@@ -94,11 +93,10 @@ def test_every_plot_compiles(charts):
 def test_names_stand_in_values_only(statistics):
     evil = "datum['x'] + signal"
     objects = tuple(replace(each, name=evil) for each in statistics.objects)
-    charts = make_charts(ChartData(replace(statistics, objects=objects), [], load_config()))
-    for chart in charts:
+    for chart in make_charts(ChartData(replace(statistics, objects=objects), [], load_config())):
         rest = {key: value for key, value in chart.spec.items() if key not in ("data", "params")}
-        rest.get("encoding", {}).get("y", {}).pop("sort", None)
-        rest.get("encoding", {}).get("y", {}).pop("scale", None)
+        for key in ("sort", "scale"):
+            rest.get("encoding", {}).get("y", {}).pop(key, None)
         assert evil not in str(rest)
     labels = object_labels(objects)
     assert len(set(labels.values())) == len(objects)
@@ -161,10 +159,6 @@ def figures(**more) -> Figures:
     return Figures(statistics, known, brightness, own.get("planned", 20))
 
 
-def test_a_good_set_has_no_findings():
-    assert find(figures()) == []
-
-
 CASES = {
     "never drawn": ({"annotations": replace(ANNOTATIONS, objects={1: 3000, 3: 3000})}, WARNING, "1 object was never drawn", "thing 2"),
     "rare": (
@@ -200,26 +194,23 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_each_fault_is_raised_once(name):
+    assert find(figures()) == []
     faults, level, title, detail = CASES[name]
     (finding,) = find(figures(**faults))
     assert (finding.level, finding.title.startswith(title), detail in finding.detail) == (level, True, True), finding
 
 
-def test_objects_that_are_seen_from_one_side():
+def test_objects_that_are_seen_from_one_side_and_order_of_findings():
+    """Warnings come first, and long lists are cut."""
     good = figures().statistics
     flat = replace(good.objects[1], coverage=replace(COVERAGE, occupied=0.1))
     (finding,) = find(replace(figures(), statistics=replace(good, objects=(good.objects[0], flat, good.objects[2]))))
     assert finding.title == "1 object seen from few directions"
-
-
-def test_warnings_come_first_and_long_lists_are_cut():
     found = find(figures(attempts=dict.fromkeys(ROWS, 0), missing=("no depth images: x",)))
     assert [finding.level for finding in found] == [WARNING, NOTE]
     assert "0, 1, 2, 3, 4, 5 and 14 more" in found[0].detail
 
 
 def test_spread_takes_both_ends():
-    assert spread(range(10), 4) == [0, 3, 6, 9]
-    assert spread(range(3), 4) == [0, 1, 2]
+    assert [spread(range(count), 4) for count in (10, 3, 0)] == [[0, 3, 6, 9], [0, 1, 2], []]
     assert spread(range(5), 1) == [2]
-    assert spread([], 3) == []

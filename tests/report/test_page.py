@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import json
 import re
 import shutil
@@ -17,11 +16,10 @@ import pytest
 import synpick_warp
 from synpick_warp.apps.report import compose, write_report
 from synpick_warp.apps.report import page as page_module
-from synpick_warp.apps.report.album import BUDGET, Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.album import Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
 from synpick_warp.apps.report.markup import Html, content_hash, element, embed_json, join, printable
-from synpick_warp.cli.main import main
 from synpick_warp.errors import OutputError
-from tests.builders import mistake
+from tests.builders import mistake, run
 from tests.harness import scripted_bake
 from tests.report.conftest import EVIL
 
@@ -120,24 +118,25 @@ def test_the_budget_of_pictures_holds(data, tmp_path, monkeypatch):
     assert "did not fit" in path.read_text()
 
 
-def test_sets_of_every_shape(data, tmp_path, capsys):
-    folder = tmp_path / "set"
-    shutil.copytree(data, folder)
+def test_sets_of_every_shape(data, tmp_path):
+    folder, page = Path(shutil.copytree(data, tmp_path / "set")), tmp_path / "set-report.html"
     shutil.rmtree(folder / "train")
-    assert main(["report", str(folder)]) == 0
-    assert capsys.readouterr().out.startswith(f"report: {tmp_path / 'set-report.html'} (")
-    assert len(Parsed(tmp_path / "set-report.html").content()["frames"]) == 12
+    ran = run("report", folder)
+    assert (ran.code, ran.out.startswith(f"report: {page} (")) == (0, True)
+    assert len(Parsed(page).content()["frames"]) == 12
     shutil.rmtree(folder / "train_web")
-    assert main(["report", str(folder), "--views", "2"]) == 0
-    assert Parsed(tmp_path / "set-report.html").content()["frames"] == []
-    assert "This data set has no images." in (tmp_path / "set-report.html").read_text()
+    assert run("report", folder, "--views", 2).code == 0
+    assert Parsed(page).content()["frames"] == []
+    assert "This data set has no images." in page.read_text()
+    (folder / "manifest.json").write_text("{}")
+    write_report(synpick_warp.open(folder), page)
+    assert "The manifest cannot be read" in page.read_text()
 
 
 def test_sets_of_several_sensors_have_the_same_pictures(tmp_path):
     found = []
     for layout in ("classic", "multisensor"):
-        config = scripted_bake.settings(2, ("bop",))
-        scripted_bake.bake(tmp_path / layout, dataclasses.replace(config, bop=dataclasses.replace(config.bop, layout=layout)))
+        scripted_bake.bake(tmp_path / layout, scripted_bake.settings(2, ("bop",)).with_values({"bop.layout": layout}))
         parsed = Parsed(write_report(synpick_warp.open(tmp_path / layout), tmp_path / f"{layout}.html"))
         found.append((parsed.content()["frames"], parsed.pictures()))
     assert found[0] == found[1]
@@ -160,20 +159,16 @@ def test_amodal_masks_are_planes_of_ids(data, page):
         np.testing.assert_array_equal(shown.any(axis=0), mask)
 
 
-def test_a_damaged_manifest_is_a_finding(data, tmp_path):
-    shutil.copytree(data, tmp_path / "set")
-    (tmp_path / "set" / "manifest.json").write_text("{}")
-    path = write_report(synpick_warp.open(tmp_path / "set"), tmp_path / "report.html")
-    assert "The manifest cannot be read" in path.read_text()
-
-
 def test_bad_input_is_one_line_and_nothing_is_written(data, tmp_path):
     (tmp_path / "folder.html").mkdir()
-    assert mistake("report", data, "--out", tmp_path / "page.pdf").endswith("its name must end in .html, .htm")
-    assert mistake("report", data, "--out", tmp_path / "folder.html").endswith("it is a folder")
-    assert mistake("report", data, "--views", 0) == "--views is 0; allowed: 1 to 200"
-    assert mistake("report", data, "--split", "west", "--out", tmp_path / "x.html").endswith("splits: train")
-    assert "is not a data set" in mistake("report", tmp_path, "--out", tmp_path / "x.html")
+    for folder, options, said in (
+        (data, ("--out", tmp_path / "page.pdf"), "its name must end in .html, .htm"),
+        (data, ("--out", tmp_path / "folder.html"), "it is a folder"),
+        (data, ("--views", 0), "--views is 0; allowed: 1 to 200"),
+        (data, ("--split", "west", "--out", tmp_path / "x.html"), "splits: train"),
+        (tmp_path, ("--out", tmp_path / "x.html"), "is not a data set"),
+    ):
+        assert said in mistake("report", folder, *options)
     broken = tmp_path / "broken"
     shutil.copytree(data, broken)
     for image in broken.glob("train/000000/rgb/*"):
@@ -213,75 +208,51 @@ def test_a_full_disk_leaves_nothing(data, tmp_path):
 
 # ---- markup: data stays data, no text can end an element, open one, or end a script ----
 
-NAMES = [
-    "</script><script>alert(1)</script>",
-    "<!--<script>",
-    '" onload="alert(1)',
-    "&lt;b&gt;",
-    "\u2028\u2029",
-    "]]>",
-    "\ud800",
-    "\x1b[31m\x00",
-]
+NAMES = ("</script><script>alert(1)</script>", "<!--<script>", '" onload="alert(1)', "&lt;b&gt;", "]]>")
+NAMES += ("\u2028\u2029", "\ud800", "\x1b[31m\x00")
 
 
 def test_known_elements():
     assert element("p", "a < b & c") == "<p>a &lt; b &amp; c</p>"
-    assert (
-        element("a", element("b", "x"), "y", href='#"', class_="q", data_kind="z")
-        == '<a href="#&quot;" class="q" data-kind="z"><b>x</b>y</a>'
-    )
+    link = element("a", element("b", "x"), "y", href='#"', class_="q", data_kind="z")
+    assert link == '<a href="#&quot;" class="q" data-kind="z"><b>x</b>y</a>'
     assert element("ul", [element("li", "1"), "<"]) == "<ul><li>1</li>&lt;</ul>"
     assert join(["<", Html("<br>")]) == "&lt;<br>"
+    # The example of the CSP specification, level 3, section 8.4.
+    assert content_hash("alert('Hello, world.');") == "'sha256-qznLcsROx4GACP2dm0UCKCzCG+HiZ1guq6ZZDob/Tng='"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_names_are_text(name):
+def test_names_are_text_and_embedded_json_cannot_end_its_element(name):
     written = element("p", name, title=name)
     assert written.count("<") == 2
     assert written.count('"') == 2
     written.encode("utf-8")
     assert all(letter.isprintable() or letter == "\n" for letter in printable(name))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_embedded_json_cannot_end_its_element_and_is_read_back(name):
     written = embed_json({name: [name]})
     assert not {"<", ">", "&", "\u2028", "\u2029"} & set(written)
     assert json.loads(written) == {name: [name]}
 
 
-def test_a_hash_is_that_of_the_policy():
-    # The example of the CSP specification, level 3, section 8.4.
-    assert content_hash("alert('Hello, world.');") == "'sha256-qznLcsROx4GACP2dm0UCKCzCG+HiZ1guq6ZZDob/Tng='"
-
-
 # ---- pictures ----
 
 
-def test_ids_are_exact_and_photos_similar():
+def test_ids_are_exact_also_when_shrunk_and_photos_similar():
     ids = np.arange(256, dtype=np.uint8).reshape(8, 32)
     assert (cv2.imdecode(np.frombuffer(encode_ids(ids).data, np.uint8), cv2.IMREAD_UNCHANGED) == ids).all()
     photo = np.full((40, 60, 3), (30, 90, 200), np.uint8)
     picture = encode_photo(photo)
     assert picture.kind == "webp"
     assert np.abs(cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR).astype(int) - photo).max() < 8
-
-
-def test_shrinking_keeps_ids_and_never_enlarges():
     ids = np.kron(np.array([[1, 7], [9, 200]], np.uint8), np.ones((50, 50), np.uint8))
     assert set(np.unique(shrink(ids, 10, smooth=False))) == {1, 7, 9, 200}
     assert shrink(ids, 10, smooth=False).shape == (10, 10)
     assert shrink(ids, 1000) is ids
 
 
-@pytest.mark.parametrize("size", [1, 2, 3, 4, 1000])
-def test_the_size_of_a_picture_is_that_of_its_base64(size):
-    picture = EncodedPicture("png", bytes(size))
-    assert picture.size == len(base64.b64encode(picture.data))
-
-
 def test_pictures_are_added_together_or_not_at_all():
+    for size in (1, 2, 3, 4, 1000):
+        assert EncodedPicture("png", bytes(size)).size == len(base64.b64encode(bytes(size)))
     album = Album(budget=4000)
     share = int(4000 * Section.ATTEMPTS.value)
     small = EncodedPicture("png", bytes(300))
@@ -291,8 +262,4 @@ def test_pictures_are_added_together_or_not_at_all():
     assert album.add(Section.FRAMES, [small, small]) == [1, 2]
     assert [kind for kind, _ in album.encoded()] == 3 * ["png"]
     assert sum(len(data) for _, data in album.encoded()) == sum(album.spent.values())
-
-
-def test_the_shares_are_the_whole_budget():
     assert sum(section.value for section in Section) == pytest.approx(1.0)
-    assert BUDGET == 25_000_000

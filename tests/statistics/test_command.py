@@ -25,16 +25,13 @@ def folder(tmp_path_factory) -> Path:
     """A data set of all formats with two splits, three episodes of mode pick."""
     out = tmp_path_factory.mktemp("scripted") / "set"
     splits = (Split("train", 2, 0, "pick", "train"), Split("test", 1, 2, "pick", "test"))
-    config = settings(3, ("bop", "shards", "zarr"))
-    bop = dataclasses.replace(config.bop, color_format="png")
-    bake(out, dataclasses.replace(config, splits=splits, bop=bop))
+    bake(out, dataclasses.replace(settings(3, ("bop", "shards", "zarr")).with_values({"bop.color_format": "png"}), splits=splits))
     return out
 
 
 @pytest.fixture
 def copy(folder, tmp_path) -> Path:
-    shutil.copytree(folder, tmp_path / "copy")
-    return tmp_path / "copy"
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
 
 
 def stats(*arguments: object) -> tuple[str, str]:
@@ -105,15 +102,11 @@ def test_splits_are_counted_apart_and_alone(folder):
     assert mistake("stats", folder, "--split", "val") == f'{folder} has no split "val"; splits: train, test'
 
 
-def test_shards_count_as_scenes_do(folder, copy):
+def test_shards_count_as_scenes_do_and_a_set_without_images_gives_episodes_and_attempts(folder, copy):
     for split in ("train", "test"):
         shutil.rmtree(copy / split)
     assert compute_statistics(synpick_warp.open(copy)) == compute_statistics(synpick_warp.open(folder))
-
-
-def test_a_set_without_images_gives_episodes_and_attempts(copy):
     for split in ("train", "test"):
-        shutil.rmtree(copy / split)
         shutil.rmtree(copy / f"{split}_web")
     text, _ = stats(copy)
     assert "missing: 3 episodes have no images" in text
@@ -162,12 +155,15 @@ def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, file, content, said
 
 
 def test_wrong_options_are_named_in_one_line(folder, tmp_path):
-    assert mistake("stats", folder, "--depth-views", "-1").startswith("--depth-views is -1; allowed: 0 to ")
-    assert mistake("stats", folder, "--threads", "9999").startswith("--threads is 9999; allowed: 0 to ")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").touch()
-    assert mistake("stats", folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
-    assert mistake("stats", folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, among the files of the data set")
+    for option, value, said in (
+        ("--depth-views", -1, "; allowed: 0 to "),
+        ("--threads", 9999, "; allowed: 0 to "),
+        ("--csv", tmp_path / "full", "; allowed: a new or an empty folder"),
+        ("--csv", folder / "tables", ", among the files of the data set"),
+    ):
+        assert mistake("stats", folder, option, value).startswith(f"{option} is {value}{said}")
 
 
 def test_names_are_no_markup(copy):

@@ -1,4 +1,5 @@
-"""Figures: known answers on a hand-made data set, twins in NumPy, merges that equal the whole, and the comparison with the paper."""
+"""Figures: known answers on a hand-made data set, twins in NumPy, merges that equal the whole, and the comparison with the paper. AUC,
+calibration and bootstrap: known answers by hand, brute force over pairs, and intervals that cover what they should."""
 
 from __future__ import annotations
 
@@ -30,6 +31,7 @@ from synpick_warp.apps.statistics.counts import Block, Counts, Group
 from synpick_warp.apps.statistics.figures import Annotations, BinUse, Coverage, EpisodeFigures, GroupStatistics, Rest
 from synpick_warp.apps.statistics.output import print_statistics
 from synpick_warp.apps.statistics.paper import compare, object_distance, read_paper, total_variation
+from synpick_warp.apps.statistics.ranking import BINS, Scored, calibrate, estimate, success_rate, weighted_auc
 from synpick_warp.apps.statistics.tables import make_tables
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.dataset.bop.arrays import SceneArrays
@@ -134,17 +136,12 @@ def test_a_line_tells_that_no_seal_came_near_its_break_force(statistics, forces,
 def test_bins_have_the_known_answers_and_merge(statistics):
     step = math.radians(5.0)
     assert statistics.bins == {"kanban": BinUse(1, (0.01, 0.02), (-0.02, -0.01), (-2 * step, -step))}
-    one, other, third = (
-        counted(
-            columns.episode_blocks(
-                GROUP, columns.EpisodeFacts("pick", 9, "finished", bin=columns.BinFacts(name, (x, 0.0, 0.0), 0.0)), [], None
-            )
-        )
-        for name, x in (("a", 0.0), ("b", 0.0), ("b", 0.035))
-    )
-    one.merge(other)
-    one.merge(third)
-    assert {name: (use.episodes, use.x) for name, use in compute.bin_figures(one).items()} == {"b": (2, (0.0, 0.04)), "a": (1, (0.0, 0.01))}
+    found = Counts()
+    for name, x in (("a", 0.0), ("b", 0.0), ("b", 0.035)):
+        facts = columns.EpisodeFacts("pick", 9, "finished", bin=columns.BinFacts(name, (x, 0.0, 0.0), 0.0))
+        found.merge(counted(columns.episode_blocks(GROUP, facts, [], None)))
+    used = {name: (use.episodes, use.x) for name, use in compute.bin_figures(found).items()}
+    assert used == {"b": (2, (0.0, 0.04)), "a": (1, (0.0, 0.01))}
 
 
 def test_lights_have_the_known_answers_and_what_is_missing_is_told(statistics, data_set):
@@ -181,6 +178,9 @@ def test_depth_is_that_of_all_pixels(statistics, folder):
     for quantile in DEPTH_QUANTILES:
         expected = np.quantile(pixels, quantile, method="inverted_cdf")
         assert statistics.depth.quantiles[quantile] == pytest.approx(expected, abs=columns.DEPTH_BIN / 2 + 1e-6)
+    assert compute.depth_figures(Counts()) is None
+    empty = compute.depth_figures(counted(columns.depth_blocks(np.zeros((2, 3), np.uint16), 0.1)))
+    assert (empty.quantiles, empty.missing) == ({}, 1.0)
 
 
 def test_all_figures_are_those_of_a_twin_that_reads_view_by_view(statistics, data_set):
@@ -249,11 +249,7 @@ def whole(blocks) -> Counts:
     return counted(*blocks.values())
 
 
-@given(
-    visibility=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60),
-    cut=st.integers(0, 60),
-    seed=st.integers(0, 2**32 - 1),
-)
+@given(visibility=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60), cut=st.integers(0, 60), seed=st.integers(0, 2**32 - 1))
 def test_a_scene_counts_as_its_halves(visibility, cut, seed):
     random = np.random.default_rng(seed)
     ids = random.integers(1, 5, len(visibility))
@@ -302,10 +298,8 @@ def test_bins_of_directions_have_equal_areas():
     assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (columns.DIRECTION_BINS - 1)) < 4.5 * np.sqrt(2.0 * columns.DIRECTION_BINS)
     bands = columns.direction_bins(np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])) // columns.SECTORS
     assert bands.tolist() == [columns.BANDS - 1, 0, columns.BANDS // 2, columns.BANDS // 2, columns.BANDS // 2]
-    assert (columns.direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % columns.SECTORS).tolist() == [
-        columns.SECTORS // 2,
-        3 * columns.SECTORS // 4,
-    ]
+    sectors = columns.direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % columns.SECTORS
+    assert sectors.tolist() == [columns.SECTORS // 2, 3 * columns.SECTORS // 4]
 
 
 def coverage(counts: Counts, object_id: int) -> Coverage:
@@ -328,12 +322,6 @@ def test_objects_over_time_are_a_mean_over_those_that_last():
     frames = ([5] * half + [3] * half, [1] * half)
     found = counted(*(columns.frame_blocks(GROUP, scene(np.ones(sum(each)), np.ones(sum(each), int), each), PERIOD) for each in frames))
     assert compute.timeline_figures(found, [GROUP]) == ((0.0, 2 * half, 3.0), (columns.TIME_BIN, half, 3.0))
-
-
-def test_depth_without_pixels():
-    assert compute.depth_figures(Counts()) is None
-    depth = compute.depth_figures(counted(columns.depth_blocks(np.zeros((2, 3), np.uint16), 0.1)))
-    assert (depth.quantiles, depth.missing) == ({}, 1.0)
 
 
 @given(yaw=st.floats(-100.0, 100.0), exposure=st.floats(-5.0, 5.0))
@@ -366,24 +354,21 @@ def rest(speed: np.ndarray, **others: Any) -> Rest | None:
     return compute.rest_figures(counted(columns.rest_blocks(SimpleNamespace(steps={**steps, **others}), STEP)))
 
 
-@pytest.mark.parametrize(
-    ("speed", "windows", "vibrating"),
-    [
-        (0.0 * TIME, 5, 0),
-        (0.006 * HUM, 5, 5),
-        (0.006 * HUM + 0.001, 5, 5),
-        (0.004 * HUM, 5, 0),
-        (0.006 * HUM * (TIME < 0.4), 5, 2),
-        (0.1 * HUM * np.exp(-TIME / 0.02), 5, 0),
-        (0.006 * HUM + 0.02 * (TIME < 0.2), 4, 4),
-    ],
-)
-def test_windows_that_vibrate_are_counted(speed, windows, vibrating):
-    """To and fro without decay; objects that drift or are shaken once are no pile at rest that vibrates."""
-    assert rest(speed) == Rest(windows, vibrating)
+SPEEDS = [
+    (0.0 * TIME, 5, 0),
+    (0.006 * HUM, 5, 5),
+    (0.006 * HUM + 0.001, 5, 5),
+    (0.004 * HUM, 5, 0),
+    (0.006 * HUM * (TIME < 0.4), 5, 2),
+    (0.1 * HUM * np.exp(-TIME / 0.02), 5, 0),
+    (0.006 * HUM + 0.02 * (TIME < 0.2), 4, 4),
+]
+"""Speeds, number of windows at rest, and of those that vibrate."""
 
 
-def test_what_the_gripper_does_is_no_rest():
+def test_windows_that_vibrate_are_counted():
+    """To and fro without decay; objects that drift or are shaken once are no pile at rest that vibrates, nor is what the gripper does."""
+    assert [rest(speed) for speed, *_ in SPEEDS] == [Rest(windows, vibrating) for _, windows, vibrating in SPEEDS]
     pressed = np.zeros((len(TIME), 2))
     pressed[150, 1] = 3.0
     assert rest(0.006 * HUM, gripper_contact_load=pressed) == Rest(4, 4)
@@ -395,7 +380,7 @@ def test_what_the_gripper_does_is_no_rest():
 COUNTS = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 1000)).filter(lambda counts: sum(counts.values()) > 0)
 
 
-def test_the_papers_numbers_add_up():
+def test_the_papers_numbers_add_up_and_its_own_set_has_no_difference():
     paper = read_paper()
     assert sum(group.views for group in paper.groups) == paper.total_views == 503_232
     assert sum(group.instances for group in paper.groups) == 3_927_549
@@ -408,30 +393,6 @@ def test_the_papers_numbers_add_up():
     assert mean == pytest.approx(paper.total_visibility, abs=0.011)
     frames = [round(group.views / (group.sequences * paper.cameras)) for group in paper.groups[:3]]
     assert frames == [573, 416, 687]
-
-
-def test_distances_have_known_answers():
-    assert total_variation({"a": 1, "b": 1}, {"a": 5, "b": 5}) == 0.0
-    assert total_variation({"a": 1}, {"b": 7}) == 1.0
-    assert total_variation({"a": 3, "b": 1}, {"a": 1, "b": 1}) == pytest.approx(0.25)
-    names = {1: "002_master_chef_can", 2: "003_cracker_box", 3: "banana"}
-    theirs = {"master_chef_can": 1, "cracker_box": 1, "banana": 0}
-    assert object_distance({1: 5, 2: 5}, names, theirs) == 0.0
-    assert object_distance({3: 5}, names, theirs) is None  # An object of another set with the same word.
-    assert object_distance({4: 5}, names, theirs) is None
-    assert object_distance({}, names, theirs) is None
-
-
-@given(first=COUNTS, second=COUNTS, third=COUNTS)
-def test_total_variation_is_a_metric(first, second, third):
-    distance = total_variation(first, second)
-    assert 0.0 <= distance <= 1.0 + 1e-12
-    assert distance == pytest.approx(total_variation(second, first))
-    assert distance <= total_variation(first, third) + total_variation(third, second) + 1e-12
-
-
-def test_the_papers_own_set_has_no_difference():
-    paper = read_paper()
     ids = {name: index for index, name in enumerate(paper.groups[0].objects)}
     ours = []
     for each in paper.groups:
@@ -443,7 +404,97 @@ def test_the_papers_own_set_has_no_difference():
     names = {index: f"000_{name}" for name, index in ids.items()}
     rows = compare(ours, {"train": "train", "test": "test"}, names, paper.cameras)
     assert len(rows) == 6
-    for row in rows:
-        assert row.ours == row.paper
-        assert row.distance == 0.0
-        assert 0.05 < row.paper_distance < 0.2
+    assert all(row.ours == row.paper and row.distance == 0.0 and 0.05 < row.paper_distance < 0.2 for row in rows)
+
+
+def test_distances_have_known_answers():
+    assert total_variation({"a": 1, "b": 1}, {"a": 5, "b": 5}) == 0.0
+    assert total_variation({"a": 1}, {"b": 7}) == 1.0
+    assert total_variation({"a": 3, "b": 1}, {"a": 1, "b": 1}) == pytest.approx(0.25)
+    names = {1: "002_master_chef_can", 2: "003_cracker_box", 3: "banana"}  # The last is of another set, with the same word.
+    theirs = {"master_chef_can": 1, "cracker_box": 1, "banana": 0}
+    assert [object_distance(ours, names, theirs) for ours in ({1: 5, 2: 5}, {3: 5}, {4: 5}, {})] == [0.0, None, None, None]
+
+
+@given(first=COUNTS, second=COUNTS, third=COUNTS)
+def test_total_variation_is_a_metric(first, second, third):
+    distance = total_variation(first, second)
+    assert 0.0 <= distance <= 1.0 + 1e-12
+    assert distance == pytest.approx(total_variation(second, first))
+    assert distance <= total_variation(first, third) + total_variation(third, second) + 1e-12
+
+
+# ---- ranking ----
+
+
+def scored(score, outcome, weight=None, cluster=None) -> Scored:
+    count = len(score)
+    return Scored(
+        np.array(score, float),
+        np.array(outcome, bool),
+        np.ones(count) if weight is None else np.array(weight, float),
+        np.arange(count) if cluster is None else np.array(cluster),
+    )
+
+
+@pytest.mark.parametrize(
+    ("score", "outcome", "weight", "area"),
+    [
+        ([0.1, 0.4, 0.35, 0.8], [0, 0, 1, 1], None, 0.75),  # Fawcett: 3 of 4 pairs are in order.
+        ([0.1, 0.2, 0.3], [0, 1, 1], None, 1.0),
+        ([0.3, 0.2, 0.1], [0, 1, 1], None, 0.0),
+        ([0.5, 0.5, 0.5], [0, 1, 1], None, 0.5),
+        ([0.5, 0.5, 0.9], [0, 1, 1], None, 0.75),  # A tie counts half.
+        ([0.1, 0.4, 0.35, 0.8], [0, 0, 1, 1], [1, 3, 1, 1], (1 + 1 + 3) / 8),  # A weight of 3 is the sample three times.
+        ([0.1, 0.4, 0.35, 0.8], [0, 0, 1, 1], [1, 0, 1, 1], 1.0),
+        ([0.1, 0.2], [1, 1], None, np.nan),
+        ([], [], None, np.nan),
+    ],
+)
+def test_auc_of_a_few_samples(score, outcome, weight, area):
+    np.testing.assert_allclose(weighted_auc(scored(score, outcome, weight)), area)
+
+
+def test_auc_is_the_share_of_pairs_in_order():
+    generator = np.random.default_rng(3)
+    score, outcome, weight = generator.integers(0, 12, 200) / 11, generator.random(200) < 0.3, generator.random(200)
+    order = np.sign(score[outcome][:, None] - score[~outcome]) / 2 + 0.5
+    pairs = weight[outcome][:, None] * weight[~outcome]
+    assert weighted_auc(scored(score, outcome, weight)) == pytest.approx((order * pairs).sum() / pairs.sum(), abs=1e-12)
+
+
+def test_calibration_of_a_hand_made_table():
+    """Two bins: 0.25 succeeds in 1 of 4, so it is calibrated; 0.95 in 1 of 2, an error of 0.45 for a third of the samples."""
+    found = calibrate(scored([0.25] * 4 + [0.95] * 2, [1, 0, 0, 0, 1, 0]), draws=50)
+    assert found.count.tolist() == [0, 0, 4, 0, 0, 0, 0, 0, 0, 2]
+    np.testing.assert_allclose(found.predicted[[2, 9]], (0.25, 0.95))
+    np.testing.assert_allclose(found.observed[[2, 9]], (0.25, 0.5))
+    assert np.isnan(found.observed[[0, 5]]).all()
+    assert found.error.value == pytest.approx(0.45 / 3)
+
+
+def test_weights_of_calibration_are_repetitions():
+    generator = np.random.default_rng(5)
+    score, outcome, weight = generator.random(60), generator.random(60) < 0.5, generator.integers(1, 4, 60)
+    once = calibrate(scored(score, outcome, weight, np.zeros(60)))
+    many = calibrate(scored(*(np.repeat(each, weight) for each in (score, outcome)), cluster=np.zeros(weight.sum())))
+    np.testing.assert_allclose(once.observed, many.observed)
+    np.testing.assert_allclose(once.predicted, many.predicted)
+    assert once.error.value == pytest.approx(many.error.value)
+    assert len(once.count) == BINS
+    assert np.isnan(once.error.low), "one cluster has no interval"
+
+
+def test_intervals_widen_with_clusters_and_cover_the_truth():
+    """100 data sets of 40 clusters whose success depends on the cluster: some 95 of 100 intervals over clusters hold the true rate, which
+    those over samples miss often."""
+    generator, held = np.random.default_rng(7), {True: 0, False: 0}
+    for _ in range(100):
+        rate = np.repeat(generator.choice((0.1, 0.9), 40), 25)
+        outcome = generator.random(1000) < rate
+        for clustered in held:
+            groups = np.repeat(np.arange(40), 25) if clustered else np.arange(1000)
+            found = estimate(scored(outcome, outcome, cluster=groups), success_rate, draws=100)
+            held[clustered] += found.low <= 0.5 <= found.high
+    assert held[True] >= 88
+    assert held[False] <= 60

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -43,12 +44,8 @@ def fill_the_disk(path: Path) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
 
-def stumble(_: Path) -> None:
+def stumble(*_: object) -> None:
     raise ValueError("two\nlines")
-
-
-def stumble_on(_image: np.ndarray, path: Path) -> None:
-    stumble(path)
 
 
 def die(_: Path) -> None:
@@ -70,22 +67,9 @@ def interrupt(path: Path) -> None:
     path.write_text(" ".join(sorted(sys.modules)))
 
 
-def submit_and_wait(pool: WriterPool, function: object, argument: Path, path: Path) -> None:
-    pool.submit(function, (), (argument,), path=path)
+def submit_and_wait(pool: WriterPool, function: object, *arguments: object) -> None:
+    pool.submit(function, (), arguments, path=arguments[0])
     pool.wait()
-
-
-def run_one(count: int, function: object, argument: Path, path: Path) -> None:
-    with WriterPool(count, SIZE) as pool:
-        submit_and_wait(pool, function, argument, path)
-
-
-def kill_one(path: Path) -> None:
-    with WriterPool(2, SIZE) as pool:
-        processes(pool)[1].kill()
-        processes(pool)[1].wait()
-        pool.submit(note, (), (path, "a"), path=path)
-        pool.wait()
 
 
 def processes(pool: WriterPool) -> list[subprocess.Popen[bytes]]:
@@ -105,27 +89,21 @@ def test_images_are_copied_before_submit_returns(tmp_path, count):
         np.testing.assert_array_equal(np.load(tmp_path / f"{value}.npy"), np.full((20, 50, 3), value))
 
 
-def test_images_of_different_types_share_a_slot(tmp_path):
-    images = (np.arange(7, dtype=np.uint8), np.arange(6.0).reshape(2, 3), np.zeros((0, 4), np.uint16), np.full((3, 3), 7, np.uint32))
-    with WriterPool(1, shared_bytes(image.nbytes for image in images)) as pool:
-        pool.submit(save_all, images, (tmp_path / "all.npz",), path=tmp_path)
-    with np.load(tmp_path / "all.npz") as file:
-        for image, back in zip(images, file.values(), strict=True):
-            assert back.dtype == image.dtype
-            np.testing.assert_array_equal(back, image)
-
-
-def test_threads_copy_large_images(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("count", "side"), [(1, 3), (2, 700)])
+def test_images_of_different_types_share_a_slot(tmp_path, monkeypatch, count, side):
+    """Large ones are copied by threads."""
     monkeypatch.setattr(pool_module, "PROCESSES_PER_COPY_THREAD", 1)
     draw = np.random.default_rng(0)
-    images = (draw.integers(0, 256, (700, 900, 6), np.uint8)[::2, 3:-3], np.zeros((0, 4)), np.arange(5), draw.integers(0, 9, (3, 1 << 20)))
+    images = draw.integers(0, 256, (side, side, 6), np.uint8)[::2, 1:-1], np.zeros((0, 4), np.uint16), np.arange(6.0).reshape(2, 3)
+    images += draw.integers(0, 9, (3, side, side)), np.arange(5, dtype=np.uint32)
     kept = [image.copy() for image in images]
-    with WriterPool(2, shared_bytes(image.nbytes for image in images)) as pool:
+    with WriterPool(count, shared_bytes(image.nbytes for image in images)) as pool:
         pool.submit(save_all, images, (tmp_path / "all.npz",), path=tmp_path)
         for image in images:
             image[...] = 0
     with np.load(tmp_path / "all.npz") as file:
         for image, back in zip(kept, file.values(), strict=True):
+            assert back.dtype == image.dtype
             np.testing.assert_array_equal(back, image)
 
 
@@ -157,7 +135,7 @@ def test_a_failure_stops_taking_tasks(tmp_path):
     def make_tasks() -> Iterator[WriteTask]:
         while True:
             prepared.append(None)
-            yield WriteTask(stumble_on, (np.zeros(4),), (tmp_path,), tmp_path)
+            yield WriteTask(stumble, (np.zeros(4),), (tmp_path,), tmp_path)
 
     pool = WriterPool(2, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines"):
@@ -175,12 +153,11 @@ def test_images_too_large_for_a_slot_are_refused(tmp_path):
 def test_on_done_may_submit_further_tasks(tmp_path, count):
     with WriterPool(count, SIZE) as pool:
 
-        def follow() -> None:
-            pool.submit(
-                note, (), (tmp_path / "b", "b"), path=tmp_path, on_done=lambda: pool.submit(note, (), (tmp_path / "c", "c"), path=tmp_path)
-            )
+        def follow(*names: str) -> None:
+            if names:
+                pool.submit(note, (), (tmp_path / names[0], "x"), path=tmp_path, on_done=lambda: follow(*names[1:]))
 
-        pool.submit(note, (), (tmp_path / "a", "a"), path=tmp_path, on_done=follow)
+        follow("a", "b", "c")
         pool.wait()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
@@ -204,27 +181,15 @@ def test_simultaneous_results_are_each_received_once(tmp_path):
     assert (tmp_path / "more").read_text() == "xxxx"
 
 
-def test_one_process_runs_tasks_in_order(tmp_path):
-    with WriterPool(1, SIZE) as pool:
-        for letter in "abcdefghijklmnop":
-            pool.submit(note, (), (tmp_path / "all", letter), path=tmp_path)
-    assert (tmp_path / "all").read_text() == "abcdefghijklmnop"
-
-
-def test_many_tasks_without_images_do_not_block(tmp_path):
-    with WriterPool(2, SIZE) as pool:
-        for _ in range(500):
-            pool.submit(note, (), (tmp_path / "all", "x"), path=tmp_path)
-    assert len((tmp_path / "all").read_text()) == 500
-
-
-def test_a_list_of_tasks_without_images_waits_in_part(tmp_path, monkeypatch):
+def test_tasks_without_images_run_in_order_wait_in_part_and_do_not_block(tmp_path, monkeypatch):
+    """Here more tasks than fit into a pipe."""
     monkeypatch.setattr(pool_module, "MAX_WAITING", 5)
-    with WriterPool(1, SIZE) as pool:
-        for index in range(40):
-            pool.submit(os.mkdir, (), (str(tmp_path / str(index)),), path=tmp_path)
-            assert len(pool._waiting) <= 5
-    assert len(list(tmp_path.iterdir())) == 40
+    for count, letters in ((1, "abcdefghijklmnop"), (2, 500 * "x")):
+        with WriterPool(count, SIZE) as pool:
+            for letter in letters:
+                pool.submit(note, (), (tmp_path / str(count), letter), path=tmp_path)
+                assert len(pool._waiting) <= 5
+        assert (tmp_path / str(count)).read_text() == letters
 
 
 def test_a_full_queue_blocks_the_caller(tmp_path):
@@ -248,20 +213,32 @@ def test_abort_kills_running_processes(tmp_path):
     pool.abort()
 
 
-@pytest.mark.parametrize("count", [0, 2])
-def test_a_full_disk_is_reported_in_one_line(tmp_path, count):
-    path = tmp_path / "picture.png"
-    with pytest.raises(OutputError) as caught:
-        run_one(count, fill_the_disk, path, tmp_path)
-    line = str(caught.value)
-    assert line == f"cannot write {path}: No space left on device; free space or rights there, or name another folder with --out"
+FULL = "cannot write {path}: No space left on device; free space or rights there, or name another folder with --out"
+
+
+@pytest.mark.parametrize(
+    ("count", "function", "said"),
+    [
+        (0, fill_the_disk, FULL),
+        (2, fill_the_disk, FULL),
+        (2, die, "was ended by SIGKILL while it wrote {path}; if memory ran out, set bake.writers"),
+        (2, quit_python, "ended with exit code 3 while it wrote {path}; see its message above"),
+    ],
+)
+def test_what_ends_a_writer_is_reported_in_one_line_with_its_path(tmp_path, count, function, said):
+    """Memory is not blamed for a process that exits."""
+    pool = WriterPool(count, SIZE)
+    with pytest.raises(OutputError, match=re.escape(said.format(path=tmp_path / "scene 3"))) as caught:
+        submit_and_wait(pool, function, tmp_path / "scene 3")
+    assert ("ran out" in str(caught.value)) == (function is die)
+    pool.abort()
 
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_failure_is_raised_by_this_and_every_later_call(tmp_path, count):
     pool = WriterPool(count, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines") as caught:
-        submit_and_wait(pool, stumble, tmp_path, tmp_path)
+        submit_and_wait(pool, stumble, tmp_path)
     assert str(tmp_path) in str(caught.value)
     assert "Traceback" in caught.value.__notes__[0]
     for call in (pool.poll, pool.wait, pool.close):
@@ -270,20 +247,13 @@ def test_a_failure_is_raised_by_this_and_every_later_call(tmp_path, count):
     pool.close()
 
 
-def test_a_killed_process_is_reported_with_its_path_and_memory_hint(tmp_path):
-    with pytest.raises(OutputError, match=r"was ended by SIGKILL while it wrote .*scene 3; if memory ran out, set bake\.writers"):
-        run_one(2, die, tmp_path, tmp_path / "scene 3")
-
-
-def test_memory_is_not_blamed_for_a_process_that_exits(tmp_path):
-    with pytest.raises(OutputError, match=r"ended with exit code 3 while it wrote .*scene 3; see its message above") as caught:
-        run_one(2, quit_python, tmp_path, tmp_path / "scene 3")
-    assert "ran out" not in str(caught.value)
-
-
 def test_a_process_that_dies_while_idle_is_reported(tmp_path):
+    pool = WriterPool(2, SIZE)
+    processes(pool)[1].kill()
+    processes(pool)[1].wait()
     with pytest.raises(OutputError, match="while it had nothing to do"):
-        kill_one(tmp_path / "a")
+        submit_and_wait(pool, note, tmp_path / "a", "a")
+    pool.abort()
 
 
 def test_processes_are_niced_ignore_ctrl_c_and_never_import_the_simulator(tmp_path, monkeypatch):
