@@ -26,7 +26,6 @@ from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,
     Arrays,
-    CameraInfo,
     GroupContext,
     ObjectInfo,
     StoreAttributes,
@@ -49,6 +48,7 @@ if TYPE_CHECKING:
     from synpick_warp.dataset.tracks import Track, Tracks
     from synpick_warp.dataset.view import View
     from synpick_warp.dataset.view_files import SceneFiles
+    from synpick_warp.scenes.types import Camera
 
 USD = Path("usd")
 """Folder of USD episodes in a data set."""
@@ -320,16 +320,13 @@ class DataSet(Mapping[int, Episode]):
         return read_checked(self.folder / models_folder(self.folder) / INFO, dict[Key, ModelInfo])
 
     @cached_property
-    def cameras(self) -> tuple[CameraInfo, ...]:
+    def cameras(self) -> tuple[Camera, ...]:
         """The cameras by index. Raises DatasetError for a data set from another source, whose views have cameras of their own."""
         if self.has_store:
             return read_cameras(self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants)
-        import numpy as np
-
         from synpick_warp.scenes.cameras import make_cameras
 
-        cameras = make_cameras(self.config.rig)
-        return tuple(CameraInfo(np.array((c.width, c.height), np.int32), c.matrix, c.rotation, c.translation) for c in cameras)
+        return make_cameras(self.config.rig)
 
     def intrinsics(self, convention: str = "synpick") -> np.ndarray:
         """Camera matrices (camera, 3, 3) [px] in the first frame, as of `View.intrinsics`: "opencv" has pixel centres at integers."""

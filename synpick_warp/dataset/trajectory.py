@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import numpy as np
     import zarr
 
+    from synpick_warp.scenes.types import Camera
+
 GROUP_FILE = "zarr.json"
 """Metadata of a zarr group or array (zarr format 3)."""
 MAX_METADATA = 2**24
@@ -44,20 +46,6 @@ class ObjectInfo:
     """[m]"""
     volume: float
     """Volume of the collision shape [m³]."""
-
-
-@dataclass(frozen=True, eq=False)
-class CameraInfo:
-    """Pinhole camera in OpenCV's axes (x right, y down, z forward); pixel centres at + 0.5."""
-
-    resolution: np.ndarray
-    """Width and height (2) int32 [px]."""
-    matrix: np.ndarray
-    """K (3, 3) float64 [px]."""
-    rotation: np.ndarray
-    """World to camera (3, 3) float64."""
-    translation: np.ndarray
-    """World to camera (3) float64 [m]."""
 
 
 class _GroupMetadata(Struct):
@@ -130,13 +118,16 @@ def read_objects(store: Path, context: GroupContext | None = None) -> tuple[Obje
     return tuple(ObjectInfo(name=name, **row) for name, row in zip(names, rows, strict=True))
 
 
-def read_cameras(store: Path, count: int | None, context: GroupContext | None = None) -> tuple[CameraInfo, ...]:
+def read_cameras(store: Path, count: int | None, context: GroupContext | None = None) -> tuple[Camera, ...]:
     """Read the camera table of a store, by camera index; `count` is the number of cameras, if it is known."""
-    sizes = {"width_height": 2, "row": 3, "column": 3} | ({} if count is None else {"camera": count})
+    extents = {"width_height": 2, "row": 3, "column": 3} | ({} if count is None else {"camera": count})
     folder, files = store / "cameras", (context or GroupContext()).files
-    columns = _read_columns(Arrays(folder, CAMERAS, GroupContext(lambda: sizes, files)), CAMERAS, folder)
+    columns = _read_columns(Arrays(folder, CAMERAS, GroupContext(lambda: extents, files)), CAMERAS, folder)
     rows = min(len(values) for values in columns.values())
-    return tuple(CameraInfo(**{name: values[row] for name, values in columns.items()}) for row in range(rows))
+    from synpick_warp.scenes.types import Camera
+
+    sizes = columns.pop("resolution").tolist()
+    return tuple(Camera(*sizes[row], **{name: values[row] for name, values in columns.items()}) for row in range(rows))
 
 
 def _read_columns(arrays: Arrays, schema: GroupSpec, folder: Path) -> dict[str, np.ndarray]:

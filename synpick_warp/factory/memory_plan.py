@@ -37,6 +37,7 @@ from synpick_warp.stages.host_copies import HostImages, host_images
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
+from synpick_warp.stages.render.cameras import allocate_lenses
 from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
@@ -48,7 +49,7 @@ from synpick_warp.stages.sim.trials import count_trial_worlds
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
-from synpick_warp.stages.view_ring import RING, allocate_lenses, allocate_ring, history_count, view_sizes
+from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 

@@ -30,7 +30,7 @@ from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views
-from synpick_warp.stages.stream import TickReport, describe_views, last_cameras, split_views
+from synpick_warp.stages.stream import TickReport, describe_batches
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress, SilentProgress
@@ -155,19 +155,12 @@ class Producer:
         for ring in self.rings:
             shown = report.column("live").astype(bool) & (frame % self.selection.stride == 0) & (frame % ring.group.every == 0)
             cameras = [camera for camera in self.selection.cameras or () if camera in ring.group.cameras]
-            yield from self._render_group(report, snapshot, ring, *pair_views(np.flatnonzero(shown), np.array(cameras, np.int32)))
-
-    def _render_group(
-        self, report: TickReport, snapshot: Snapshot, ring: BatchRing, world: np.ndarray, camera: np.ndarray
-    ) -> Iterator[ViewBatch]:
-        """Render views (world, camera) of a group."""
-        stages = self.stages
-        for part, wide in split_views(ring.group, report, world, camera, stages.episode_cameras):
-            known = (self.object_ids, stages.light_table, stages.config.cell.recorded, stages.episode_cameras)
-            host = describe_views(report, world[part], camera[part], stages.tick_time, *known)
-            host["arrangement"] = report.column("arrangement")[world[part]]
-            last = last_cameras(stages.episode_cameras, report, world[part], camera[part])
-            yield ring.render(snapshot, world[part], camera[part], host, last, wide)
+            world, camera = pair_views(np.flatnonzero(shown), np.array(cameras, np.int32))
+            known = (self.stages.tick_time, self.object_ids, self.stages.light_table, self.stages.config.cell.recorded)
+            batches = describe_batches(ring.group, report, world, camera, *known, cameras=self.stages.episode_cameras)
+            for part, wide, (host, last) in batches:
+                host["arrangement"] = report.column("arrangement")[world[part]]
+                yield ring.render(snapshot, world[part], camera[part], host, last, wide)
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""

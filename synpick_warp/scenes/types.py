@@ -218,6 +218,11 @@ class Camera:
     """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
 
     @property
+    def resolution(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.width, self.height
+
+    @property
     def center(self) -> np.ndarray:
         """Optical centre (3) in the frame that the camera is fixed to [m]."""
         return -dot(self.rotation.T, self.translation)

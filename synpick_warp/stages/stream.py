@@ -20,7 +20,7 @@ from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
-from synpick_warp.stages.view_ring import CameraGroup, ViewRing
+from synpick_warp.stages.view_ring import CameraGroup, Placements, ViewRing
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch, most_words
 
 OWN_ARRAYS = 6
@@ -234,11 +234,14 @@ def split_views(
     return split_batches(words, share, views, views * share // (group.sizes["instance"] * most_words(*bounds.size)))
 
 
-def last_cameras(cameras: EpisodeCameras | None, report: TickReport, world: np.ndarray, camera: np.ndarray) -> dict[str, np.ndarray]:
-    """As matrix, rotation and translation of `describe_views`, in the tick before."""
-    if cameras is None:
-        return {}
-    return cameras.of_views(report.column("episode")[world], camera, report.snapshot.last_fixture_pose[world, SHAFT])
+def describe_batches(
+    group: CameraGroup, report: TickReport, world: np.ndarray, camera: np.ndarray, *known: Any, cameras: EpisodeCameras | None
+) -> Iterator[tuple[slice, bool, Placements]]:
+    """The batches of `split_views`, and in each the views by `describe_views`, with their cameras in the tick before."""
+    for part, wide in split_views(group, report, world, camera, cameras):
+        views = describe_views(report, world[part], camera[part], *known, cameras)
+        shaft = report.snapshot.last_fixture_pose[world[part], SHAFT]
+        yield part, wide, (views, {} if cameras is None else cameras.of_views(views["episode"], camera[part], shaft))
 
 
 @dataclass(eq=False)
@@ -317,14 +320,12 @@ class FrameStream:
         for ring in self.rings:
             shown = report.column("live").astype(bool) & (report.column("frame") % ring.group.every == 0)
             world, camera = pair_views(np.flatnonzero(shown), np.array(ring.cameras))
-            for part, wide in split_views(ring.group, report, world, camera, self.cameras):
+            known = (self.tick_time, self.object_ids, self.lights, self.bins)
+            for part, wide, views in describe_batches(ring.group, report, world, camera, *known, cameras=self.cameras):
                 while sum(batch.ring is ring for batch in self.in_flight) == len(ring.slots):
                     yield from self._deliver()
-                known = (self.tick_time, self.object_ids, self.lights, self.bins, self.cameras)
-                description = describe_views(report, world[part], camera[part], *known)
-                last = last_cameras(self.cameras, report, world[part], camera[part])
-                slot = ring.launch(snapshot, world[part], camera[part], self.streams, (description, last), wide)
-                self.in_flight.append(_Launched(ring, slot, part.stop - part.start, description))
+                slot = ring.launch(snapshot, world[part], camera[part], self.streams, views, wide)
+                self.in_flight.append(_Launched(ring, slot, part.stop - part.start, views[0]))
                 launched, ahead = launched + 1, ahead + int(self.device.is_cuda)
         if launched:
             self.in_flight[-1].finished = finished

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.calibration.lens import LensMap, with_matrix
+from synpick_warp.configs.calibration.lens import LensMap
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import Render
-from synpick_warp.kernels.render.visibility.lens import NUMBERS
-from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run
+from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.mask_pool import SHARE, MaskBounds, share_words, widen
+from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import LENSES, PlacedCameras, allocate_view_cameras, make_views, place_cameras, place_lenses
+from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.timing import scope
 from synpick_warp.views.frames import WORD_BYTES, most_words
@@ -63,8 +63,8 @@ def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.D
     return sizes if rig.bends(cameras) else sizes | {"mask_word": share_words(views, objects, *size)}
 
 
-Placements = tuple[Mapping[str, Any], Mapping[str, Any]]
-"""Matrices and poses of the cameras of views, in this frame and in the one before."""
+Placements = tuple[dict[str, Any], Mapping[str, Any]]
+"""Matrix, rotation and translation of the cameras of views as `FrameBatch` has them, in this frame and in the one before."""
 
 
 def history_count(rig: Rig, worlds: int, group: int = 0) -> int:
@@ -100,33 +100,34 @@ class CameraGroup:
         """Row of cameras in the renderer's scene (view) int32, by their indices (view)."""
         return np.searchsorted(np.array(self.cameras), camera).astype(np.int32)
 
-    def allocate_cameras(self) -> PlacedCameras | None:
-        """Allocate the cameras of a batch; None: the scene has those of all views."""
+    def allocate_cameras(self) -> tuple[Any, Any] | None:
+        """Allocate the cameras of a batch in this frame and in the one before, the same if they do not move; None: the scene has those of
+        all views."""
         if not self.placed:
             return None
         scene, views = self.renderer.scene, self.sizes["view"]
         now, last = (allocate_view_cameras(views, scene.device, scene.cameras) for _ in range(2))
         if self.lenses:
             now.lenses = allocate_lenses(self.sizes, scene.device)
-        return PlacedCameras(now, last if self.moves else now)
+        return now, last if self.moves else now
 
-    def place(self, cameras: PlacedCameras | None, camera: np.ndarray, placed: Placements) -> None:
-        """Set what `allocate_cameras` made, for views of these cameras (view), by matrix, rotation and translation as `FrameBatch` has
-        them: of this frame, and of the one before."""
-        if cameras is None:
-            return
-        now, last = placed
-        place_cameras(cameras.now, self.renderer.scene, self.slots(camera), now)
-        if self.moves:
-            place_cameras(cameras.last, self.renderer.scene, self.slots(camera), last)
-        if self.lenses:
-            drawn = [with_matrix(self.lenses[slot], matrix) for slot, matrix in zip(self.slots(camera), now["matrix"], strict=True)]
-            place_lenses(cameras.now, self.renderer.scene, self.slots(camera), drawn)
+    def write_views(self, lists: wp.array, world: np.ndarray, camera: np.ndarray, made: tuple[Any, Any] | None, placed: Placements) -> Any:
+        """The struct `Views` of views of these cameras (world, camera), whose indices are written to `lists` (3, view) int32.
 
-
-def allocate_lenses(sizes: dict[str, int], device: wp.Device) -> Any:
-    """Allocate a lens of its own for each view of a batch, whose extents are those of `view_sizes`."""
-    return allocate_struct(LENSES, sizes | {"number": int(NUMBERS)}, device)
+        Args:
+            made: As of `allocate_cameras`; written.
+            placed: What its cameras are set to.
+        """
+        slot, cameras = self.slots(camera), self.renderer.scene.cameras
+        padded = np.zeros(lists.shape, np.int32)
+        padded[1] = self.cameras[0]
+        padded[:, : len(world)] = world, camera, slot
+        lists.assign(padded)
+        if made is not None:
+            place_cameras(made[0], cameras, slot, placed[0], self.lenses)
+            if self.moves:
+                place_cameras(made[1], cameras, slot, placed[1])
+        return make_views(lists[0], lists[1], len(world), self.sizes["instance"], slot=lists[2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,18 +207,13 @@ class ViewRing:
     ) -> int:
         """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot.
 
-        `placed`: matrices and poses of the views' cameras, see `CameraGroup.place`. `wide`: the pool of mask words is divided by `widen`.
+        `placed`: as of `CameraGroup.write_views`. `wide`: the pool of mask words is divided by `widen`.
         """
         slot, count = self._next, len(world)
         images = self.divided[slot] = widen(self.slots[slot].images) if wide else self.slots[slot].images
         self._next = (slot + 1) % len(self.slots)
-        rows = self.lists[slot]
-        padded = np.zeros((3, self.batch), dtype=np.int32)
-        padded[1] = self.cameras[0]
-        padded[:, :count] = world, camera, self.group.slots(camera)
-        rows.assign(padded)
-        views, cameras = make_views(rows[0], rows[1], count, self.instances, slot=rows[2]), self.view_cameras[slot]
-        self.group.place(cameras, camera, placed)
+        cameras = self.view_cameras[slot]
+        views = self.group.write_views(self.lists[slot], world, camera, cameras, placed)
         with wp.ScopedStream(streams.render, sync_exit=True), scope("render", self.device):
             self.renderer.render(snapshot, views, images, self.slots[slot].layers, cameras)
         with wp.ScopedStream(streams.copy):

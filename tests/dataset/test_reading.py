@@ -70,7 +70,7 @@ def test_objects_cameras_and_settings(folder):
     np.testing.assert_array_equal(data.objects[1].inertia, entries[1].inertia)
     assert len(data.cameras) == len(lenses)
     np.testing.assert_array_equal(data.cameras[2].matrix, lenses[2].matrix)
-    assert data.cameras[0].resolution.tolist() == [lenses[0].width, lenses[0].height]
+    assert data.cameras[0].resolution == lenses[0].resolution
     assert data.config == load_config("smoke", {})
     assert (data.attributes["steps_per_tick"], data.attributes["units"]["step"]) == (STEP_COUNT, "s")
 

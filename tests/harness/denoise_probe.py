@@ -10,8 +10,9 @@ from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, f
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
+from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
-from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
+from synpick_warp.stages.render.scene import build_grid, pack_half3_array
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.aimed_views import aimed_views
 from tests.harness.devices import default_device

@@ -14,7 +14,8 @@ from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate, allocate_struct, count_words, unpack_words
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
-from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.cameras import build_cameras
+from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.aimed_views import aimed_views

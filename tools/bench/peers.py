@@ -20,8 +20,9 @@ from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.system.progress import SilentProgress
 from tools.bench import worlds

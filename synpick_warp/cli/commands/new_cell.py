@@ -25,7 +25,7 @@ from synpick_warp.configs.cell.cameras import CameraRow
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import lens_map
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT, MASS_RANGE, MATERIALS, UNITS
-from synpick_warp.configs.files.cell_file import NewCamera, NewCell, bin_of_size, cell_toml
+from synpick_warp.configs.files.cell_file import NewCell, bin_of_size, cell_toml
 from synpick_warp.configs.rules.camera_rules import NAME, RESERVED
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickError, escape, format_value, suggest
@@ -132,7 +132,7 @@ def new_cell(
             _copy(file, stage / PARTS)
         models = os.path.realpath(parts[0]) if parts and not copied else PARTS if parts else ""
         rows, sizes = _read_cameras(calibration or [], resolution, lens or "", stage), BinSizes.of_row(shape)
-        cameras = [NewCamera(row.name, given, pose_for(row, index, sizes)) for index, (row, given) in enumerate(rows)]
+        cameras = [{"name": row.name, **given, "pose": pose_for(row, index, sizes)} for index, (row, given) in enumerate(rows)]
         width, height = rows[0][0].resolution or _RESOLUTION
         perception = (_PERCEPTION, min(max(_LEAST, round(_PERCEPTION * height / width)), MAX_SIDE))
         cell = NewCell(cameras, _copy_bin(shape, stage), models, unit or AUTO_UNIT, *weights, perception=perception)

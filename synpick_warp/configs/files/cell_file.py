@@ -36,20 +36,11 @@ All settings: `synpick-warp config --config {file}`, and configs/README.md."""
 
 
 @dataclass(frozen=True)
-class NewCamera:
-    """A camera of a new cell."""
-
-    name: str
-    intrinsics: Mapping[str, Any]
-    """`file`, or `fov`, with `resolution`, `model` where they are needed."""
-    pose: Pose
-
-
-@dataclass(frozen=True)
 class NewCell:
     """What a new cell consists of."""
 
-    cameras: Sequence[NewCamera]
+    cameras: Sequence[Mapping[str, Any]]
+    """Settings of each in [[camera]]."""
     bin: BinRow
     models: str = ""
     """Folder of the parts; empty: the embedded objects."""
@@ -71,7 +62,6 @@ class NewCell:
 
 def cell_toml(cell: NewCell, name: str) -> str:
     """TOML text of a cell; `name`: its folder."""
-    cameras = [camera.name for camera in cell.cameras]
     inside, shape, shapes = _bin(cell.bin)
     volume = float(f"{max(FILL * inside, cell.volume):.2g}")
     parts = {"unit": cell.unit, "center": cell.center, "symmetries": "detect"} if cell.models else {}
@@ -84,9 +74,9 @@ def cell_toml(cell: NewCell, name: str) -> str:
     lines += _section("bake", {"mode": "pick", "worlds": 1, "episodes": 1, **models}, {"seed": 7, "formats": ("bop", "zarr")})
     lines += _title("Cameras")
     for index, camera in enumerate(cell.cameras):
-        lines += _table("[[camera]]", "camera", {"name": camera.name, **camera.intrinsics, "pose": camera.pose}, {}, first=index == 0)
+        lines += _table("[[camera]]", "camera", camera, {}, first=index == 0)
     lines += _table("#[[camera]]", "camera", {}, _MEASURED)
-    lines += _section("perception", {"camera": cameras[0], "resolution": cell.perception}, {})
+    lines += _section("perception", {"camera": cell.cameras[0]["name"], "resolution": cell.perception}, {})
     lines += _title("Bin")
     lines += _section("bins", {"kind": "own"}, {"shift": (0.02, 0.02), "yaw": 5.0})
     lines += _table("[[bin]]", "bin", shape, shapes)

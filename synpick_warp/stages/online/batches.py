@@ -15,7 +15,7 @@ from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, mas
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.mask_pool import widen
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
-from synpick_warp.stages.render.view_setup import make_views, with_cameras
+from synpick_warp.stages.render.view_setup import with_cameras
 from synpick_warp.stages.timing import scope
 from synpick_warp.stages.view_ring import CameraGroup
 
@@ -228,12 +228,8 @@ class BatchRing:
         self._next = (self._next + 1) % len(self.slots)
         slot.gate.wait_for_consumers()
         slot.images = widen(slot.pooled) if wide else slot.pooled
-        padded = np.zeros((3, self.views), dtype=np.int32)
-        padded[:, :count] = world, camera, self.group.slots(camera)
-        slot.lists.assign(padded)
-        views = make_views(slot.lists[0], slot.lists[1], count, self.instances, slot=slot.lists[2])
-        self.group.place(cameras, camera, (host, last))
-        views = with_cameras(views, self.renderer.cameras if cameras is None else cameras.now)
+        views = self.group.write_views(slot.lists, world, camera, cameras, (host, last))
+        views = with_cameras(views, self.renderer.cameras if cameras is None else cameras[0])
         with scope("render", self.device):
             self.renderer.render(snapshot, views, slot.images, slot.layers, cameras)
             self._gather(snapshot, views, slot.truth)

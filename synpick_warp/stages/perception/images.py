@@ -17,9 +17,10 @@ from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
+from synpick_warp.stages.render.cameras import VIEW_CAMERAS
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_grid, with_cameras
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEW_CAMERAS, VIEWS, body_sizes, set_up_views
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30

@@ -10,6 +10,7 @@ from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
+from synpick_warp.stages.render.cameras import allocate_view_cameras
 from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.looks import Dresser
@@ -17,15 +18,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import (
-    GBUFFER,
-    VIEW_BODIES,
-    PlacedCameras,
-    allocate_view_cameras,
-    body_sizes,
-    set_up_views,
-    with_cameras,
-)
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -40,7 +33,7 @@ class Renderer:
     Attributes:
         instances: Instance capacity of a world.
         views: Maximum number of views of a batch.
-        cameras: The struct `ViewCameras` of the last batch, or `LensCameras` if some cameras are distorted.
+        cameras: The struct `CameraTable` of the last batch, or `LensCameras` if some cameras are distorted.
         bodies: The struct `ViewBodies` of the last batch.
         gbuffer: The struct `GBuffer` of the last batch.
         image: The struct `ShadedImage` of the last batch: linear radiance.
@@ -97,7 +90,7 @@ class Renderer:
         self.annotator = Annotator(scene, instances, views)
 
     def render(
-        self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: PlacedCameras | None = None
+        self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: tuple[Any, Any] | None = None
     ) -> None:
         """Render and annotate a batch of views: the one place that knows the order of the passes.
 
@@ -106,7 +99,7 @@ class Renderer:
             views: The struct `Views`; the renderer brings their cameras.
             out: Written.
             layers: Written; None: no layers.
-            placed: Cameras of the views; None: the scene has them.
+            placed: Cameras of the views in this frame and in the one before, by `place_cameras`; None: the scene has them.
 
         Raises:
             ValueError: The batch has more views than there is scratch for.
@@ -119,7 +112,7 @@ class Renderer:
         views = self.render_gbuffer(snapshot, views, out, placed)
         if layers is not None:
             with scope("layers", device):
-                last = views.cameras if placed is None else placed.last
+                last = views.cameras if placed is None else placed[1]
                 self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers, last)
         if self.shading is not None:
             with scope("shade", device):
@@ -129,9 +122,9 @@ class Renderer:
         with scope("annotate", device):
             self.annotator.annotate(self.bodies, views, out)
 
-    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: PlacedCameras | None = None) -> Any:
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
         """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the views with their cameras."""
-        scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed.now)
+        scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed[0])
         with scope("set up views", scene.device):
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
             if self.dresser:

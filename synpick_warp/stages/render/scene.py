@@ -10,22 +10,21 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.calibration.lens import FISHEYE, LensMap
 from synpick_warp.kernels.render.images.suction_map import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
-from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
-from synpick_warp.kernels.render.visibility.lens import BEND, FIRST, FISHEYE_MODEL, MODEL, NUMBERS, RADIUS, STRETCH, Lenses
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
+from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.light_tables import (
     EnvironmentTables,
     build_environment_cdf,
@@ -49,7 +48,7 @@ class RenderScene:
     surfaces: Any
     """The struct `Surfaces`: materials and textures."""
     cameras: Any
-    """The struct `Cameras`."""
+    """The struct `CameraTable`."""
     lights: Any
     """The struct `Lights`: environment maps."""
     table: Any
@@ -209,42 +208,6 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
     adjugate = gram[:, ::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])
     squared, area = np.einsum("fij,fij->f", adjugate, turned), np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     return (np.sqrt(np.maximum(squared, 0.0)) / np.where(area > 0.0, area, np.inf)).astype(np.float32)
-
-
-def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
-    """Build the struct `Cameras` on the device: intrinsics, rotations both ways, centres."""
-    values = camera_arrays(*(np.array([getattr(camera, name) for camera in cameras]) for name in ("matrix", "rotation", "translation")))
-    result = Cameras()
-    for name, value in values.items():
-        setattr(result, name, wp.array(value, dtype=Cameras.vars[name].type.dtype, device=device))
-    if lenses := [camera.lens for camera in cameras if camera.lens is not None]:
-        rows = np.cumsum([camera.lens is not None for camera in cameras]) - 1
-        rows = [row if camera.lens is not None else -1 for row, camera in zip(rows, cameras, strict=True)]
-        result.lens = wp.array(rows, dtype=wp.int32, device=device)
-        tables = Lenses()
-        tables.ray = wp.array(np.stack([lens.rays() for lens in lenses]), dtype=wp.vec2, device=device)
-        tables.number = wp.array(np.stack([lens_numbers(lens) for lens in lenses]), dtype=wp.float32, device=device)
-        result.lenses = tables
-    return result
-
-
-def camera_arrays(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> dict[str, np.ndarray]:
-    """Members of `Cameras` without lenses for matrices (n, 3, 3) [px], world-to-camera rotations (n, 3, 3) and translations (n, 3) [m]."""
-    return {
-        "intrinsics": matrix[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32),
-        "rotation": rotation,
-        "center": -np.einsum("kji,kj->ki", rotation, translation),
-        "to_world": rotation.transpose(0, 2, 1).astype(np.float32),
-    }
-
-
-def lens_numbers(lens: LensMap) -> np.ndarray:
-    """Row of `Lenses.number`."""
-    result = np.zeros(int(NUMBERS), np.float32)
-    result[int(MODEL)] = float(FISHEYE_MODEL) * (lens.lens.model == FISHEYE)
-    result[int(FIRST) : int(FIRST) + len(lens.lens.coefficients)] = lens.lens.coefficients
-    result[[int(RADIUS), int(BEND), int(STRETCH)]] = lens.radius, lens.bend, lens.stretch
-    return result
 
 
 def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:

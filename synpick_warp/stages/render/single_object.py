@@ -12,8 +12,9 @@ from synpick_warp.kernels.render.visibility.gbuffer import Table
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
+from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.raster import Rasterizer
-from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
+from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, first_views, set_up_views
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.calibration.lens import LensMap
-from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, ViewCameras, Views, compute_rays_kernel
+from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, Views
 from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, ViewBodies
-from synpick_warp.kernels.render.visibility.lens import NUMBERS, Lenses
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
-from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.arrays import struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
-from synpick_warp.stages.render.scene import RenderScene, build_grid, camera_arrays, lens_numbers
+from synpick_warp.stages.render.cameras import allocate_view_cameras
+from synpick_warp.stages.render.scene import RenderScene, build_grid
 
 VIEW_BODIES = struct_arrays(
     ViewBodies,
@@ -31,9 +28,6 @@ VIEW_BODIES = struct_arrays(
     units={"start": "m", "near": "m", "box": "px", "position": "m", "sphere": "m, m²"},
 )
 VIEWS = struct_arrays(Views, "view")
-VIEW_CAMERAS = struct_arrays(ViewCameras, "view", units={"intrinsics": "px", "center": "m"})
-LENS_CAMERAS = struct_arrays(LensCameras, "view", units={"intrinsics": "px", "center": "m"})
-LENSES = struct_arrays(Lenses, "view", ray=("view", "row", "column"), number=("view", "number"))
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
 BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
@@ -51,7 +45,7 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int, ca
         camera: Camera of each view (view) int32.
         count: Views in the batch; arrays may be longer.
         instances: Instance capacity of a world.
-        cameras: The struct `ViewCameras` or `LensCameras`; None: the renderer brings its own.
+        cameras: The struct `CameraTable` or `LensCameras`; None: the renderer brings its own.
         slot: Row of each view's camera in the scene (view) int32; None: that of its index.
     """
     views = LensViews() if isinstance(cameras, LensCameras.cls) else Views()
@@ -70,61 +64,9 @@ def with_cameras(views: Any, cameras: Any) -> Any:
     return views
 
 
-def allocate_view_cameras(views: int, device: wp.Device, cameras: Any = None) -> Any:
-    """Allocate the struct `ViewCameras`, or `LensCameras` if the struct `Cameras` has lenses; None: it has none."""
-    if cameras is None or cameras.lens is None:
-        return allocate_struct(VIEW_CAMERAS, {"view": views}, device)
-    made = allocate_struct(LENS_CAMERAS, {"view": views}, device)
-    made.lenses = cameras.lenses
-    return made
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedCameras:
-    """Cameras of the views of a batch, set on the host: the struct `ViewCameras` in this frame and in the one before."""
-
-    now: Any
-    last: Any
-    """The same struct if the cameras do not move."""
-
-
-def place_lenses(cameras: Any, scene: RenderScene, slot: np.ndarray, lenses: Sequence[LensMap | None]) -> None:
-    """Give the first views of the struct `LensCameras` a lens of their own, and compute the rays of its pixels.
-
-    Args:
-        cameras: Written; its cameras are set, and its lenses are those of `LENSES`.
-        scene: Scene that has these lenses with other camera matrices.
-        slot: Row of each view's camera in the scene (view) int32.
-        lenses: Lens of each view; None: a pinhole.
-    """
-    views, table = np.arange(len(lenses), dtype=np.int32), cameras.lenses
-    cameras.lens[: len(views)].assign(np.where([lens is not None for lens in lenses], views, -1).astype(np.int32))
-    numbers = [np.zeros(int(NUMBERS), np.float32) if lens is None else lens_numbers(lens) for lens in lenses]
-    table.number[: len(views)].assign(np.stack(numbers))
-    inputs = [scene.cameras, wp.array(slot, dtype=wp.int32, device=scene.device), cameras]
-    dim = (len(views), *table.ray.shape[1:])
-    wp.launch(compute_rays_kernel, dim=dim, inputs=inputs, outputs=[table.ray], device=scene.device)
-
-
-def place_cameras(cameras: Any, scene: RenderScene, slot: np.ndarray, placed: Mapping[str, np.ndarray]) -> None:
-    """Set the first views of the struct `ViewCameras` on the host.
-
-    Args:
-        cameras: Written.
-        scene: Scene that has the lenses.
-        slot: Row of each view's camera in the scene (view) int32.
-        placed: Matrix, rotation and translation of each view, as fields of `FrameBatch`.
-    """
-    values = camera_arrays(placed["matrix"], placed["rotation"], placed["translation"])
-    if scene.cameras.lens is not None:
-        values["lens"] = scene.cameras.lens.numpy()[slot]
-    for name, value in values.items():
-        getattr(cameras, name)[: len(slot)].assign(value)
-
-
 def first_views(count: int, cameras: int, instances: int, device: wp.Device, lenses: Any = None) -> Any:
     """The struct `Views` of the first views, world by world and camera by camera; arguments as of `make_views`, number of cameras, and the
-    struct `Cameras` if some are distorted."""
+    scene's struct `CameraTable` if some are distorted."""
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
     return make_views(world, camera, count, instances, allocate_view_cameras(count, device, lenses))

@@ -8,7 +8,7 @@ import warp as wp
 
 from synpick_warp.exporters.bop.view import rotation_matrices
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
-from synpick_warp.kernels.render.visibility.camera import Cameras
+from synpick_warp.kernels.render.visibility.camera import CameraTable
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import allocate_view_buffers, masks_of
 from synpick_warp.stages.online.batches import TruthBuffers
@@ -23,7 +23,7 @@ OBJECT_IDS = np.array([4, 7, 11], np.int32)
 
 def gather(device: wp.Device, rotation: np.ndarray, center: np.ndarray, entry: np.ndarray, pose: np.ndarray) -> dict[str, np.ndarray]:
     """Results of both kernels; intrinsics are 100 and 110 c + 0, 1, 2, 3 for camera c; world w shows frame 2 w of episode 20 + w."""
-    cameras = Cameras()
+    cameras = CameraTable()
     intrinsics = np.array([[100, 101, 102, 103], [110, 111, 112, 113]], np.float32)
     cameras.intrinsics = wp.array(intrinsics, dtype=wp.vec4, device=device)
     cameras.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)

@@ -24,8 +24,9 @@ from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.postprocess import PostProcessor
-from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.system.hardware.device import pick_device
 from tests.builders import refusal
 from tests.harness.aimed_views import aimed_views

@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, ViewCameras, in_image, pinhole_ray, projected_box, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import CameraTable, ImageGrid, in_image, pinhole_ray, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.devices import default_device
 from tests.harness.probe import probe
@@ -24,11 +24,11 @@ def visit_pixel(grid: ImageGrid, visits: wp.array3d[int], index: int):
         wp.atomic_add(visits, view, row, column, 1)
 
 
-visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box, cameras=ViewCameras)
+visit, ray_of, box_of = probe(visit_pixel), probe(pinhole_ray), probe(projected_box, cameras=CameraTable)
 
 
 def project(lower, upper, rotation, position):
-    cameras = ViewCameras()
+    cameras = CameraTable()
     cameras.intrinsics = wp.array([(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)], dtype=wp.vec4, device=default_device())
     return box_of(lower, upper, rotation, position, cameras, 0, build_grid(WIDTH, HEIGHT))
 

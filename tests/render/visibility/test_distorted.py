@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.configs.calibration.lens import FISHEYE, with_matrix
 from synpick_warp.configs.schema import UNOCCLUDED
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.render.view_setup import allocate_view_cameras, place_cameras, place_lenses
-from synpick_warp.stages.view_ring import allocate_lenses
+from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.devices import default_device
 from tests.render.visibility.test_raster import NEVER, depth_in_float64, gbuffer_of, random_triangles, triangles
@@ -103,8 +102,8 @@ def test_rays_of_a_drawn_camera_matrix_are_those_of_float64(device, name, zoom, 
     slot, matrices = np.array([0, 1, 0], np.int32), np.array([matrix, WIDE.matrix, view.matrix])
     cameras = allocate_view_cameras(4, device, scene.cameras)
     cameras.lenses = allocate_lenses({"view": 4, "row": view.height, "column": view.width}, device)
-    place_cameras(cameras, scene, slot, {"matrix": matrices, "rotation": np.array([DOWN] * 3), "translation": np.zeros((3, 3))})
-    place_lenses(cameras, scene, slot, lenses)
+    placed = {"matrix": matrices, "rotation": np.array([DOWN] * 3), "translation": np.zeros((3, 3))}
+    place_cameras(cameras, scene.cameras, slot, placed, (view.lens, None))
     assert cameras.lens.numpy()[:3].tolist() == [0, -1, 2]
     for row in (0, 2):
         # A thousandth of a pixel is 1.5e-5 here.

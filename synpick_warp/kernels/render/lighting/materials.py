@@ -7,7 +7,7 @@ import warp as wp
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
-from synpick_warp.kernels.render.visibility.variants import VARIANTS
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,30 +61,12 @@ class Surfaces:
     """Directional albedo of the specular lobe, the same for all surfaces."""
 
 
-@wp.struct
-class DressedSurfaces:
-    """Surfaces as `Surfaces`, where episodes draw their looks (`looks`): constant, but for the materials of views.
+DressedSurfaces = variant_of(Surfaces, "DressedSurfaces", row=wp.array2d[int], recolor=wp.array[wp.mat33], repeats=wp.array[float])
+"""Surfaces where episodes draw their looks (`looks`): constant, but for the materials of views.
 
-    More rows called material follow: one for each texture that episodes draw from, and one for each body of each view.
-    """
-
-    triangle: wp.array[wp.vec4]
-    color: wp.array[wp.vec3]
-    metallic: wp.array[float]
-    roughness: wp.array[float]
-    texture_size: wp.array[wp.vec2i]
-    first_texel: wp.array2d[int]
-    texture_levels: wp.array[int]
-    texel: wp.array[wp.uint32]
-    albedo: AlbedoTables
-    row: wp.array2d[int]
-    """(view, body, then the table and the floor): row of its material."""
-    recolor: wp.array[wp.mat33]
-    """(material): matrix on the linear base colour, whose result is clamped to 0..1."""
-    repeats: wp.array[float]
-    """(material): factor on texture coordinates."""
-
-
+More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
+body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
+clamped to 0..1, and `repeats` the factor on its texture coordinates."""
 AnySurfaces = Any
 """`Surfaces`, or `DressedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, DressedSurfaces

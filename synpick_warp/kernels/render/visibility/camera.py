@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.lens import BEND, Lenses, distort, table_ray, undistort
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,59 +22,31 @@ NEAR_PLANE = wp.constant(1.0e-3)
 
 
 @wp.struct
-class Cameras:
-    """Pinhole cameras: intrinsics (fx, fy, cx, cy) [px], world-to-camera rotation, optical centre in the world [m], and camera-to-world
-    rotation in float32. Constant.
+class CameraTable:
+    """Cameras, a row for each camera of a scene or each view of a batch: intrinsics, extrinsics and lens. Of views filled by
+    `aim_cameras_kernel` or on the host.
     """
 
     intrinsics: wp.array[wp.vec4]
-    """(camera): fx, fy, cx, cy [px]."""
+    """(row): fx, fy, cx, cy [px]."""
     rotation: wp.array[wp.mat33d]
-    """(camera): world to camera."""
+    """(row): world to camera."""
     center: wp.array[wp.vec3d]
-    """(camera): optical centre in the world [m]."""
+    """(row): optical centre in the world [m]."""
     to_world: wp.array[wp.mat33]
-    """(camera): camera to world, in float32 for the per-pixel kernels."""
+    """(row): camera to world, in float32 for the per-pixel kernels."""
     lens: wp.array[int]
-    """(camera): row of `lenses`; -1: a pinhole. Null: all are."""
+    """(row): row of `lenses`; -1: a pinhole."""
     lenses: Lenses
-    """Lenses of the cameras that are distorted."""
+    """Lenses of the cameras that are distorted; null: none is."""
 
 
-@wp.struct
-class ViewCameras:
-    """Pinhole camera of each view of a batch, as `Cameras`: where it stands in the view's frame. Filled by `aim_cameras_kernel`."""
-
-    intrinsics: wp.array[wp.vec4]
-    """(view): fx, fy, cx, cy [px]."""
-    rotation: wp.array[wp.mat33d]
-    """(view): world to camera."""
-    center: wp.array[wp.vec3d]
-    """(view): optical centre in the world [m]."""
-    to_world: wp.array[wp.mat33]
-    """(view): camera to world, in float32 for the per-pixel kernels."""
-    # Never read. Functions for both kinds of cameras name them, in branches that are removed for pinholes; and without `lens` alone the
-    # compiler orders the instructions of every kernel of views otherwise, so that last bits of pictures could change.
-    lens: wp.array[int]
-    lenses: Lenses
-
-
-@wp.struct
-class LensCameras:
-    """Camera of each view of a batch, as `ViewCameras`, where some are distorted."""
-
-    intrinsics: wp.array[wp.vec4]
-    rotation: wp.array[wp.mat33d]
-    center: wp.array[wp.vec3d]
-    to_world: wp.array[wp.mat33]
-    lens: wp.array[int]
-    """(view): row of `lenses`; -1: a pinhole."""
-    lenses: Lenses
-    """Lenses of the cameras that are distorted."""
-
-
+# Kernels of `CameraTable` are those of pinholes, and never read its lenses: see `lens_of`. Without these members the compiler would order
+# the instructions of every kernel of views otherwise, so that last bits of pictures could change.
+LensCameras = variant_of(CameraTable, "LensCameras")
+"""Cameras of the views of a batch, where some are distorted."""
 AnyCameras = Any
-"""`ViewCameras`, or `LensCameras`: functions are compiled for each; see `variants`."""
+"""`CameraTable`, or `LensCameras`: functions are compiled for each; see `variants`."""
 
 
 @wp.struct
@@ -100,8 +73,8 @@ class Views:
     camera: wp.array[int]
     """(view): index among all cameras, by which random numbers are addressed; -1: the view is not in use."""
     slot: wp.array[int]
-    """(view): row of `Cameras`, which has the cameras of one image size."""
-    cameras: ViewCameras
+    """(view): row of the scene's cameras, which are those of one image size."""
+    cameras: CameraTable
     """Camera of each view."""
     count: int
     """Views in the batch."""
@@ -109,20 +82,11 @@ class Views:
     """Instance capacity of a world."""
 
 
-@wp.struct
-class LensViews:
-    """Views of a batch, as `Views`, where some cameras are distorted."""
-
-    world: wp.array[int]
-    camera: wp.array[int]
-    slot: wp.array[int]
-    cameras: LensCameras
-    count: int
-    instances: int
-
-
+LensViews = variant_of(Views, "LensViews", cameras=LensCameras)
+"""Views of a batch, where some cameras are distorted."""
 AnyViews = Any
 """`Views`, or `LensViews`: kernels are compiled for each; see `variants`."""
+VARIANTS["views"] = VARIANTS["views_inout"] = Views, LensViews
 
 
 @wp.func
@@ -169,7 +133,7 @@ def pinhole_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> 
 
 
 @wp.func
-def lens_of(cameras: ViewCameras, view: int) -> int:
+def lens_of(cameras: CameraTable, view: int) -> int:
     """Row of a view's lens in `LensCameras.lenses`; -1: a pinhole, known when the kernel is compiled."""
     return -1
 
@@ -284,7 +248,7 @@ def projected_box(
 @wp.kernel
 def compute_rays_kernel(
     # Scene:
-    cameras: Cameras,
+    cameras: CameraTable,
     # In:
     slot: wp.array[int],  # (view)
     view_cameras: LensCameras,

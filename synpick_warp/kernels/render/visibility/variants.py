@@ -8,9 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import LensViews, Views
-
-VARIANTS: dict[str, tuple[Any, Any]] = {"views": (Views, LensViews), "views_inout": (Views, LensViews)}
+VARIANTS: dict[str, tuple[Any, Any]] = {}
 """Structs of a parameter that is annotated `Any`, by its name: the plain one and that of the variant. Modules that define structs add
 theirs."""
 _parameters: dict[wp.Kernel, dict[str, tuple[Any, Any]]] = {}
@@ -19,6 +17,12 @@ _templates: dict[wp.Kernel, wp.Kernel] = {}
 """Generic kernel of each plain kernel."""
 _kernels: dict[tuple[wp.Kernel, frozenset[Any]], wp.Kernel] = {}
 """Variant of each plain kernel by the structs that are not plain; filled by module."""
+
+
+def variant_of(struct: Any, name: str, **members: Any) -> Any:
+    """Struct with the members of another, but for those named, for kernels that are compiled apart."""
+    body = {"__annotations__": struct.cls.__annotations__ | members, "__module__": struct.cls.__module__, "__doc__": f"As `{struct.key}`."}
+    return wp.struct(type(name, (), body))
 
 
 def kernel_of_views(function: Callable[..., None] | None = None, **options: Any) -> Any:

@@ -8,7 +8,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     TILE_HEIGHT,
     TILE_WIDTH,
     AnyViews,
-    Cameras,
+    CameraTable,
     ImageGrid,
     camera_ray,
     lens_of,
@@ -35,8 +35,8 @@ def aim_views_kernel(views_inout: AnyViews):
 
 
 @kernel_of_views
-def aim_cameras_kernel(cameras: Cameras, views_inout: AnyViews):
-    """Gather camera parameters: copy intrinsics, pose and lens of row `slot` of `Cameras` to each used view. Launched over view."""
+def aim_cameras_kernel(cameras: CameraTable, views_inout: AnyViews):
+    """Gather camera parameters: copy intrinsics, pose and lens of row `slot` of the scene's to each used view. Launched over view."""
     view = wp.tid()
     if views_inout.camera[view] >= 0:
         camera = views_inout.slot[view]

@@ -32,7 +32,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
-from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views, variant_of
 from synpick_warp.kernels.rng import mix, stream_key
 from synpick_warp.kernels.state import Frames
 
@@ -66,17 +66,8 @@ class PathScene:
     """Rows are those of `Lights.radiance`."""
 
 
-@wp.struct
-class DressedScene:
-    """Scene as `PathScene`, where episodes draw their looks."""
-
-    meshes: Meshes
-    table: Table
-    surfaces: DressedSurfaces
-    lights: Lights
-    cdf: EnvironmentCdf
-
-
+DressedScene = variant_of(PathScene, "DressedScene", surfaces=DressedSurfaces)
+"""Scene where episodes draw their looks."""
 AnyScene = Any
 """`PathScene`, or `DressedScene`: functions are compiled for each; see `variants`."""
 VARIANTS["scene"] = PathScene, DressedScene
