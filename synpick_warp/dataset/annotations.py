@@ -46,24 +46,20 @@ MAX_SYMMETRIES = 1024
 """Most symmetries of an object; a polyhedron has up to 60 rotations, and every one multiplies the work of evaluation."""
 
 
-class ForeignCameraEntry(Struct, gc=False, frozen=True, kw_only=True):
-    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm]. Those of other
-    programs may lack any of them.
+def camera_schema(*required: str, **types: Any) -> Any:
+    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], lens.
+
+    Args:
+        required: Keys that must be there; those of other programs may lack any.
+        types: Types of further keys, or of these, in place of the usual ones.
     """
-
-    cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
-    depth_scale: Scale | UnsetType = UNSET
-    cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
-    cam_t_w2c: Vector3 | UnsetType = UNSET
-    cam_dist: Any = UNSET
-    cam_dist_model: Any = UNSET
+    fields = [(key, kind) if key in required else (key, kind | UnsetType, UNSET) for key, kind in (_CAMERA | types).items()]
+    return msgspec.defstruct("CameraEntry", fields, kw_only=True, gc=False)
 
 
-class CameraEntry(ForeignCameraEntry, gc=False, frozen=True, kw_only=True):
-    """Schema of a view's entry in scene_camera.json with what every bake writes."""
-
-    cam_K: Matrix3  # noqa: N815
-    depth_scale: Scale
+_CAMERA: dict[str, Any] = {
+    "cam_K": Matrix3, "depth_scale": Scale, "cam_R_w2c": Rotation, "cam_t_w2c": Vector3, "cam_dist": Any, "cam_dist_model": Any
+}  # fmt: skip
 
 
 class TruthEntry(Struct, gc=False):
@@ -156,7 +152,7 @@ class EpisodeEntry(Struct, gc=False):
     attempts: list[dict[str, Any]] = []
 
 
-VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
+VIEW_SCHEMAS: dict[str, Any] = {"camera": camera_schema("cam_K", "depth_scale"), "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 GRAPH_SCHEMA = dict[Key, GraphEntry]
 """Schema of scene_graph.json: the entries by frame."""

@@ -126,7 +126,7 @@ def read_scene(data_set: DataSet, task: SceneTask) -> Iterator[Block]:
     group = Group(data_set.split_of(episode), read_facts(data_set, episode).mode)
     files = data_set.scene_files(episode, camera)
     images = data_set[episode].images(camera) if files.complete else files.frames()
-    scene = read_arrays(files, images, columns.LitCameraEntry, whole=True)
+    scene = read_arrays(files, images, columns.CAMERA, whole=True)
     yield from columns.scene_blocks(group, scene, files.place)
     if camera == 0:
         if data_set.period is not None:

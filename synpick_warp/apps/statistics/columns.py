@@ -11,11 +11,11 @@ from typing import Annotated
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Meta, UnsetType
+from msgspec import Meta
 
 from synpick_warp.apps.statistics.counts import Block, Group
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.dataset.annotations import ADVICE, ForeignCameraEntry, Index, Length
+from synpick_warp.dataset.annotations import ADVICE, Index, Length, camera_schema
 from synpick_warp.dataset.bop.arrays import SceneArrays
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.errors import DatasetError
@@ -116,10 +116,8 @@ class Light(msgspec.Struct, gc=False):
     exposure: Length
 
 
-class LitCameraEntry(ForeignCameraEntry, gc=False):
-    """Schema of a view's entry in scene_camera.json with its light, which only data sets of this program have."""
-
-    light: Light | UnsetType = UNSET
+CAMERA = camera_schema(light=Light)
+"""Entry of a view in scene_camera.json with its light, which only data sets of this program have."""
 
 
 def episode_blocks(group: Group, row: EpisodeFacts, attempts: Sequence[AttemptFacts], suction: Suction | None) -> Iterator[Block]:

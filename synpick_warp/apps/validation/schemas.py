@@ -8,20 +8,13 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
-from synpick_warp.dataset.annotations import ForeignCameraEntry, GraphEntry, Index, InfoEntry, Length, Matrix3, TruthEntry
+from synpick_warp.dataset.annotations import GraphEntry, Index, InfoEntry, Length, Matrix3, TruthEntry, camera_schema
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
 
 
-class CameraSchema(ForeignCameraEntry, gc=False):
-    """Schema of an entry of scene_camera.json: intrinsics [px], depth scale [mm per count], world-to-camera rotation and translation [mm];
-    UNSET: missing.
-    """
-
-    cam_model: dict[str, Any] | UnsetType = UNSET
-    depth_scale: Length | UnsetType = UNSET
-    cam_R_w2c: Matrix3 | UnsetType = UNSET  # noqa: N815
+CAMERA = camera_schema(cam_model=dict[str, Any], depth_scale=Length, cam_R_w2c=Matrix3)
 
 
 class TruthSchema(TruthEntry, gc=False):
@@ -79,7 +72,7 @@ class Coco(Struct, gc=False):
     categories: list[Category]
 
 
-RECORDS: dict[str, Any] = {"camera": CameraSchema, "gt": list[TruthSchema], "gt_info": list[Info], "graph": GraphEntry}
+RECORDS: dict[str, Any] = {"camera": CAMERA, "gt": list[TruthSchema], "gt_info": list[Info], "graph": GraphEntry}
 """Schema of an image's entry by file."""
 
 

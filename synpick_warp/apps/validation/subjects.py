@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from synpick_warp.apps.validation.scene_files import CheckedScene, RecordFile, StoredMask, png_type
-from synpick_warp.apps.validation.schemas import Annotation, CameraSchema, Coco, Info, TruthSchema
+from synpick_warp.apps.validation.schemas import Annotation, Coco, Info, TruthSchema
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
@@ -73,7 +73,7 @@ class SceneSubject:
         return self.files.record(name)
 
     @property
-    def cameras(self) -> dict[int, CameraSchema]:
+    def cameras(self) -> dict[int, Any]:
         """Entries of scene_camera.json by image, those that fit the schema."""
         return self.record("camera").entries
 

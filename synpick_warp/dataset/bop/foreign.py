@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.dataset.annotations import VIEW_SCHEMAS, ForeignCameraEntry
+from synpick_warp.dataset.annotations import VIEW_SCHEMAS, camera_schema
 from synpick_warp.dataset.bop.images import COLOR, FolderImages, KeyedFolder, KeyedImages, SceneImages
 from synpick_warp.dataset.bop.layout import Layout, Listing, NoLayoutError, SceneRef
 from synpick_warp.dataset.view_files import RECORD_NAMES, SceneFiles, SceneFolder, SceneShards, ViewRecords
@@ -44,7 +44,7 @@ _PER_OBJECT = 1000
 class ForeignScene(SceneFiles):
     """`SceneFiles` of any origin: what is missing is completed, images may have any format that BOP data sets have."""
 
-    schemas: Mapping[str, Any] = VIEW_SCHEMAS | {"camera": ForeignCameraEntry}
+    schemas: Mapping[str, Any] = VIEW_SCHEMAS | {"camera": camera_schema()}
     complete = False
     advice = " or .tif"
 

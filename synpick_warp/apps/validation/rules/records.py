@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
-from synpick_warp.apps.validation.schemas import CameraSchema, Info, TruthSchema
+from synpick_warp.apps.validation.schemas import Info, TruthSchema
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 ROTATION_TOLERANCE = 1e-3
@@ -236,7 +237,7 @@ def _outline(info: Info) -> int:
     return 2 * (max(info.bbox_obj[2], 0) + max(info.bbox_obj[3], 0) + 2)
 
 
-def _cameras(scene: SceneSubject) -> Iterator[tuple[str, str, CameraSchema]]:
+def _cameras(scene: SceneSubject) -> Iterator[tuple[str, str, Any]]:
     """Yield (file, place for messages, entry) of each image in scene_camera.json."""
     record = scene.record("camera")
     yield from ((record.where(image), f"image {image}", entry) for image, entry in scene.cameras.items())
