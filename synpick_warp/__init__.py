@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.environment.vector import PickingVectorEnv
     from synpick_warp.factory.episodes import BakeSummary
-    from synpick_warp.online.render import Pinhole
     from synpick_warp.online.stream import ViewStream
+    from synpick_warp.scenes.types import Camera
     from synpick_warp.system.progress import Progress
 
 __all__ = [
@@ -253,7 +253,7 @@ def make_env(
 
 def render(
     objects: Sequence[tuple[Path | str | tuple[Any, Any], Any]],
-    cameras: Sequence[Pinhole],
+    cameras: Sequence[Camera],
     *,
     layers: Sequence[str] = (),
     unit: float = 1.0,
@@ -263,9 +263,9 @@ def render(
 ) -> dict[str, Any]:
     """Render meshes at given poses, without simulation and files.
 
-        from synpick_warp.online.render import Pinhole
+        from synpick_warp.scenes.types import Camera
 
-        camera = Pinhole(matrix=K, resolution=(640, 480), pose=camera_to_world)
+        camera = Camera.at(matrix=K, resolution=(640, 480), pose=camera_to_world)
         views = synpick_warp.render([("bracket.stl", object_to_world)], [camera], layers=("normals",), unit=1e-3)
 
     Args:

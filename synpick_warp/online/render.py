@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +32,8 @@ GREY = Material((0.7, 0.7, 0.7), None, 0.0, 0.6)
 Mesh = Path | str | tuple[np.ndarray, np.ndarray]
 
 
-@dataclass(frozen=True)
-class Pinhole:
-    """Pinhole camera: intrinsic matrix (3, 3) [px], width and height [px], and pose in the world (4, 4) [m] with OpenCV's axes (x right,
-    y down, z forward). Pixel centres lie at half integers.
-    """
-
-    matrix: Sequence[Sequence[float]] | np.ndarray
-    resolution: tuple[int, int]
-    pose: Sequence[Sequence[float]] | np.ndarray
-
-    def camera(self) -> Camera:
-        """The camera as the renderer has it, from the world to its axes."""
-        pose = np.asarray(self.pose, float).reshape(4, 4)
-        rotation = pose[:3, :3].T
-        return Camera(*self.resolution, np.asarray(self.matrix, float).reshape(3, 3), rotation, -rotation @ pose[:3, 3])
-
-
 def render_scene(
-    objects: Sequence[tuple[Mesh, Any]], cameras: Sequence[Pinhole], layers: Sequence[str], unit: float, device: str, settings: Config
+    objects: Sequence[tuple[Mesh, Any]], cameras: Sequence[Camera], layers: Sequence[str], unit: float, device: str, settings: Config
 ) -> dict[str, wp.array]:
     """Render a scene; arguments and errors as of `synpick_warp.render`. Returns arrays of `ViewBuffers` and layers, by name."""
     if not 1 <= len(objects) <= MAX_INSTANCES:
@@ -63,14 +46,13 @@ def render_scene(
     settings, on = replace(settings, render=replace(settings.render, layers=tuple(layers))), pick_device(device)
     meshes = {_key(mesh): mesh for mesh, _ in objects}
     catalog = Catalog(tuple(_entry(index + 1, mesh, unit) for index, mesh in enumerate(meshes.values())))
-    views = tuple(each.camera() for each in cameras)
     fixtures = make_fixtures(make_bins(settings.cell.bins), settings.gripper)
-    scene = build_render_scene(settings.render, 0.0, catalog, fixtures, views, load_lights(settings.bake.lights)[:1], on)
-    sizes = view_buffer_sizes(len(views), views[0].width, views[0].height, len(objects))
+    scene = build_render_scene(settings.render, 0.0, catalog, fixtures, tuple(cameras), load_lights(settings.bake.lights)[:1], on)
+    sizes = view_buffer_sizes(len(cameras), *cameras[0].resolution, len(objects))
     images, extra = allocate(ViewBuffers, sizes, on), allocate(LayerBuffers, sizes, on, layers)
     world = _world([list(meshes).index(_key(mesh)) for mesh, _ in objects], [pose for _, pose in objects], on)
-    shown = first_views(len(views), len(views), len(objects), on, scene.cameras)
-    make_renderer(settings, scene, len(objects), len(views)).render(world, shown, images, extra if layers else None)
+    shown = first_views(len(cameras), len(cameras), len(objects), on, scene.cameras)
+    make_renderer(settings, scene, len(objects), len(cameras)).render(world, shown, images, extra if layers else None)
     return {"color": images.color, "depth": images.depth, "instance": images.instance} | {name: getattr(extra, name) for name in layers}
 
 

@@ -101,7 +101,7 @@ def describe_cameras(picks: bool, rig: Rig, bins: Sequence[BinSizes], gripper: G
             )
         points = matmul(np.array([np.mean(each.corners, axis=0) for each in bins]), camera.rotation.T) + camera.translation
         pixels = matmul(points, camera.matrix.T)[:, :2] / np.where(points[:, 2:] > 0.0, points[:, 2:], np.nan)
-        seen = ((pixels >= 0.0) & (pixels <= (camera.width, camera.height))).all(axis=1)
+        seen = ((pixels >= 0.0) & (pixels <= camera.resolution)).all(axis=1)
         if camera.fixed_to == WORLD and row.pose.look_at is None and not seen.any():
             advice = "if its pose leads from the world to the camera, invert it"
             lines.append(f"camera {camera.name} has the middle of the {noun} beside its images; {advice}")

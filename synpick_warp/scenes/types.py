@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -216,6 +217,13 @@ class Camera:
     """Distortion of the lens; None: a pinhole."""
     fixed_to: str = WORLD
     """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
+
+    @classmethod
+    def at(cls, matrix: Sequence[Sequence[float]] | np.ndarray, resolution: tuple[int, int], pose: Any) -> Camera:
+        """Pinhole camera of an intrinsic matrix (3, 3) [px], with width and height [px], by its pose in the world (4, 4) [m]."""
+        pose = np.asarray(pose, float).reshape(4, 4)
+        rotation = pose[:3, :3].T
+        return cls(*resolution, np.asarray(matrix, float).reshape(3, 3), rotation, -rotation @ pose[:3, 3])
 
     @property
     def resolution(self) -> tuple[int, int]:

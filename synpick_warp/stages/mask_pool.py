@@ -58,7 +58,7 @@ class MaskBounds:
         """Bounds for the objects of the struct `Meshes`, and the cameras of a group."""
         corner = np.abs(np.stack((meshes.lower.numpy(), meshes.upper.numpy()))).max(axis=0)[: meshes.entries].astype(np.float64)
         placed = {key: np.stack([getattr(camera, key) for camera in cameras]) for key in CAMERA_KEYS}
-        return cls(np.append(np.linalg.norm(corner, axis=1), -1.0), placed, (cameras[0].width, cameras[0].height))
+        return cls(np.append(np.linalg.norm(corner, axis=1), -1.0), placed, cameras[0].resolution)
 
     def count_words(self, index: np.ndarray, pose: np.ndarray, cameras: Mapping[str, np.ndarray]) -> np.ndarray:
         """Upper bound of the words of each view's masks (B) int64.

@@ -8,12 +8,12 @@ import trimesh
 
 import synpick_warp
 from synpick_warp.errors import ConfigError
-from synpick_warp.online.render import Pinhole
+from synpick_warp.scenes.types import Camera
 
 SIDE, HEIGHT = 0.1, 0.5
 K = [[64.0, 0.0, 32.0], [0.0, 64.0, 24.0], [0.0, 0.0, 1.0]]
 DOWN = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, HEIGHT], [0.0, 0.0, 0.0, 1.0]])
-CAMERA = Pinhole(K, (64, 48), DOWN)
+CAMERA = Camera.at(K, (64, 48), DOWN)
 BOX = trimesh.creation.box([SIDE] * 3)
 CUBE = (BOX.vertices, BOX.faces)
 

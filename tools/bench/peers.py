@@ -118,7 +118,7 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
     fixtures = make_fixtures(make_bins(config.cell.bins), config.gripper)
     theirs = build(config.render, factory.catalog, fixtures, cameras, table, snapshot, count, device)
     renderer, unoccluded = (_make_views_of(factory, mode, cameras, count) for mode in (config.render.mode, UNOCCLUDED))
-    out = allocate_view_buffers(count, cameras[0].width, cameras[0].height, renderer.instances, device)
+    out = allocate_view_buffers(count, *cameras[0].resolution, renderer.instances, device)
     views = first_views(count, len(cameras), renderer.instances, device)
 
     def time_view(*passes: Callable[[], object]) -> float:
@@ -159,6 +159,6 @@ def tile_snapshot(snapshot: Snapshot, count: int, device: wp.Device) -> Snapshot
 def _make_views_of(factory: Factory, mode: str, cameras: tuple[Camera, ...], count: int) -> Renderer:
     """Our renderer in a mode, of `count` views of these cameras."""
     own = factory.stream.rings[0].renderer
-    grid = build_grid(cameras[0].width, cameras[0].height)
+    grid = build_grid(*cameras[0].resolution)
     scene = replace(own.scene, cameras=build_cameras(cameras, own.scene.device), grid=grid)
     return make_renderer(factory.config.with_values({"render.mode": mode}), scene, own.instances, count, histories=count)

@@ -81,7 +81,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 masks=bop.masks and settings.rig.writes(index, MASKS),
                 coco=bop.coco and settings.rig.writes(index, MASKS) and settings.rig.writes(index, COLOR),
                 camera=make_camera_constants(camera, bop.depth_scale),
-                resolution=(camera.width, camera.height),
+                resolution=camera.resolution,
                 color=settings.rig.writes(index, COLOR),
                 depth=self.writes_depth and settings.rig.writes(index, DEPTH),
                 layers=settings.rig.chosen(index, layers),

@@ -146,7 +146,7 @@ def write_constants(
     told = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
     group = add_group(root, "cameras", CAMERAS, told)
     for name, spec in CAMERAS.arrays.items():
-        values = [(camera.width, camera.height) if name == "resolution" else getattr(camera, name) for camera in cameras]
+        values = [getattr(camera, name) for camera in cameras]
         add_array(group, name, spec, np.array(values, spec.dtype), level)
     add_group(root, EPISODES, GroupSpec("One group an episode, named by its number with six digits."))
     return places

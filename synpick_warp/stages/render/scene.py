@@ -212,7 +212,7 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
 
 def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
     """The same scene with other cameras, of one image size."""
-    grid = build_grid(cameras[0].width, cameras[0].height)
+    grid = build_grid(*cameras[0].resolution)
     return replace(scene, cameras=build_cameras(cameras, scene.device), grid=grid, camera_count=len(cameras))
 
 
@@ -349,7 +349,7 @@ def build_render_scene(
         lights=paths.lights,
         table=table,
         paths=paths,
-        grid=build_grid(cameras[0].width, cameras[0].height),
+        grid=build_grid(*cameras[0].resolution),
         obj_id=wp.array(catalog.object_ids, dtype=wp.int32, device=device),
         camera_count=len(cameras),
         device=device,

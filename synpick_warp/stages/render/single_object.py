@@ -36,7 +36,7 @@ def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camer
         lights=None,
         table=Table(),
         paths=None,
-        grid=build_grid(cameras[0].width, cameras[0].height),
+        grid=build_grid(*cameras[0].resolution),
         obj_id=wp.zeros(len(keep), dtype=wp.int32, device=device),
         camera_count=len(cameras),
         device=device,

@@ -68,7 +68,7 @@ def image_border(camera: Camera, points: int = _EDGE) -> np.ndarray:
     """Points (4 points, 2) along the border of an image, clockwise from its top left corner [px]."""
     along = np.arange(points) / points
     sides = [(along, 0 * along), (0 * along + 1, along), (1 - along, 0 * along + 1), (0 * along, 1 - along)]
-    return np.concatenate([np.column_stack(side) for side in sides]) * (camera.width, camera.height)
+    return np.concatenate([np.column_stack(side) for side in sides]) * camera.resolution
 
 
 def footprint(camera: Camera, height: float, most: float) -> tuple[np.ndarray, np.ndarray]:
@@ -107,8 +107,8 @@ def _nearest(row: CameraRow, azimuth: float, elevation: float, up: tuple[float, 
         middle = (near + far) / 2.0
         (camera,) = make_cameras(Rig.of(Cameras(), (replace(row, pose=pose(middle)),)))
         pixels, depth = project(camera, np.array(sizes.corners))
-        border = _BORDER * np.array((camera.width, camera.height))
-        fits = (depth > 0.0).all() and (pixels >= border).all() and (pixels <= (camera.width, camera.height) - border).all()
+        border = _BORDER * np.array(camera.resolution)
+        fits = (depth > 0.0).all() and (pixels >= border).all() and (pixels <= camera.resolution - border).all()
         near, far = (near, middle) if fits else (middle, far)
     return pose(far)
 

@@ -144,7 +144,7 @@ class CellScene:
 
 def scaled_down(camera: Camera, most: int = _PIXELS) -> Camera:
     """The same camera with smaller images, whose longest side is `most` [px]; smaller ones stay as they are."""
-    scale = most / max(camera.width, camera.height)
+    scale = most / max(camera.resolution)
     if scale >= 1.0:
         return camera
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))

@@ -125,7 +125,7 @@ def _draw_camera_view(scene: CellScene, rig: Rig, index: int, camera: Camera) ->
     """What a camera sees of the cell with its first bin, in its colour, with what it covers in three lines; on the gripper also of that."""
     picture = scene.render(scaled_down(camera), 0 if rig.moves(index) else -1).color
     name = f"{rig.names[index]} (on the gripper)" if rig.moves(index) else rig.names[index]
-    scale = _PANEL / max(camera.width, camera.height)
+    scale = _PANEL / max(camera.resolution)
     size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
     picture = cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC if scale > 1.0 else cv2.INTER_AREA)
     cv2.rectangle(picture, (0, 0), (size[0] - 1, size[1] - 1), _color(index), 3)

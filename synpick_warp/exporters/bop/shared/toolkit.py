@@ -124,10 +124,10 @@ def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalo
         "SENSORS": list(layout.sensors),
         "OBJ_IDS": [entry.obj_id for entry in entries],
         "SYMMETRIC_OBJ_IDS": [entry.obj_id for entry in entries if entry.symmetries_discrete or entry.symmetries_continuous],
-        "IM_SIZE": (cameras[0].width, cameras[0].height),
+        "IM_SIZE": cameras[0].resolution,
         "RGB_EXT": f".{color_format}",
     }
-    sizes = {sensor: (camera.width, camera.height) for sensor, camera in zip(layout.sensors, cameras, strict=False)}
+    sizes = {sensor: camera.resolution for sensor, camera in zip(layout.sensors, cameras, strict=False)}
     body = _BODY
     kinds = [[name for name, kind in (("rgb", COLOR), ("depth", DEPTH)) if rig.writes(camera, kind)] for camera in range(len(rig))]
     if any(own != ["rgb", "depth"] for own in kinds):

@@ -26,7 +26,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     segment_of,
     triangle_normal,
 )
-from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views, variant_of
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 AnyCrowd = Any
@@ -261,13 +261,8 @@ class FewBodies:
     words: int
 
 
-@wp.struct
-class ManyBodies:
-    """Marks views whose bodies take several words of `ViewBodies.body_mask`."""
-
-    words: int
-
-
+ManyBodies = variant_of(FewBodies, "ManyBodies")
+"""Marks views whose bodies take several words of `ViewBodies.body_mask`."""
 VARIANTS["crowd"] = FewBodies, ManyBodies
 
 
