@@ -28,12 +28,18 @@ class Figure(NamedTuple):
     source: str
 
 
-_UNKNOWN_NOISE = Figure(0.08, ASSUMED, "a usual figure for well textured surfaces; the manufacturer states depth errors only")
-_FRACTION = Figure(1 / 32, ASSUMED, "five fractional bits, as in librealsense's disparity format")
-_SEARCH = Figure(126.0, PUBLISHED, "disparities that are searched, which give the least distance f b / 126 (librealsense, issue 3039)")
 _MIDDLE = "middle of the image"
-_RAGGED = Figure(0.5, ASSUMED, "as of other sensors that match windows (Handa et al., 2014)")
 _FRAMES = "ten frames of YCB-Video (tools/reports/sensor)"
+_D400 = {
+    "disparity_noise": Figure(0.08, ASSUMED, "a usual figure for well textured surfaces; the manufacturer states depth errors only"),
+    "disparity_step": Figure(1 / 32, ASSUMED, "five fractional bits, as in librealsense's disparity format"),
+    "max_disparity": Figure(
+        126.0, PUBLISHED, "disparities that are searched, which give the least distance f b / 126 (librealsense, issue 3039)"
+    ),
+    "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
+    "lateral_noise": Figure(0.5, ASSUMED, "as of other sensors that match windows (Handa et al., 2014)"),
+}
+"""Figures of all sensors of this series."""
 _ABOVE = Figure(1.0, ASSUMED, "within the range in which noise is below 3 mm")
 
 SENSORS: dict[str, dict[str, Figure]] = {
@@ -43,11 +49,7 @@ SENSORS: dict[str, dict[str, Figure]] = {
         "center": Figure((640.0, 360.0), ASSUMED, _MIDDLE),
         "height": _ABOVE,
         "baseline": Figure(0.050, ASSUMED, "of the D400 series' data sheet, as quoted by others"),
-        "disparity_noise": _UNKNOWN_NOISE,
-        "disparity_step": _FRACTION,
-        "max_disparity": _SEARCH,
-        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
-        "lateral_noise": _RAGGED,
+        **_D400,
     },
     "d415": {
         "resolution": Figure((1280, 720), PUBLISHED, "full depth image"),
@@ -55,11 +57,7 @@ SENSORS: dict[str, dict[str, Figure]] = {
         "center": Figure((640.0, 360.0), ASSUMED, _MIDDLE),
         "height": _ABOVE,
         "baseline": Figure(0.055, ASSUMED, "of the D400 series' data sheet, as quoted by others"),
-        "disparity_noise": _UNKNOWN_NOISE,
-        "disparity_step": _FRACTION,
-        "max_disparity": _SEARCH,
-        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
-        "lateral_noise": _RAGGED,
+        **_D400,
     },
     "d455": {
         "resolution": Figure((1280, 800), PUBLISHED, "full colour image"),
@@ -67,11 +65,7 @@ SENSORS: dict[str, dict[str, Figure]] = {
         "center": Figure((629.6, 398.0), MEASURED, "as focal, with 0.5 added"),
         "height": _ABOVE,
         "baseline": Figure(0.095, ASSUMED, "as commonly stated; not found in a document of the manufacturer"),
-        "disparity_noise": _UNKNOWN_NOISE,
-        "disparity_step": _FRACTION,
-        "max_disparity": _SEARCH,
-        "distances": Figure((0.1, 10.0), ASSUMED, "no other limit than max_disparity is near"),
-        "lateral_noise": _RAGGED,
+        **_D400,
     },
     "xtion": {
         "resolution": Figure((640, 480), PUBLISHED, "depth image"),

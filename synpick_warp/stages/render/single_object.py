@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from synpick_warp.stages.arrays import allocate, allocate_struct
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.raster import Rasterizer
-from synpick_warp.stages.render.scene import RenderScene, build_grid
+from synpick_warp.stages.render.scene import RenderScene, blank_scene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, first_views, set_up_views
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -29,17 +30,12 @@ def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camer
         cameras: Cameras of one image size.
         device: Device of the arrays.
     """
-    return RenderScene(
+    return replace(
+        blank_scene(len(cameras), *cameras[0].resolution, device),
         meshes=meshes,
-        surfaces=None,
-        cameras=build_cameras(tuple(cameras), device),
-        lights=None,
+        cameras=build_cameras(cameras, device),
         table=Table(),
-        paths=None,
-        grid=build_grid(*cameras[0].resolution),
         obj_id=wp.zeros(len(keep), dtype=wp.int32, device=device),
-        camera_count=len(cameras),
-        device=device,
         keep=keep,
     )
 
