@@ -20,7 +20,7 @@ from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
-from synpick_warp.stages.view_ring import CameraGroup, Placements, ViewRing
+from synpick_warp.stages.view_ring import CameraGroup, ViewExtrinsics, ViewRing
 from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch, most_words
 
 OWN_ARRAYS = 6
@@ -236,7 +236,7 @@ def split_views(
 
 def describe_batches(
     group: CameraGroup, report: TickReport, world: np.ndarray, camera: np.ndarray, *known: Any, cameras: EpisodeCameras | None
-) -> Iterator[tuple[slice, bool, Placements]]:
+) -> Iterator[tuple[slice, bool, ViewExtrinsics]]:
     """The batches of `split_views`, and in each the views by `describe_views`, with their cameras in the tick before."""
     for part, wide in split_views(group, report, world, camera, cameras):
         views = describe_views(report, world[part], camera[part], *known, cameras)

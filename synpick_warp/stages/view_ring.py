@@ -63,7 +63,7 @@ def view_sizes(render: Render, rig: Rig, worlds: int, objects: int, device: wp.D
     return sizes if rig.bends(cameras) else sizes | {"mask_word": share_words(views, objects, *size)}
 
 
-Placements = tuple[dict[str, Any], Mapping[str, Any]]
+ViewExtrinsics = tuple[dict[str, Any], Mapping[str, Any]]
 """Matrix, rotation and translation of the cameras of views as `FrameBatch` has them, in this frame and in the one before."""
 
 
@@ -111,7 +111,9 @@ class CameraGroup:
             now.lenses = allocate_lenses(self.sizes, scene.device)
         return now, last if self.moves else now
 
-    def write_views(self, lists: wp.array, world: np.ndarray, camera: np.ndarray, made: tuple[Any, Any] | None, placed: Placements) -> Any:
+    def write_views(
+        self, lists: wp.array, world: np.ndarray, camera: np.ndarray, made: tuple[Any, Any] | None, placed: ViewExtrinsics
+    ) -> Any:
         """The struct `Views` of views of these cameras (world, camera), whose indices are written to `lists` (3, view) int32.
 
         Args:
@@ -203,7 +205,7 @@ class ViewRing:
         self._next = 0
 
     def launch(
-        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, placed: Placements, wide: bool = False
+        self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, streams: RenderStreams, placed: ViewExtrinsics, wide: bool = False
     ) -> int:
         """Render the views (world, camera) of a snapshot into the next slot, then start to encode and copy the images; returns the slot.
 
