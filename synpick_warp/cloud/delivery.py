@@ -229,12 +229,10 @@ class WatchedProgress(ForwardingProgress):
         self._check, self._ended = check, ended
 
     def stage(self, text: str) -> None:
-        """See `Progress`."""
         self._check()
         super().stage(text)
 
     def update(self, **counts: Any) -> None:
-        """See `Progress`."""
         self._check()
         before = {"episodes_done": len(self._ended.episodes), "episodes": self._ended.total, "views": self._ended.views}
         super().update(**counts | {name: count + counts[name] for name, count in before.items()})

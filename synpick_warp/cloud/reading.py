@@ -294,7 +294,6 @@ class StoreDataSet(DataSet):
 
     @cached_property
     def splits(self) -> dict[str, DataSet]:
-        """See `DataSet`."""
         named: dict[str, DataSet] = {split.name: StoreDataSet(self._cache, episode_range(split)) for split in self.config.splits}
         return named or {self.config.bop.split: self}
 
@@ -356,11 +355,9 @@ class _Blocks(io.RawIOBase):
         self._blocks, self._held = blocks, memoryview(b"")
 
     def readable(self) -> bool:
-        """See `io.RawIOBase`."""
         return True
 
     def readinto(self, buffer: Any) -> int:
-        """See `io.RawIOBase`."""
         self._held = self._held or memoryview(next(self._blocks, b""))
         count = min(len(buffer), len(self._held))
         buffer[:count], self._held = self._held[:count], self._held[count:]

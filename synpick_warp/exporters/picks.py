@@ -33,7 +33,6 @@ class PicksExporter(EpisodeExporter[_Tables]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         return SharedFiles((), (), (STATES_FOLDER, FOLDER))
 
     def write_constants(self) -> list[Path]:
@@ -44,7 +43,6 @@ class PicksExporter(EpisodeExporter[_Tables]):
         return []
 
     def write_picks(self, batch: PickBatch) -> None:
-        """See `Exporter`."""
         content = self._staged(batch.episode, _make_content).content
         content.append((make_rows(COLUMNS, batch.trials), make_rows(STATES, batch.states)))
 

@@ -58,7 +58,6 @@ class EpisodeExporter(Exporter, Generic[_Content]):
     """Name of the format's folder in `PARTIAL`."""
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         self._staging = context.out / PARTIAL / self.staging
         self._episodes: dict[int, StagedEpisode[_Content]] = {}

@@ -77,7 +77,6 @@ class CheckModel:
     obj_id: int | None
 
     def __call__(self, state: TaskState) -> TaskResult:
-        """See `ValidationTask`."""
         folder = state.models(self.folder)
         return TaskResult(list(apply_rules(folder if self.obj_id is None else ModelSubject(folder, self.obj_id))))
 
@@ -100,7 +99,6 @@ class CheckScene:
     targets: dict[str, Any] = field(default_factory=dict)
 
     def __call__(self, state: TaskState) -> TaskResult:
-        """See `ValidationTask`."""
         scene = state.scene(self.ref, self.targets)
         violations: list[Violation] = []
         deviations: list[tuple[str, int, float]] = []
@@ -129,7 +127,6 @@ class CheckRig:
     cameras: int
 
     def __call__(self, state: TaskState) -> TaskResult:
-        """See `ValidationTask`."""
         scenes = tuple(SceneSubject(state.layout, open_scene(state.layout, ref)) for ref in self.refs)
         return TaskResult(list(apply_rules(RigSubject(self.refs[0].place, scenes, self.cameras))))
 
@@ -141,7 +138,6 @@ class CheckPicks:
     index: int
 
     def __call__(self, state: TaskState) -> TaskResult:
-        """See `ValidationTask`."""
         from synpick_warp.apps.validation.rules.trials import PicksSubject
 
         violations = []

@@ -47,7 +47,6 @@ class BopExporter(SceneExporter):
     has_graph = True
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         points = {obj_id: make_category_keys(keypoints) for obj_id, keypoints in self._keypoints.items()}
         names = context.names.items()

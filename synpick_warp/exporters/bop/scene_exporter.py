@@ -60,7 +60,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     """Whether the format has scene graphs."""
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         settings, bop = context.settings, context.settings.bop
         self._out = context.out

@@ -73,7 +73,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
     staging = FOLDER.name
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         settings, rig = context.settings, context.settings.rig
         known = (video_rate(settings.physics), context.names, settings.bins[0].noun)
@@ -87,7 +86,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         videos = video_folders(layout.names)
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
         return SharedFiles(note_files(layout), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
@@ -105,7 +103,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
             return write_notes(context.out, context.settings, self._settings.objects, context.cameras)
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`."""
         tasks = []
         for view in range(len(batch)):
             index, camera, frame = (int(column[view]) for column in (batch.episode, batch.camera, batch.frame))
@@ -125,7 +122,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         self._context.pool.submit_all(tasks)
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
             self._staged(index, _make_content).content.ticks += row.tobytes()
 

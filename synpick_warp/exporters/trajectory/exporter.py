@@ -53,7 +53,6 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
     staging = "trajectory"
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         settings = context.settings
         self._settings = TrajectorySettings(
@@ -71,7 +70,6 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 
     def write_constants(self) -> list[Path]:
@@ -86,7 +84,6 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         return [path.relative_to(context.out) for path in written]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
         indices = batch.episode.tolist()
         episodes = [self._staged(index, partial(self._make_content, batch, world)) for world, index in enumerate(indices)]
         self._context.pool.submit_all(self._spool(batch, episodes))

@@ -35,7 +35,6 @@ class UsdExporter(EpisodeExporter[TickSpool]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     def write_constants(self) -> list[Path]:
@@ -53,7 +52,6 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`."""
         make_spool = partial(_make_spool, batch.object_id.shape[1])
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._staged(index, make_spool).content

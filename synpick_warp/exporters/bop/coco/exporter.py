@@ -40,7 +40,6 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """See `SceneExporter`."""
         return True
 
     @staticmethod
@@ -50,7 +49,6 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         places = tuple(map(annotation_file, layout.folders))
         return SharedFiles((CATEGORIES, *note_files(layout)), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 

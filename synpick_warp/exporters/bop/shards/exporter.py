@@ -50,7 +50,6 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         splits = ShardsExporter.folders(layout)
         return SharedFiles(constant_files(layout), (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 

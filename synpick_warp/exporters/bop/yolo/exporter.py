@@ -26,7 +26,6 @@ class YoloExporter(SceneExporter):
     write_view = staticmethod(write_view)
 
     def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
         super().__init__(context)
         classes = tuple(sorted(context.names))
         self._views = tuple(dataclasses.replace(view, classes=classes) for view in self._views)
@@ -38,7 +37,6 @@ class YoloExporter(SceneExporter):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """See `Exporter`."""
         splits = tuple(FOLDER / kind / split for kind in CONTENTS for split in layout.folders)
         return SharedFiles((DATA, *note_files(layout)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
 
