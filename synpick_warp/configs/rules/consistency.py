@@ -24,7 +24,6 @@ _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
 """Regular expression of valid bin names: identifiers, as USD needs for prims, that are not the name of another kind of bin."""
 _MIN_COMPARTMENT = 0.03
 """Least length and width of a compartment [m]."""
-_BITS = 32
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
 

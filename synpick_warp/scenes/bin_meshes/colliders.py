@@ -29,8 +29,6 @@ TOLERANCE = 2e-3
 MAX_TOLERANCE = 4e-3
 MAX_PIECES = 64
 """Maximum number of collision shapes of a bin; the cost of the broad phase grows with the square of the shapes of a world."""
-MAX_VERTICES = 64
-"""Vertices of a collision shape."""
 FACET_ANGLE = np.radians(30.0)
 """Largest angle of a face to the first face of its facet."""
 STEEP = 0.7

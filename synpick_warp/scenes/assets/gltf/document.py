@@ -33,7 +33,6 @@ GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 _IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
-_ATTRIBUTES = ("POSITION", "NORMAL", "COLOR_0", "TEXCOORD_", "JOINTS_", "WEIGHTS_")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
