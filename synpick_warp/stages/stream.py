@@ -240,8 +240,10 @@ def describe_batches(
     """The batches of `split_views`, and in each the views by `describe_views`, with their cameras in the tick before."""
     for part, wide in split_views(group, report, world, camera, cameras):
         views = describe_views(report, world[part], camera[part], *known, cameras)
-        shaft = report.snapshot.last_fixture_pose[world[part], SHAFT]
-        yield part, wide, (views, {} if cameras is None else cameras.of_views(views["episode"], camera[part], shaft))
+        last: dict[str, np.ndarray] = {}
+        if cameras is not None:
+            last = cameras.of_views(views["episode"], camera[part], report.snapshot.last_fixture_pose[world[part], SHAFT])
+        yield part, wide, (views, last)
 
 
 @dataclass(eq=False)

@@ -120,15 +120,15 @@ class CameraGroup:
             made: As of `allocate_cameras`; written.
             placed: What its cameras are set to.
         """
-        slot, cameras = self.slots(camera), self.renderer.scene.cameras
+        slot = self.slots(camera)
         padded = np.zeros(lists.shape, np.int32)
         padded[1] = self.cameras[0]
         padded[:, : len(world)] = world, camera, slot
         lists.assign(padded)
         if made is not None:
-            place_cameras(made[0], cameras, slot, placed[0], self.lenses)
+            place_cameras(made[0], self.renderer.scene.cameras, slot, placed[0], self.lenses)
             if self.moves:
-                place_cameras(made[1], cameras, slot, placed[1])
+                place_cameras(made[1], self.renderer.scene.cameras, slot, placed[1])
         return make_views(lists[0], lists[1], len(world), self.sizes["instance"], slot=lists[2])
 
 
