@@ -221,7 +221,7 @@ class BatchRing:
             world: World of each view (B) int32, at most `views`.
             camera: Camera of each view (B) int32.
             host: For `ViewBatch.host`.
-            last: As of `stream.last_cameras`.
+            last: Their cameras in the tick before, as in `ViewExtrinsics`.
             wide: As of `ViewRing.launch`.
         """
         slot, cameras, count = self.slots[self._next], self._cameras[self._next], len(world)
