@@ -131,6 +131,7 @@ def test_all_that_writers_produce_is_described():
     groups = CONSTANT_GROUPS | EPISODE_GROUPS
     arrays = {name for group in groups.values() for name in group.arrays}
     assert arrays | set(groups) <= described("Zarr trajectories")
+    assert {column.name for column in (*COLUMNS, *STATES)} <= described("Picks")
 
 
 class TestPicksContract(ExporterContract):
