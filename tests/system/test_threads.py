@@ -6,6 +6,7 @@ import contextlib
 import gc
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import numpy as np
@@ -42,13 +43,8 @@ def waiting_thread(name: str) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("name", "only"),
     [
-        ("pixels_0", True),
-        ("copies_3", True),
-        ("setup_0", True),
-        ("bake link", True),
-        ("zarr_io", True),
-        ("copies_worker", False),
-        ("loader", False),
+        *((name, True) for name in ("pixels_0", "copies_3", "setup_0", "bake link", "zarr_io")),
+        *((name, False) for name in ("copies_worker", "loader")),
     ],
 )
 def test_unknown_threads_may_launch_kernels(name, only):
@@ -66,18 +62,12 @@ def test_reading_a_zarr_array_starts_harmless_threads(tmp_path):
     assert threads.is_only_launcher()
 
 
-def test_progress_bars_launch_nothing():
+def test_progress_bars_launch_nothing_and_another_thread_sees_the_main_thread_as_a_launcher():
     with rich.progress.Progress(disable=False):
         assert threading.active_count() > 1
         assert threads.is_only_launcher()
-
-
-def test_another_thread_sees_the_main_thread_as_a_launcher():
-    found: list[bool] = []
-    thread = threading.Thread(target=lambda: found.append(threads.is_only_launcher()))
-    thread.start()
-    thread.join()
-    assert found == [False]
+    with ThreadPoolExecutor(1) as other:
+        assert not other.submit(threads.is_only_launcher).result()
 
 
 def test_a_parallel_map_keeps_the_order_and_raises_the_first_items_error(monkeypatch):
