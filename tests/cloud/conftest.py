@@ -21,7 +21,6 @@ from tests.builders import once
 from tests.harness import scripted_bake
 
 EPISODES = 4
-Application = Callable[[dict[str, Any], Callable[..., Any]], Any]
 
 
 def tiny(episodes: int = EPISODES, formats: tuple[str, ...] = ("bop", "shards")):

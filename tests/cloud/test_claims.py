@@ -140,12 +140,12 @@ def test_an_error_ends_the_heartbeat_of_a_chunk(memory, monkeypatch):
     monkeypatch.setattr(Ledger, "done", fail)
     store = open_store(memory)
     chunks = Chunks(Ledger(store, tiny(), Probe(0.0, True)), Claims(store, 0.0), [range(4)], 4)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match="no answer"):
         next(iter(chunks))
     monkeypatch.undo()
     (chunk,) = itertools.islice(Chunks(chunks._ledger, Claims(store, 1_000.0), [range(4)], 4), 1)
     monkeypatch.setattr(store, "put", fail)
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match="no answer"):
         chunks.done(chunk)
     assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 

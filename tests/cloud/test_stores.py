@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import threading
 from http.server import ThreadingHTTPServer
 from pathlib import Path
@@ -20,7 +21,7 @@ from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import Probe, open_store, probe
 from tests.builders import mistake
-from tests.cloud.conftest import stored, tiny, together
+from tests.cloud.conftest import stored, tiny
 from tests.harness import scripted_bake
 
 
@@ -86,12 +87,6 @@ def test_a_second_server_without_compare_and_swap_is_told_and_takes_shares(tmp_p
     assert stored(url) == local
     server.shutdown()
     server.server_close()
-
-
-def test_of_many_that_create_one_wins(memory):
-    store, won = open_store(memory), []
-    together(*(lambda me=me: won.append(store.create("claim", b"%d" % me)) for me in range(16)))
-    assert sum(tag is not None for tag in won) == 1
 
 
 @pytest.mark.parametrize("fault", ["500 InternalError", "503 SlowDown", "lost"])
@@ -225,10 +220,9 @@ def test_a_place_is_a_folder_or_a_prefix(place, found):
     ],
 )
 def test_a_place_of_another_form_is_one_line(place, said):
-    with pytest.raises(StoreError) as error:
+    with pytest.raises(StoreError, match=re.escape(said)) as error:
         parse_place(place)
-    assert said in str(error.value)
-    assert len(str(error.value).splitlines()) == 1
+    assert "\n" not in str(error.value)
 
 
 SECRET = "hunter2hunter2"
@@ -266,24 +260,11 @@ def test_no_message_shows_a_secret_of_the_environment(scheme, server, monkeypatc
         assert SECRET not in str(caught.value)
 
 
-ADDRESSES = (
-    "http://[::1",
-    "http://[x]",
-    "http://h:99999",
-    "http://h st",
-    "http://",
-    "http:///x",
-    "http://h:p",
-    "http://h:0",
-    "h:9",
-    " http://h",
-    "http://h\n",
-)
+ADDRESSES = ["http://[::1", "http://[x]", "http://h:99999", "http://h st", "http://", "http:///x", "http://h:p", "http://h:0", "h:9"]
+ADDRESSES += [" http://h", "http://h\n", "http://ä", "ftp://h", "http://h#f", "http://%zz", f"http://u:{SECRET}@h", f"http://h?{SECRET}"]
 
 
-@pytest.mark.parametrize(
-    "address", [*ADDRESSES, "http://ä", "ftp://h", "http://h#f", "http://%zz", f"http://u:{SECRET}@h", f"http://h?{SECRET}"]
-)
+@pytest.mark.parametrize("address", ADDRESSES)
 @pytest.mark.parametrize("name", ["AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT", "AZURE_STORAGE_ENDPOINT", "AZURE_ENDPOINT"])
 def test_a_malformed_endpoint_is_one_line(name, address, server, monkeypatch, capfd):
     """Of which obstore panics, in a class that is no Exception, and prints a stack."""
