@@ -15,7 +15,7 @@ scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
 from synpick_warp.errors import ConfigError  # noqa: E402
 from synpick_warp.system.hardware.device import pick_device  # noqa: E402
 from tools.reports.real import training  # noqa: E402
-from tools.reports.real.__main__ import check_ids, interval, make_options, recipe_of, source_of  # noqa: E402
+from tools.reports.real.__main__ import check_ids, interval, make_options, source_of  # noqa: E402
 from tools.reports.real.training import (  # noqa: E402
     Recipe,
     ResidualNetwork,
@@ -182,8 +182,3 @@ def test_images_and_objects_that_networks_cannot_have_are_named():
     assert source_of(options, 0, pick_device("cpu")).config.rig.sizes[0] == (400, 384)
     with pytest.raises(ConfigError, match="obj_id 22; allowed here: 1 to 21"):
         check_ids([np.zeros((2, 2), np.uint8), np.full((3, 2), 22, np.uint8)])
-
-
-def test_the_command_lines_defaults_are_the_recipes():
-    made = recipe_of(make_options().parse_args(["--real", "frames"]))
-    assert made == Recipe(views=24_000, passes=4.0, batch=16, width=64, seconds=280.0, capacity=24_000, half=0.7, dice=1.0, crop=0.5)
