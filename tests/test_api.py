@@ -84,10 +84,8 @@ def test_a_config_is_taken_as_it_is(tmp_path, calls):
         synpick_warp.bake(config, tmp_path, {"bake.mode": "move"})
 
 
-@pytest.mark.parametrize(
-    ("shard", "said"), [((2, 2), "shard is 2/2; allowed"), ((0, 0), "shard is 0/0"), ((5, 8), "shard 5/8 has none of 2 episodes")]
-)
-def test_a_shard_without_episodes_leaves_no_folder(tmp_path, shard, said):
-    with pytest.raises(synpick_warp.ConfigError, match=said):
-        synpick_warp.bake("smoke", tmp_path / "set", shard=shard)
+def test_a_shard_without_episodes_leaves_no_folder(tmp_path):
+    for shard, said in (((2, 2), "shard is 2/2; allowed"), ((0, 0), "shard is 0/0"), ((5, 8), "shard 5/8 has none of 2 episodes")):
+        with pytest.raises(synpick_warp.ConfigError, match=said):
+            synpick_warp.bake("smoke", tmp_path / "set", shard=shard)
     assert not (tmp_path / "set").exists()

@@ -1,8 +1,9 @@
-"""Bakes from settings to files: the same bytes every time, truth that fits the images, and what is left when something fails."""
+"""Bakes from settings to files: the same bytes every time, truth that fits the images, grasp trials, what is left when something fails."""
 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Mapping
@@ -10,24 +11,26 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet as parquet
 import pytest
 
+from synpick_warp.apps.validation.registry import Level
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.cli import main as commands
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.errors import OutputError
+from synpick_warp.errors import ConfigError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.writing.png import frame_depth_png
-from synpick_warp.factory import pipeline
+from synpick_warp.factory import picks, pipeline
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, once
+from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, failing_after, once
 from tests.harness.exporter_contract import digests
-from tests.twins.depth_png import encode_depth
+from tests.worlds.sights import BRIEF
 from tests.worlds.small_worlds import QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
@@ -38,10 +41,6 @@ TINY = STIRRING | {
     "cameras.resolution": [WIDTH, HEIGHT],
     "render.views_per_batch": CAMERAS,
 }
-
-
-def tiny(**overrides: object):
-    return settings(**TINY | {key.replace("__", "."): value for key, value in overrides.items()})
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -68,12 +67,6 @@ class Baked:
 
 def truth(scene: Path, name: str) -> dict[int, object]:
     return {int(number): record for number, record in json.loads((scene / f"{name}.json").read_text()).items()}
-
-
-def mask(scene: Path, kind: str, view: int, instance: int) -> np.ndarray:
-    image = cv2.imread(str(scene / kind / f"{view:06d}_{instance:06d}.png"), cv2.IMREAD_UNCHANGED)
-    assert set(np.unique(image)) <= {0, 255}
-    return image > 0
 
 
 @pytest.fixture(scope="module")
@@ -140,13 +133,6 @@ def test_every_episode_has_a_scene_for_each_camera_and_every_frame_its_files(bak
     assert [path.name for path in baked.out.iterdir() if path.name.startswith(".")] == []
 
 
-def test_depth_files_are_those_of_the_device(baked):
-    for scene in baked.scenes():
-        for path in sorted((scene / "depth").iterdir()):
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            assert path.read_bytes() == frame_depth_png(encode_depth(image), WIDTH, HEIGHT)
-
-
 def test_the_list_of_episodes_is_right(baked):
     rows = [json.loads(line) for line in (baked.out / "episodes.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == list(range(EPISODES))
@@ -188,40 +174,12 @@ def test_all_cameras_tell_the_same_poses_in_the_world(baked):
         assert (views[..., 2] > -1).all()
 
 
-def test_counts_and_boxes_are_those_of_the_masks(baked):
-    for scene in baked.scenes():
-        for view, records in truth(scene, "scene_gt_info").items():
-            depth = cv2.imread(str(scene / "depth" / f"{view:06d}.png"), cv2.IMREAD_UNCHANGED)
-            for instance, record in enumerate(records):
-                whole, visible = mask(scene, "mask", view, instance), mask(scene, "mask_visib", view, instance)
-                assert record["px_count_visib"] == visible.sum()
-                assert record["px_count_valid"] == (whole & (depth > 0)).sum()
-                # What lies beyond the border counts as well.
-                assert record["px_count_all"] >= whole.sum()
-                share = record["px_count_visib"] / record["px_count_all"] if record["px_count_all"] else 0.0
-                assert record["visib_fract"] == pytest.approx(share, abs=1e-6)
-                if visible.any():
-                    rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
-                    # As the toolkit measures: from the first to the last pixel.
-                    assert record["bbox_visib"] == [columns[0], rows[0], np.ptp(columns), np.ptp(rows)]
-
-
-def test_visible_masks_are_disjoint_and_inside_the_masks(baked):
-    seen = 0
-    for scene in baked.scenes():
-        for view, records in truth(scene, "scene_gt").items():
-            visible = [mask(scene, "mask_visib", view, instance) for instance in range(len(records))]
-            assert np.sum(visible, axis=0).max() <= 1
-            for instance, part in enumerate(visible):
-                assert not (part & ~mask(scene, "mask", view, instance)).any()
-                seen += int(part.any())
-    assert seen > 0.8 * sum(len(records) for scene in baked.scenes() for records in truth(scene, "scene_gt").values())
-
-
-def test_an_instance_keeps_its_object_through_the_episode(baked):
-    for scene in baked.scenes():
-        objects = {tuple(record["obj_id"] for record in records) for records in truth(scene, "scene_gt").values()}
-        assert len(objects) == 1
+def test_counts_boxes_masks_depth_and_objects_agree(baked):
+    """By the rules that find each fault of tests/validation/faults.py."""
+    summary = Summary()
+    found = validate(baked.out, ValidationOptions(threads=1), summary)
+    assert [each for each in found if each.level is Level.ERROR] == []
+    assert summary.views == baked.summary.views
 
 
 # ---- picking ----
@@ -324,7 +282,7 @@ def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
     monkeypatch.setattr(BopExporter, "write_views", failing)
     out = tmp_path / "set"
     with pytest.raises(OutputError, match="no more"):
-        run_bake(tiny(render__views_per_batch=CAMERAS), out, SilentProgress())
+        Baked(out)
     split = out / baked.config.bop.split
     for scene in sorted(split.iterdir()) if split.exists() else []:
         whole = {path.relative_to(scene) for path in scene.rglob("*")}
@@ -334,16 +292,14 @@ def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
     assert "episodes.jsonl" not in names
 
 
-def arguments(**overrides: object) -> list[str]:
-    given = QUICK | TINY | {key.replace("__", "."): value for key, value in overrides.items()}
-    return ["--config", "smoke", *assignments(given)]
+COMMAND = ["--config", "smoke", *assignments(QUICK | TINY)]
 
 
 def test_episodes_that_are_given_up(tmp_path, capsys):
     """One arrangement without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
     out = tmp_path / "set"
-    given = arguments(settle__max_time=0.1, settle__tries=1, bake__episodes=2)
-    assert commands.main(["bake", "--out", str(out), *given]) == commands.EXIT_INCOMPLETE
+    given = assignments({"settle.max_time": 0.1, "settle.tries": 1, "bake.episodes": 2})
+    assert commands.main(["bake", "--out", str(out), *COMMAND, *given]) == commands.EXIT_INCOMPLETE
     capsys.readouterr()
     rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert [(row["episode"], row["ending"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
@@ -359,8 +315,8 @@ def test_drawn_again_and_counted(tmp_path):
         def note(self, text: str) -> None:
             noted.append(text)
 
-    config = tiny(settle__max_time=0.1, settle__tries=2, bake__episodes=1, bake__worlds=1)
-    summary = run_bake(config, tmp_path / "set", Notes())
+    given = TINY | {"settle.max_time": 0.1, "settle.tries": 2, "bake.episodes": 1, "bake.worlds": 1}
+    summary = run_bake(settings(**given), tmp_path / "set", Notes())
     assert (summary.resampled, summary.resampled_by_ending) == (1, {Ending.UNSETTLED: 1})
     assert [(row.episode, row.arrangement, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
     advice = "raise settle.max_time (0.1) or settle.max_redrops (8)"
@@ -371,10 +327,8 @@ def test_drawn_again_and_counted(tmp_path):
 def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys, monkeypatch):
     monkeypatch.setattr(pipeline, "check_disk", lambda *_: None)
     out = small_disk(200) / "set"
-    assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
-    said = capsys.readouterr().err.strip().splitlines()
-    assert said[-1].startswith("synpick-warp: error: cannot write ")
-    assert "No space left on device" in said[-1]
+    assert commands.main(["bake", "--out", str(out), *COMMAND]) == commands.EXIT_MISTAKE
+    assert re.match("synpick-warp: error: cannot write .*No space left on device", capsys.readouterr().err.splitlines()[-1])
     assert list(out.rglob(".*")) == []
 
 
@@ -391,6 +345,76 @@ def test_a_worker_that_fails_ends_the_bake_with_one_line(tmp_path, capsys, monke
 
     out = tmp_path / "set"
     monkeypatch.setattr(BopExporter, "write_views", blocked)
-    assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
-    said = capsys.readouterr().err.strip().splitlines()
-    assert said[-1].startswith("synpick-warp: error: cannot write ")
+    assert commands.main(["bake", "--out", str(out), *COMMAND]) == commands.EXIT_MISTAKE
+    assert capsys.readouterr().err.splitlines()[-1].startswith("synpick-warp: error: cannot write ")
+
+
+# ---- grasp trials ----
+
+
+GIVEN = {key.replace("__", "."): value for key, value in BRIEF.items()} | {
+    "bake.mode": "pick",
+    "bake.worlds": 2,
+    "bake.episodes": 2,
+    "bake.formats": ["bop", "picks"],
+    "arrangement.max_objects": 2,
+    "cameras.resolution": [32, 18],
+    "picks.states": 2,
+    "picks.candidates": 4,
+    "picks.repeats": 2,
+    "picks.near": 0.02,
+    "picks.hold": 0.1,
+    "picks.lift_height": 0.05,
+}
+
+
+@pytest.fixture(scope="module")
+def tried(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("picks") / "set"
+    bake_boxes(folder, GIVEN)
+    return folder
+
+
+def files(folder) -> dict[str, str]:
+    """Digests of what episodes have, but for the tables beside their scenes."""
+    found = {name: digest for name, digest in digests(folder).items() if name.startswith(("train", "picks"))}
+    return {name: digest for name, digest in found.items() if not name.endswith("scene_picks.json")}
+
+
+def test_tables_have_every_trial_and_the_own_grasp_succeeds_as_in_its_episode(tried):
+    for episode in range(GIVEN["bake.episodes"]):
+        table = parquet.read_table(tried / f"picks/{episode:06d}.parquet").to_pydict()
+        states = parquet.read_table(tried / f"picks/states/{episode:06d}.parquet").to_pydict()
+        assert states["state"] == [0, 1]
+        assert states["candidates"] == [4, 4]
+        assert list(zip(table["state"], table["candidate"], table["repeat"], strict=True)) == [
+            (state, candidate, repeat) for state in range(2) for candidate in range(4) for repeat in range(2)
+        ]
+        own = [index for index, candidate in enumerate(table["candidate"]) if candidate == 0]
+        assert all(table["outcome"][index] == Outcome.TARGET_PICKED and table["intended"][index] for index in own)
+        assert all(1 <= held <= 10 for held in table["hits"])
+        assert all((margin > 0) == bool(success) for margin, success in zip(table["margin"], table["success"], strict=True))
+
+
+@pytest.mark.slow
+def test_tables_do_not_depend_on_worlds_nor_on_a_failure(tried, tmp_path, monkeypatch):
+    """Each state is tried by itself, in other numbers of worlds, by a bake that fails in between and is resumed."""
+    monkeypatch.setattr(picks, "BATCH_ROUNDS", 0)
+    other = GIVEN | {"bake.worlds": 1, "picks.worlds": 3}
+    with failing_after(1):
+        bake_boxes(tmp_path / "set", other)
+    assert len(list(tmp_path.glob("set/picks/*.parquet"))) == 1
+    bake_boxes(tmp_path / "set", other)
+    assert files(tmp_path / "set") == files(tried)
+
+
+def test_the_ordinary_data_set_is_the_same_without_trials(tried, tmp_path):
+    bake_boxes(tmp_path / "set", GIVEN | {"bake.formats": ["bop"]})
+    ordinary = {name: digest for name, digest in files(tried).items() if not name.startswith("picks")}
+    assert len(ordinary) > 50
+    assert files(tmp_path / "set") == ordinary
+
+
+def test_episodes_must_pick():
+    with pytest.raises(ConfigError, match=r"bake.formats is .*; allowed: without picks where no episode picks"):
+        load_config("smoke", QUICK | {"bake.mode": "move", "bake.formats": ["picks"]})

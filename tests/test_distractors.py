@@ -1,31 +1,38 @@
-"""Distractors: objects in the pile that are rendered and occlude others, but have no labels and are no targets."""
+"""Distractors, which occlude others, but have no labels and are no targets; and all that can be randomized at once: the same bytes in any
+number of worlds."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 import zarr
 
 import synpick_warp
-from synpick_warp.codes import Ending, Mode, Phase, Stream, Task
+from synpick_warp.codes import Ending, LookKind, Mode, Phase, Stream, Task
 from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.commit.writing import digest_inputs
+from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.build import count_distractor_slots
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.solids import solids
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim import arrange
-from tests.builders import PICKING, bake_boxes, refusal
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import PICKING, bake_boxes, boxes, refusal
 from tests.harness.exporter_contract import digests
 from tests.twins import rng
+from tests.worlds.cells import make_camera
 from tests.worlds.kernel_worlds import arrangement_worlds
+from tests.worlds.model_files import box, put
 from tests.worlds.small_worlds import cluttered_catalog, settings
 
 SEED = 7
@@ -137,16 +144,13 @@ def baked(tmp_path_factory):
     return place
 
 
-def distractors_of(folder, episode: int) -> dict[int, str]:
-    rows = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+def lines(folder: Path, name: str) -> list[dict]:
+    return [json.loads(line) for line in (folder / f"{name}.jsonl").read_text().splitlines()]
+
+
+def distractors_of(folder: Path, episode: int) -> dict[int, str]:
+    rows = lines(folder, "episodes")
     return {one["instance"]: one["name"] for one in rows[episode]["looks"]["distractors"]}
-
-
-@pytest.mark.slow  # `test_randomized_bakes` has distractors among all else.
-def test_bytes_do_not_depend_on_worlds(baked, tmp_path):
-    bake_boxes(tmp_path / "2", GIVEN | {"bake.worlds": 2}, objects=cluttered_catalog)
-    one, two = ({name: value for name, value in digests(folder).items() if "config.toml" not in name} for folder in (baked, tmp_path / "2"))
-    assert {name for name in one if one[name] != two[name]} <= {"manifest.json"}
 
 
 def test_labels_have_no_distractors_but_are_occluded_by_them(baked):
@@ -168,15 +172,14 @@ def test_labels_have_no_distractors_but_are_occluded_by_them(baked):
 
 
 def test_distractors_are_no_targets_and_no_objects_of_attempts(baked):
-    rows = [json.loads(line) for line in (baked / "attempts.jsonl").read_text().splitlines()]
-    assert rows
-    for row in rows:
+    assert lines(baked, "attempts")
+    for row in lines(baked, "attempts"):
         named = distractors_of(baked, row["episode"]).keys()
         seen = {one["instance"] for one in row["observation"]["instances"]}
         votes = {instance for vote in row["observation"]["votes"] for instance in vote[:2]}
         graph = {instance for one in row["observation"]["instances"] for instance in one["above"] + one["ancestors"]}
         assert named.isdisjoint({row["target"]} | seen | votes | graph | set(row["engaged"]) | set(row["picked"]))
-    for row in map(json.loads, (baked / "episodes.jsonl").read_text().splitlines()):
+    for row in lines(baked, "episodes"):
         assert row["objects"] == row["picked"] + row["lost"] + row["left"]
 
 
@@ -212,21 +215,10 @@ def test_inputs_without_distractors_have_the_digest_that_they_had():
 # ---- settings ----
 
 
-def make_folder(folder: Path, *sides: float) -> Path:
-    """A folder of cubes as STL files."""
-    folder.mkdir()
-    for index, side in enumerate(sides):
-        trimesh.creation.box((side, side, side)).export(folder / f"cube_{index}.stl")
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("own", "surfaces"),
-    [(True, 0), (False, 0), (True, 1)],
-)
+@pytest.mark.parametrize(("own", "surfaces"), [(True, 0), (False, 0), (True, 1)])
 def test_distractors_of_no_folder_are_solids(tmp_path, own, surfaces):
     """Household objects look like those of labelled classes, such as the banana of the YCB models."""
-    models = str(make_folder(tmp_path / "own", 0.05)) if own else ""
+    models = str(put(tmp_path / "own" / "cube.stl", box(0.05, 0.05, 0.05, kind="stl")).parent) if own else ""
     loaded = load_catalog(load_config("smoke", {"bake.models": models, "randomize.distractors": 2, "randomize.surfaces": surfaces}))
     assert [body.name for body in loaded.distractors] == [raw.name for raw in solids(surfaces > 0)]
     assert loaded.object_ids.tolist()[len(loaded) :] == [-2 - index for index in range(len(loaded.distractors))]
@@ -245,10 +237,10 @@ def test_distractors_that_look_like_a_labelled_object_are_left_out(tmp_path):
         for name, mesh in meshes.items():
             mesh.export(tmp_path / folder / f"{name}.stl")
     given = {"randomize.distractors": 1, "bake.models": str(tmp_path / "labelled"), "randomize.distractor_models": str(tmp_path / "others")}
-    lines: list[str] = []
-    loaded = load_catalog(load_config("smoke", given | {"objects.concave_ratio": 0.0}), tmp_path / "cache", lines.append)
+    told: list[str] = []
+    loaded = load_catalog(load_config("smoke", given | {"objects.concave_ratio": 0.0}), tmp_path / "cache", told.append)
     assert [body.name for body in loaded.distractors] == ["carton"]
-    said = [line.removeprefix("left out: the distractor ") for line in lines if "labelled" in line and "left out" in line]
+    said = [line.removeprefix("left out: the distractor ") for line in told if "labelled" in line and "left out" in line]
     pairs = [("drill", "drill"), ("fruit", "banana"), ("tool", "drill")]
     assert said == [f"{name}: it looks like {twin}, whose instances are labelled" for name, twin in pairs]
 
@@ -281,16 +273,106 @@ def test_distractors_without_room_are_one_line(given, said):
     assert said in refusal(load_config, "smoke", given)
 
 
-@pytest.mark.parametrize(
-    ("folder", "said"),
-    [
-        ("missing", "missing"),
-        ("empty", "empty"),
-        ("wide", "too large for the tote"),
-    ],
-)
+@pytest.mark.parametrize(("folder", "said"), [("missing", "missing"), ("empty", "empty"), ("wide", "too large for the tote")])
 def test_distractors_that_cannot_be_used_are_one_line(folder, said, tmp_path):
-    make_folder(tmp_path / "empty")
-    make_folder(tmp_path / "wide", 3.0)
+    (tmp_path / "empty").mkdir()
+    put(tmp_path / "wide" / "cube.stl", box(3.0, 3.0, 3.0, kind="stl"))
     config = load_config("smoke", {"randomize.distractors": 1, "randomize.distractor_models": str(tmp_path / folder)})
     assert said in refusal(load_catalog, config)
+
+
+# ---- everything at once ----
+
+
+ANY_COLOR = {"uniform": [[0, 0, 0], [1, 1, 1]]}
+DRAWN: dict[str, Any] = {
+    "object_hue": {"uniform": [-180, 180]},
+    "object_brightness": {"log_uniform": [0.5, 2]},
+    "object_roughness": {"normal": [0.5, 0.2]},
+    "object_metallic": {"choice": [0, 0.9], "weights": [2, 1]},
+    "bin_color": ANY_COLOR,
+    "bin_roughness": {"uniform": [0.2, 0.9]},
+    "bin_metallic": {"choice": [0, 1]},
+    "table_color": ANY_COLOR,
+    "table_roughness": {"uniform": [0.2, 0.9]},
+    "texture_width": {"log_uniform": [0.05, 0.5]},
+    "lamps": {"uniform": [0, 4]},
+    "lamp_variants": 2,
+    "lamp_elevation": {"uniform": [20, 80]},
+    "lamp_radius": {"log_uniform": [1, 10]},
+    "lamp_strength": {"uniform": [0.2, 0.8]},
+    "lamp_temperature": {"choice": [2700, 6500]},
+    "distractors": {"choice": [0, 1, 2]},
+    "surfaces": 3,
+    "exposure": {"normal": [0, 1]},
+}
+CAMERAS = (
+    make_camera(
+        "jittered",
+        (0.0, -0.6, 1.2),
+        (0.0, 0.0, 0.1),
+        resolution=[48, 27],
+        fov=60.0,
+        jitter={
+            "position": {"normal": [0.0, 0.02]},
+            "rotation": {"uniform": [-1.0, 1.0]},
+            "focal_length": {"choice": [-0.02, 0.02]},
+            "center": {"uniform": [-1.0, 1.0]},
+        },
+    ),
+    make_camera("still", (0.0, 0.0, 1.4), (0.0, 0.0, 0.1), resolution=[32, 32], fov=50.0, distortion=[-0.1, 0.05, 0.0, 0.0, 0.0]),
+)
+FOLDERS = ("bin_textures", "table_textures", "background_textures", "distractor_models")
+EVERYTHING = PICKING | {
+    "arrangement.max_objects": 4,
+    "arrangement.upright": 0.5,
+    "bake.episodes": 3,
+    "bake.formats": ["bop", "usd", "zarr"],
+    "bins.shift": [0.05, 0.03],
+    "bins.yaw": 20.0,
+    "effects.exposure_jitter": 0.3,
+    "render.layers": ["albedo", "classes", "depth_sensor"],
+    "render.table_size": [0.9, 0.6],
+    **{f"randomize.{name}": value for name, value in DRAWN.items()},
+}
+
+
+def test_all_settings_and_kinds_of_distributions_are_on():
+    assert {item.name for item in fields(Randomize)} == {*DRAWN, *FOLDERS}
+    kinds = {value.kind for value in vars(settings(**EVERYTHING).randomize).values() if isinstance(value, Distribution)}
+    assert kinds == {kind.name.lower() for kind in LookKind} - {"off", "fixed"}
+
+
+def bake(place: Path, worlds: int) -> dict[str, str]:
+    """Bake boxes; returns the digests of all files but those of settings."""
+    textures = place.parent / "textures"
+    textures.mkdir(exist_ok=True)
+    for index, color in enumerate(((30, 60, 200), (200, 180, 20))):
+        image = np.full((8, 8, 3), color, np.uint8)
+        image[:4] //= 2
+        cv2.imwrite(str(textures / f"{index}.png"), image)
+    folders = {f"randomize.{name}": str(textures) for name in FOLDERS}
+    with boxes(cluttered_catalog):
+        run_bake(replace(settings(**(EVERYTHING | folders | {"bake.worlds": worlds})), camera=CAMERAS), place, SilentProgress())
+    return {name: digest for name, digest in digests(place).items() if not name.endswith(("config.toml", "manifest.json"))}
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory) -> tuple[Path, dict[str, str]]:
+    place = tmp_path_factory.mktemp("randomized") / "1"
+    return place, bake(place, 1)
+
+
+@pytest.mark.parametrize("worlds", [2, pytest.param(8, marks=pytest.mark.slow)])
+def test_bytes_do_not_depend_on_worlds(single, worlds):
+    place, expected = single
+    found = bake(place.with_name(str(worlds)), worlds)
+    assert [name for name in expected if found.get(name) != expected[name]] == []
+    assert found.keys() == expected.keys()
+
+
+def test_episodes_look_different(single):
+    images = [cv2.imread(str(path)).astype(int) for path in sorted(single[0].glob("train/*/rgb/000000.png"))[::2]]
+    assert len(images) == 3
+    for first, second in ((0, 1), (0, 2), (1, 2)):
+        assert np.abs(images[first] - images[second]).mean() > 10

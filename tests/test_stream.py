@@ -1,4 +1,4 @@
-"""From ticks to frame batches: which views, in which order, in which batches, with what in them."""
+"""From ticks to frame batches: which views, in which order, in which batches, with what in them; selections of ticks, waits for copies."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick, tick_batch
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, views_per_batch
 from synpick_warp.system.codecs.jpeg import encode_jpeg
-from synpick_warp.views.frames import FrameBatch
+from synpick_warp.views.frames import FrameBatch, SelectedRows
 from tests.twins.depth_png import encode_depth
 from tests.worlds.small_worlds import settings
 from tests.worlds.toy_scene import even_light, sun
+from tests.worlds.trajectories import ticks
 
 WORLDS, ROOM = 5, 3
 OBJECT_IDS = np.array([4, 7, 11], np.int32)
@@ -278,45 +279,36 @@ def new_record(device) -> TickRecord:
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Observation, Plan)))
 
 
-def test_a_report_outlives_the_next_tick(device):
-    record = new_record(device)
-    record.snapshot.catalog_index.fill_(2)
-    record.status.table.fill_(Phase.ACT)
-    report = read_tick(record)
-    everything = (record.snapshot.catalog_index, record.status.table, record.status.measures, *vars(record.observation).values())
-    for array in (*everything, *vars(record.plan).values()):
-        array.fill_(5)
-    record.snapshot.pose.fill_(wp.transform_identity())
-    assert (report.catalog_index == 2).all()
-    assert report.column("phase").tolist() == [Phase.ACT] * WORLDS
-    assert (report.pose == 0.0).all()
-    assert report.pose.shape == (WORLDS, ROOM, 7)
-    assert not report.measures.any()
-    assert not any(array.any() for part in (report.observation, report.plan) for array in vars(part).values())
-
-
-def test_a_report_has_every_array_under_its_name(device):
-    """Each is filled with a number of its own."""
+def test_a_report_has_every_array_under_its_name_and_outlives_the_next_tick(device):
+    """Each is filled with a number of its own, and with another one afterwards."""
     record = new_record(device)
     parts = {"observation": record.observation, "plan": record.plan}
     given = {(part, name): 2 + number for part, arrays in parts.items() for number, name in enumerate(vars(arrays))}
     for (part, name), number in given.items():
         getattr(parts[part], name).fill_(number)
-    for index in range(len(Measure)):
-        values = record.status.measures.numpy()
-        values[:, index] = np.arange(WORLDS) + 10 * index
-        record.status.measures.assign(values)
+    record.snapshot.catalog_index.fill_(2)
+    record.status.table.fill_(Phase.ACT)
+    measures = np.arange(WORLDS)[:, None] + 10 * np.arange(len(Measure))
+    record.status.measures.assign(measures.astype(np.float32))
     report = read_tick(record)
+    everything = (record.snapshot.catalog_index, record.status.table, record.status.measures)
+    for array in (*everything, *vars(record.observation).values(), *vars(record.plan).values()):
+        array.fill_(99)
+    record.snapshot.pose.fill_(wp.transform_identity())
     for (part, name), number in given.items():
         array = getattr(getattr(report, part), name)
         assert (array == number).all(), name
         assert len(array) == WORLDS
-    assert report.observation.distances.shape == (WORLDS, ROOM, 3)
-    assert report.observation.votes.shape == (WORLDS, ROOM, ROOM)
-    assert report.observation.grasp_pixel.dtype == np.int32
-    assert report.observation.above.dtype == np.uint32
-    assert report.plan.point.shape == (WORLDS, 3)
-    assert report.measure("peak_force").tolist() == list(range(WORLDS))
+    assert (report.catalog_index == 2).all()
+    assert report.column("phase").tolist() == [Phase.ACT] * WORLDS
+    assert report.measure("peak_force").tolist() == [world + 10 * Measure.PEAK_FORCE for world in range(WORLDS)]
+    assert (report.pose == 0.0).all()
+    shapes = {"distances": (3,), "votes": (ROOM,)}
+    assert {name: getattr(report.observation, name).shape for name in shapes} == {
+        name: (WORLDS, ROOM, *rest) for name, rest in shapes.items()
+    }
+    assert (report.pose.shape, report.plan.point.shape) == ((WORLDS, ROOM, 7), (WORLDS, 3))
+    assert (report.observation.grasp_pixel.dtype, report.observation.above.dtype) == (np.int32, np.uint32)
 
 
 def test_a_host_copy_is_the_array_itself_on_the_cpu_and_a_copy_on_a_gpu(device):
@@ -409,3 +401,81 @@ def test_groups_of_cameras_take_turns_in_a_tick(device):
         seen += zip(batch.episode.tolist(), batch.camera.tolist(), strict=True)
     assert ended == [0, 1, 2]
     assert sorted(seen) == sorted(3 * [(20 + world, camera) for world in (0, 1, 4) for camera in range(3)])
+
+
+# ---- selections of ticks ----
+
+
+EPISODES = (0, 2, 4, 6)
+
+
+def test_a_selection_of_a_selection_has_the_rows_of_both():
+    (batch,) = ticks(EPISODES, 1)
+    chosen = batch.select(np.array([3, 1, 0])).select(np.array([2, 0]))
+    assert chosen.episode.tolist() == [0, 6]
+    np.testing.assert_array_equal(chosen.pose, batch.pose[[0, 3]])
+    for own, whole in ((chosen.tick, batch.tick), (chosen.steps, batch.steps)):
+        assert own.keys() == whole.keys()
+        for name, values in whole.items():
+            np.testing.assert_array_equal(own[name], values[[0, 3]], err_msg=name)
+
+
+def test_a_selection_reads_rows_when_they_are_asked_for():
+    arrays = {"speed": np.arange(4.0), "force": np.arange(4.0)}
+    rows = SelectedRows(arrays, np.array([1, 3]))
+    arrays["speed"] += 10.0
+    assert (len(rows), rows["speed"].tolist()) == (2, [11.0, 13.0])
+    rows["speed"][:] = 0.0
+    assert rows["speed"].tolist() == [11.0, 13.0]
+
+
+def test_asking_a_selection_for_a_name_gathers_nothing():
+    class Unread(dict[str, np.ndarray]):
+        def __getitem__(self, name: str) -> np.ndarray:
+            raise AssertionError(f"{name} was read")
+
+    rows = SelectedRows(Unread(speed=np.arange(4.0)), np.array([1]))
+    assert "speed" in rows
+    assert "force" not in rows
+
+
+# ---- waiting for copies ----
+
+
+class FakeEvent:
+    """Stand-in for a CUDA event that is complete after a number of queries."""
+
+    def __init__(self, queries: int) -> None:
+        self.results = itertools.chain(itertools.repeat(False, queries), itertools.repeat(True))
+
+    @property
+    def is_complete(self) -> bool:
+        return next(self.results)
+
+
+def copy_after(queries: int) -> HostCopy:
+    copy = HostCopy([wp.zeros(1, dtype=float, device="cpu")])
+    copy.done = FakeEvent(queries)
+    return copy
+
+
+@pytest.mark.parametrize(("queries", "pauses"), [(0, 0), (3, 3)])
+def test_a_wait_pauses_until_the_copy_is_done(monkeypatch, queries, pauses):
+    synchronized, slept = [], []
+    monkeypatch.setattr(wp, "synchronize_event", synchronized.append)
+    monkeypatch.setattr(host_copies.time, "sleep", slept.append)
+    monkeypatch.setattr(host_copies.time, "monotonic", lambda: 7.0)
+    copy = copy_after(queries)
+    assert copy.wait()[0].tolist() == [0.0]
+    assert slept == [host_copies.PAUSE_SECONDS] * pauses
+    assert synchronized == [copy.done]
+
+
+def test_a_failed_copy_is_reported_though_its_event_is_never_complete(monkeypatch):
+    def fail(_: FakeEvent) -> None:
+        raise RuntimeError("Failed to synchronize event")
+
+    monkeypatch.setattr(wp, "synchronize_event", fail)
+    monkeypatch.setattr(host_copies, "MAX_PAUSED_SECONDS", 0.01)
+    with pytest.raises(RuntimeError, match="Failed"):
+        copy_after(10**9).wait()

@@ -83,8 +83,13 @@ def test_samples_are_views_in_order_with_what_is_visible_enough(folder):
 def test_choices_of_cameras_and_frames(folder):
     views = Views(folder, split="train", cameras=(2,), stride=2)
     assert [(sample["episode"], sample["camera"], sample["frame"]) for sample in views] == [(e, 2, f) for e in EPISODES for f in (0, 2)]
-    for wrong in ({"cameras": (3,)}, {"stride": 0}, {"split": "nowhere"}, {"fields": ("colour",)}):
-        with pytest.raises(DatasetError):
+    for wrong, said in (
+        ({"cameras": (3,)}, "has the cameras 0 to 2"),
+        ({"stride": 0}, "stride 0: at least 1"),
+        ({"split": "nowhere"}, "nowhere"),
+        ({"fields": ("colour",)}, "there is no field colour"),
+    ):
+        with pytest.raises(DatasetError, match=said):
             Views(folder, **wrong)[0]
 
 

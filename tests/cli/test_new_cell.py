@@ -29,16 +29,10 @@ from tests.worlds.model_files import OBJ, exported, put
 K = np.array([[275.0, 0.0, 163.3], [0.0, 274.6, 117.0], [0.0, 0.0, 1.0]])
 """With pixel centres at integers: 163.8, 117.5 here."""
 FIVE = [-0.12, 0.08, 5e-4, -3e-4, 0.01]
-REALSENSE = {"width": 320, "height": 240, "ppx": 163.3, "ppy": 117.0, "fx": 275.0, "fy": 274.6, "model": "brown_conrady", "coeffs": FIVE}
 ZIVID = {
     "CameraMatrix": {"FX": 275.0, "FY": 274.6, "CX": 163.3, "CY": 117.0},
     "Distortion": dict(zip(("K1", "K2", "P1", "P2", "K3"), FIVE, strict=True)),
 }
-ROS = (
-    "image_width: 320\nimage_height: 240\ncamera_name: a\n"
-    "camera_matrix: {rows: 3, cols: 3, data: [275, 0, 163.3, 0, 274.6, 117, 0, 0, 1]}\n"
-    f"distortion_model: plumb_bob\ndistortion_coefficients: {{rows: 1, cols: 5, data: {FIVE}}}\n"
-)
 
 
 def opencv(path: Path, distortion=FIVE) -> Path:
@@ -122,8 +116,6 @@ def test_each_setting_is_explained_and_each_example_is_valid(tmp_path, monkeypat
     ("file", "text", "options"),
     [
         ("Left 1.yaml", None, []),
-        ("camera_info.yaml", ROS, []),
-        ("rs.json", json.dumps(REALSENSE), []),
         ("zivid.json", json.dumps({"CameraIntrinsics": ZIVID}), ["--resolution", "320x240"]),
         ("camera.json", json.dumps({"width": 320, "height": 240, "fx": 275.0, "fy": 274.6, "cx": 163.8, "cy": 117.5}), []),
         ("world.xml", None, []),
@@ -140,7 +132,7 @@ def test_a_camera_is_that_of_its_calibration_and_sees_the_bin(tmp_path, drawn, f
     assert config.rig.sizes == ((320, 240),) * 2
     assert intrinsics(config.camera[0]) == pytest.approx((275.0, 274.6, 163.8, 117.5))
     assert config.camera[0].distortion == (None if "cx" in (text or "") else tuple(FIVE))
-    assert config.rig.names[0] in ("left_1", "camera_info", "rs", "zivid", "camera", "camera_world")
+    assert config.rig.names[0] in ("left_1", "zivid", "camera", "camera_world")
     assert config.rig.names[1] == f"{config.rig.names[0]}_2"
     assert config.perception.resolution == (640, 480)
     for camera in make_cameras(config.rig):
@@ -208,7 +200,6 @@ def test_a_large_part_has_its_volume_and_a_folder_is_named(tmp_path, drawn):
     ("file", "options", "up", "kept"),
     [
         ("kanban 1.stl", ["--bin-unit", "mm"], "z", "bins/kanban 1.stl"),
-        ("kanban.ply", ["--bin-unit", "mm"], "z", "bins/kanban.ply"),
         ("kanban.glb", ["--bin-unit", "mm", "--bin-up", "y"], "y", "bins/kanban.glb"),
         ("kanban.obj", ["--bin-unit", "mm"], "z", "../in/kanban.obj"),
     ],

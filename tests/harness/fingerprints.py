@@ -1,6 +1,6 @@
 """Fingerprints of what is computed on the host: meshes, shapes, masses, symmetries, lights, cameras, and the files of a small bake.
 
-python -m tests.harness.fingerprints FOLDER    # prints them as JSON; `test_processors` compares kinds of processors
+python -m tests.harness.fingerprints FOLDER    # prints them as JSON; `test_determinism` compares kinds of processors
 """
 
 from __future__ import annotations
