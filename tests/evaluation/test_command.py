@@ -8,6 +8,7 @@ import os
 import shlex
 import shutil
 import subprocess
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -19,34 +20,32 @@ from synpick_warp.apps.evaluation.results import write_results
 from synpick_warp.apps.evaluation.run import method_names
 from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.commands.evaluate import toolkit_command
-from synpick_warp.cli.main import main
 from synpick_warp.system.codecs.charts import SCALE, WIDTH
+from tests.builders import mistake, run
 from tests.worlds.evaluation_set import moved, write_evaluation_set
+from tests.worlds.model_files import put
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return write_evaluation_set(tmp_path_factory.mktemp("command") / "synpick")
-
-
-@pytest.fixture(scope="module")
-def files(folder):
+def files(folder, truth, tmp_path_factory):
     """Result files: perfect, and off by 5 cm."""
-    poses = read_truth(synpick_warp.open(folder)).poses
-    good, bad = folder.parent / "icg_synpick-train-pbr.csv", folder.parent / "bad.csv"
-    write_results(good, poses)
-    write_results(bad, moved(poses, (0.0, 0.0, 0.05)))
+    results = tmp_path_factory.mktemp("results")
+    good, bad = results / "icg_synpick-train-pbr.csv", results / "bad.csv"
+    write_results(good, truth.poses)
+    write_results(bad, moved(truth.poses, (0.0, 0.0, 0.05)))
     return good, bad
 
 
-def run(*arguments: object) -> int:
-    return main(["eval", *map(str, arguments)])
+def evaluated(*arguments: object) -> tuple[str, str]:
+    """Output of a run that ends well."""
+    code, output, error = run("eval", *arguments)
+    assert code == 0, error
+    return output, error
 
 
 @pytest.mark.parametrize("repeated", [("--results",), ()])
-def test_methods_stand_beside_each_other(folder, files, capsys, repeated):
-    assert run("--data", folder, "--results", files[0], *repeated, files[1]) == 0
-    output, error = capsys.readouterr()
+def test_methods_stand_beside_each_other(folder, files, repeated):
+    output, error = evaluated("--data", folder, "--results", files[0], *repeated, files[1])
     assert error == ""
     lines = output.splitlines()
     assert lines[0].split() == ["icg", "bad"]
@@ -56,21 +55,26 @@ def test_methods_stand_beside_each_other(folder, files, capsys, repeated):
     assert lines[-1].startswith("BOP_PATH=")
 
 
-def test_other_styles_keep_the_standard_output_clean(folder, files, capsys):
-    assert run("--data", folder, "--results", files[1], "--format", "json", "--visib-min", "0", "--top", "0", "--vertices", "5") == 0
-    output, error = capsys.readouterr()
+def test_other_styles_keep_the_standard_output_clean_and_files_get_the_table(folder, files, tmp_path):
+    options = ("--format", "json", "--visib-min", 0, "--top", 0, "--vertices", 5)
+    output, error = evaluated("--data", folder, "--results", files[1], *options)
     table = json.loads(output)
     assert table["methods"][0]["rows"][-1]["targets"] == 96
     assert synpick_warp.evaluate(folder, files[1:], min_visibility=0.0, top=0, vertices=5) == table
     assert "eval_bop19_pose.py" in error
+    out = tmp_path / "table.tex"
+    output, _ = evaluated("--data", folder, "--results", files[0], "--format", "latex", "--convention", "vocap", "--out", out)
+    assert "convention vocap" in out.read_text()
+    assert output.startswith(f"table: {out}\n# BOP scores")
+    assert [path.name for path in tmp_path.iterdir()] == ["table.tex"]
 
 
-def test_the_filter_scores_each_method_once_more(folder, files, capsys):
+def test_the_filter_scores_each_method_once_more(folder, files):
     """With weight 1 it changes nothing; with the paper's 0.05 it lags behind what moves, and only there."""
 
     def methods(*arguments: object) -> dict[str, dict[str, float]]:
-        assert run("--data", folder, "--results", *files, "--format", "json", "--vertices", 50, "--filter", "ema", *arguments) == 0
-        found = json.loads(capsys.readouterr().out)["methods"]
+        given = ("--format", "json", "--vertices", 50, "--filter", "ema", *arguments)
+        found = json.loads(evaluated("--data", folder, "--results", *files, *given)[0])["methods"]
         return {one["method"]: {f"{row['group']} {row['label']}": row["ADD exact"] for row in one["rows"]} for one in found}
 
     neutral = methods("--alpha", 1)
@@ -83,40 +87,32 @@ def test_the_filter_scores_each_method_once_more(folder, files, capsys):
     assert max(lost.values()) > 10.0
 
 
-def test_a_table_is_written_to_a_file(folder, files, tmp_path, capsys):
-    out = tmp_path / "table.tex"
-    assert run("--data", folder, "--results", files[0], "--format", "latex", "--convention", "vocap", "--out", out) == 0
-    assert "convention vocap" in out.read_text()
-    assert capsys.readouterr().out.startswith(f"table: {out}\n# BOP scores")
-    assert [path.name for path in tmp_path.iterdir()] == ["table.tex"]
-
-
-def test_images_without_an_estimate_are_told(folder, files, tmp_path, capsys):
+def test_images_without_an_estimate_are_told(folder, files, tmp_path):
     header, *rows = files[0].read_text().splitlines()
-    few, list_beside = tmp_path / "few.csv", tmp_path / "few-targets.json"
-    few.write_text("\n".join((header, *rows[:1])))
+    few = put(tmp_path / "few.csv", "\n".join((header, *rows[:1])))
     images = len({tuple(row.split(",")[:2]) for row in rows})
     said = f"{few} has no estimate in {images - 1} of {images} images, whose objects count as missed"
-    assert run(folder, "--results", files[0], few, "--vertices", 50) == 0
-    assert capsys.readouterr().err == f"{said}\n"
-    list_beside.write_text("[]")
-    assert run(folder, "--results", few, "--vertices", 50) == 0
-    assert capsys.readouterr().err == f"{said}; --targets {list_beside} scores those that were estimated\n"
+    assert evaluated(folder, "--results", files[0], few, "--vertices", 50)[1] == f"{said}\n"
+    beside = put(tmp_path / "few-targets.json", "[]")
+    assert evaluated(folder, "--results", few, "--vertices", 50)[1] == f"{said}; --targets {beside} scores those that were estimated\n"
 
 
-def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, files):
+def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, files, tmp_path):
     data = synpick_warp.open(folder)
     lines = toolkit_command(data, files).splitlines()
-    assert lines[1] == f"cp {files[1]} {folder.parent / 'bad_synpick-train-pbr.csv'}"
+    assert lines[1] == f"cp {files[1]} {files[1].parent / 'bad_synpick-train-pbr.csv'}"
     words = shlex.split(lines[-1])
     assert words[:3] == [f"BOP_PATH={folder.parent}", "python", "scripts/eval_bop19_pose.py"]
     assert "--result_filenames=icg_synpick-train-pbr.csv,bad_synpick-train-pbr.csv" in words
     assert "--targets_filename=test_targets_bop19.json" in words
     assert f"--targets_filename={folder / 'few.json'}" in toolkit_command(data, files, folder / "few.json")
-    other = write_evaluation_set(folder.parent / "my set_1")
+    other = write_evaluation_set(tmp_path / "my set_1")
     lines = toolkit_command(synpick_warp.open(other), files[:1]).splitlines()
-    assert shlex.split(lines[1]) == ["ln", "-sfn", str(other), str(folder.parent / "myset1")]
-    assert shlex.split(lines[2])[2] == str(folder.parent / "icgsynpicktrainpbr_myset1-train-pbr.csv")
+    assert shlex.split(lines[1]) == ["ln", "-sfn", str(other), str(tmp_path / "myset1")]
+    assert shlex.split(lines[2])[2] == str(files[0].parent / "icgsynpicktrainpbr_myset1-train-pbr.csv")
+    paths = [Path(name) for name in ("a_set-test.csv", "b.csv", "a_set-val.csv", "1/a.csv", "2/a.csv")]
+    for some, names in ((paths[:2], ["a", "b"]), (paths[::2][:2], ["a_set-test", "a_set-val"]), (paths[3:], ["1/a.csv", "2/a.csv"])):
+        assert method_names(some) == names
 
 
 def test_the_toolkit_gets_results_of_the_first_sensor_with_the_ids_of_its_scenes(folder, files, tmp_path):
@@ -133,12 +129,6 @@ def test_the_toolkit_gets_results_of_the_first_sensor_with_the_ids_of_its_scenes
     assert {row.partition(",")[0] for row in rows[1:]} == {"0", "1"}
 
 
-def test_methods_have_different_names(tmp_path):
-    assert method_names([tmp_path / "a_set-test.csv", tmp_path / "b.csv"]) == ["a", "b"]
-    assert method_names([tmp_path / "a_set-test.csv", tmp_path / "a_set-val.csv"]) == ["a_set-test", "a_set-val"]
-    assert method_names([tmp_path / "1" / "a.csv", tmp_path / "2" / "a.csv"]) == [str(tmp_path / name / "a.csv") for name in "12"]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -149,7 +139,6 @@ def test_methods_have_different_names(tmp_path):
         (["--top", "-2"], "--top is -2; allowed: -1 for as many as instances, 0 for all"),
         (["--alpha", "0.1"], "--alpha is 0.1, but there is no filter; add --filter ema"),
         (["--filter", "kalman"], '--filter is "kalman"; allowed: ema'),
-        (["--filter", "ema", "--alpha", "0"], "alpha 0.0 is not allowed: it is the weight of the new estimate, above 0 and at most 1"),
         (["--vertices", "-1"], "--vertices is -1; allowed: 0 for all"),
         (["--top", "1.5"], '--top is "1.5"; allowed: a whole number'),
         (["--out", "{folder}/none/table.txt"], "/none/table.txt; allowed: a file in an existing folder"),
@@ -163,99 +152,89 @@ def test_methods_have_different_names(tmp_path):
         (["--plots", "{good}-new", "--track", "one"], '--track is "one"; allowed: SCENE:INSTANCE, such as 3:12'),
         (["--plots", "{good}-new", "--track", "9:1"], "--track is 9:1; the data set has no such scene and instance"),
         (["--results", "{folder}/none.csv"], "there is no file {folder}/none.csv"),
-        (["--results", "{folder}/config.toml"], "/config.toml, line 1 has 1 columns; allowed: 7 separated by commas"),
     ],
 )
-def test_mistakes_are_one_line(folder, files, capsys, arguments, message):
+def test_mistakes_are_one_line(folder, files, arguments, message):
     before = sorted(folder.rglob("*"))
     given = [text.format(folder=folder, good=files[0]) for text in arguments]
-    assert run("--data", folder, "--results", files[0], *given) == 2
-    output, error = capsys.readouterr()
-    assert output == ""
+    code, output, error = run("eval", "--data", folder, "--results", files[0], *given)
+    assert (code, output, error.count("\n")) == (2, "", 1)
     assert error.startswith("synpick-warp: error: ")
     assert message.format(folder=folder, good=files[0]) in error
-    assert error.count("\n") == 1
     assert sorted(folder.rglob("*")) == before
 
 
-def test_folders_that_are_no_data_sets_are_refused(files, tmp_path, capsys):
-    assert run("--data", tmp_path, "--results", files[0]) == 2
-    assert "is not a data set" in capsys.readouterr().err
-    assert run("--data", tmp_path) == 2
-    assert run("--results", files[0]) == 2
-    assert run("--data", tmp_path, "--results") == 2
-    assert "--results has no value; name BOP result files" in capsys.readouterr().err
-
-
-def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, capsys):
+def test_what_cannot_be_scored_is_one_line(files, tmp_path):
     hidden = write_evaluation_set(tmp_path / "hidden")
     for path in hidden.rglob("scene_gt_info.json"):
         path.write_text(path.read_text().replace('"visib_fract": 1.0', '"visib_fract": 0.5'))
-    assert run("--data", hidden, "--results", files[0], "--visib-min", "0.9") == 2
-    assert "--visib-min is 0.9; no instance of" in capsys.readouterr().err
+    for given, said in (
+        (("--data", tmp_path, "--results", files[0]), "is not a data set"),
+        (("--data", tmp_path), ""),
+        (("--results", files[0]), ""),
+        (("--data", tmp_path, "--results"), "--results has no value; name BOP result files"),
+        (("--data", hidden, "--results", files[0], "--visib-min", "0.9"), "--visib-min is 0.9; no instance of"),
+    ):
+        assert said in mistake("eval", *given)
 
 
-def test_names_that_do_not_print_are_escaped(folder, files, capsys, tmp_path):
-    odd = tmp_path / "a\nb\x1b\udcff.csv"
-    odd.write_bytes(files[0].read_bytes())
+def test_names_that_do_not_print_are_escaped(folder, files, tmp_path):
+    odd = put(tmp_path / "a\nb\x1b\udcff.csv", files[0].read_bytes())
     for style in ("text", "latex", "csv", "json"):
-        assert run("--data", folder, "--results", odd, "--format", style, "--out", tmp_path / style) == 0
-        assert "\x1b" not in (tmp_path / style).read_text()
-        assert "\x1b" not in capsys.readouterr().out
+        output, _ = evaluated("--data", folder, "--results", odd, "--format", style, "--out", tmp_path / style)
+        assert "\x1b" not in (tmp_path / style).read_text() + output
 
 
+METHODS = ("icg", "bad")
 ERRORS = ("error_by_speed", "error_by_visibility", "recall")
 PICTURES = [f"{name}_{metric}.png" for name in ERRORS for metric in ("add", "add_or_s", "add_s")]
 KINDS = (("alpha_sweep", ""), ("trajectory", "_scene_000004_instance_1"))
 
 
-def test_plots_are_written_to_a_new_or_empty_folder(folder, files, tmp_path, capsys):
+def test_plots_are_written_to_a_new_or_empty_folder(folder, files, tmp_path):
     """One of the two moving bricks is faster: instance 3 of the first scene in which it is so."""
     for name in ("new/deep", "empty"):
         (tmp_path / "empty").mkdir(exist_ok=True)
-        assert run("--data", folder, "--results", *files, "--plots", tmp_path / name) == 0
-        found = {path.name for path in (tmp_path / name).iterdir()}
-        assert found == {*PICTURES, *(f"trajectory_{method}_scene_000000_instance_3.png" for method in ("icg", "bad"))}
-        lines = capsys.readouterr().out.splitlines()
-        assert {line.removeprefix("picture: ") for line in lines if line.startswith("picture: ")} == {
-            str(tmp_path / name / each) for each in found
-        }
+        lines = evaluated("--data", folder, "--results", *files, "--plots", tmp_path / name)[0].splitlines()
+        found = set((tmp_path / name).iterdir())
+        assert {path.name for path in found} == {*PICTURES, *(f"trajectory_{method}_scene_000000_instance_3.png" for method in METHODS)}
+        assert {line.removeprefix("picture: ") for line in lines if line.startswith("picture: ")} == set(map(str, found))
         assert lines[-1].startswith("BOP_PATH=")
         for each in found:
-            assert cv2.imread(str(tmp_path / name / each)).shape[1] == SCALE * WIDTH
+            assert cv2.imread(str(each)).shape[1] == SCALE * WIDTH
 
 
-def test_plots_with_a_filter_have_a_sweep_of_each_method(folder, files, tmp_path, capsys):
+def test_plots_with_a_filter_have_a_sweep_of_each_method(folder, files, tmp_path):
     given = ("--filter", "ema", "--format", "csv", "--plots", tmp_path / "plots", "--track", "4:1", "--vertices", 20)
-    assert run("--data", folder, "--results", *files, *given) == 0
-    output, error = capsys.readouterr()
+    output, error = evaluated("--data", folder, "--results", *files, *given)
     assert output.startswith("group,")
     assert "picture: " not in output
     names = {path.name for path in (tmp_path / "plots").iterdir()}
-    assert names == {*PICTURES, *(f"{kind}_{method}{end}.png" for kind, end in KINDS for method in ("icg", "bad"))}
+    assert names == {*PICTURES, *(f"{kind}_{method}{end}.png" for kind, end in KINDS for method in METHODS)}
     assert error.count("picture: ") == len(names)
 
 
-def test_a_track_that_a_method_lacks_is_not_chosen_and_is_refused(folder, files, tmp_path, capsys):
-    poses = read_truth(synpick_warp.open(folder)).poses
-    slow = tmp_path / "slow.csv"
+def test_a_track_that_a_method_lacks_is_not_chosen_and_is_refused(folder, truth, files, tmp_path):
+    poses, slow = truth.poses, tmp_path / "slow.csv"
     write_results(slow, poses.select((poses.scene == 2) & (poses.instance == 1)))
-    assert run("--data", folder, "--results", files[0], slow, "--plots", tmp_path / "plots") == 0
+    given = ("--data", folder, "--results", files[0], slow)
+    evaluated(*given, "--plots", tmp_path / "plots")
     trajectories = sorted(path.name for path in (tmp_path / "plots").glob("trajectory*"))
     assert trajectories == [f"trajectory_{method}_scene_000002_instance_1.png" for method in ("icg", "slow")]
-    capsys.readouterr()
-    assert run("--data", folder, "--results", files[0], slow, "--plots", tmp_path / "other", "--track", "0:3") == 2
-    assert "--track is 0:3; slow has no estimate of it; choose another one" in capsys.readouterr().err
+    said = "--track is 0:3; slow has no estimate of it; choose another one"
+    code, _, error = run("eval", *given, "--plots", tmp_path / "other", "--track", "0:3")
+    assert code == 2
+    assert said in error
     assert not (tmp_path / "other").exists()
 
 
 def test_methods_of_odd_names_have_pictures_of_their_own(folder, files, tmp_path):
     for name in ("a b", "a+b", "Ground truth"):
         (tmp_path / f"{name}.csv").write_bytes(files[0].read_bytes())
-    assert run("--data", folder, "--results", *sorted(tmp_path.glob("*.csv")), "--plots", tmp_path / "plots") == 0
-    ending = "scene_000000_instance_3.png"
+    evaluated("--data", folder, "--results", *sorted(tmp_path.glob("*.csv")), "--plots", tmp_path / "plots")
     names = {path.name for path in (tmp_path / "plots").glob("trajectory*")}
-    assert names == {f"trajectory_{number}_{name}_{ending}" for number, name in ((1, "Ground_truth"), (2, "a_b"), (3, "a_b"))}
+    numbered = ((1, "Ground_truth"), (2, "a_b"), (3, "a_b"))
+    assert names == {f"trajectory_{number}_{name}_scene_000000_instance_3.png" for number, name in numbered}
 
 
 @pytest.fixture(scope="module", params=["bop,zarr", "shards"])
@@ -264,7 +243,7 @@ def baked(request, picked_set, tmp_path_factory):
     return shutil.copytree(picked_set, tmp_path_factory.mktemp("baked") / "set", ignore=lambda *_: others, copy_function=os.link)
 
 
-def test_the_truth_of_a_bake_scores_100(baked, tmp_path, capsys):
+def test_the_truth_of_a_bake_scores_100(baked, tmp_path):
     data = synpick_warp.open(baked)
     truth = read_truth(data)
     assert len(truth.images) == sum(len(episode) for episode in data.values()) * data.camera_count
@@ -273,9 +252,7 @@ def test_the_truth_of_a_bake_scores_100(baked, tmp_path, capsys):
     assert 0.0 <= truth.speed.min() <= truth.speed.max() < 10.0
     results, table = tmp_path / "truth.csv", tmp_path / "table.csv"
     write_results(results, truth.poses)
-    options = ("--format", "csv", "--out", str(table), "--visib-min", "0")
-    assert main(["eval", "--data", str(baked), "--results", str(results), *options]) == 0
-    capsys.readouterr()
+    evaluated("--data", baked, "--results", results, "--format", "csv", "--out", table, "--visib-min", 0)
     rows = list(csv.DictReader(table.read_text().splitlines()))
     values = [float(row[column]) for row in rows for column in row if column.startswith("ADD")]
     assert (min(values), max(values)) == pytest.approx((100.0, 100.0))

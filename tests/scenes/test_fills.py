@@ -22,6 +22,7 @@ from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.fills import check_fill, count_entries, drop_height
 from synpick_warp.scenes.types import Catalog, ConvexPiece
+from tests.builders import refusal
 from tests.worlds.bin_meshes import round_bin, sloped_bin
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, PLATE, catalog, cluttered_catalog, settings
 
@@ -40,6 +41,7 @@ def load(counts, **settings):
         ({"bolt": [4, 8], "nut": 8}, (("bolt", 4, 8), ("nut", 8, 8))),
         ([["a part", 0, 3], ["b", 1, 1]], (("a part", 0, 3), ("b", 1, 1))),
         ({}, ()),
+        (parse_assignment("arrangement.counts={bracket=12}")[1], (("bracket", 12, 12),)),
     ],
 )
 def test_tables_and_lists_are_read_and_written(tmp_path, counts, rows):
@@ -47,10 +49,6 @@ def test_tables_and_lists_are_read_and_written(tmp_path, counts, rows):
     assert config.arrangement.counts == rows
     (tmp_path / "same.toml").write_text(config_to_toml(config))
     assert load_config(str(tmp_path / "same.toml")).arrangement.counts == rows
-
-
-def test_the_command_line_takes_a_table():
-    assert load_config("smoke", dict([parse_assignment("arrangement.counts={bracket=12}")])).arrangement.counts == (("bracket", 12, 12),)
 
 
 @pytest.mark.parametrize(
@@ -75,29 +73,26 @@ def test_the_command_line_takes_a_table():
     ],
 )
 def test_what_no_fill_is_takes_one_line(counts, settings, rule):
-    with pytest.raises(ConfigError, match=rule) as error:
-        load(counts, **settings)
-    assert "arrangement.counts" in str(error.value)
-    assert "\n" not in str(error.value)
+    said = refusal(load, counts, **settings)
+    assert "arrangement.counts" in said
+    assert rule in said
 
 
-def test_parts_are_found_by_name_and_by_obj_id():
+def test_parts_are_found_by_name_and_by_obj_id_and_take_slots_of_their_largest_numbers():
     first, _, last = OBJECTS.entries
     counts = ((last.name, 1, 4), (str(first.obj_id), 2, 2))
     np.testing.assert_array_equal(count_entries(counts, OBJECTS), [(2, 2), (0, 0), (1, 4)])
     assert not count_entries((), OBJECTS).any()
+    config = load(((NAMES[0], 3, 7), (NAMES[2], 1, 2)))
+    assert build.count_slots(config.arrangement, [False], OBJECTS) == (9, 0)
+    assert not build.must_repeat(config.arrangement, OBJECTS)
 
 
-@pytest.mark.parametrize(
-    ("counts", "line"),
-    [
-        (((f"{NAMES[1]}s", 1, 1),), f"which no object has.*{NAMES[0]}.*did you mean {NAMES[1]}"),
-        (((NAMES[0], 1, 1), (str(OBJECTS.entries[0].obj_id), 1, 1)), "which is set already"),
-    ],
-)
-def test_unknown_parts_are_named(counts, line):
-    with pytest.raises(ConfigError, match=line):
-        count_entries(counts, OBJECTS)
+def test_unknown_parts_are_named():
+    with pytest.raises(ConfigError, match=f"which no object has.*{NAMES[0]}.*did you mean {NAMES[1]}"):
+        count_entries(((f"{NAMES[1]}s", 1, 1),), OBJECTS)
+    with pytest.raises(ConfigError, match="which is set already"):
+        count_entries(((NAMES[0], 1, 1), (str(OBJECTS.entries[0].obj_id), 1, 1)), OBJECTS)
 
 
 def test_more_than_the_bin_holds_is_refused():
@@ -125,12 +120,6 @@ def test_stacks_above_the_guide_walls_are_refused():
             check_fill(arrangement, height, OBJECTS, bins)
 
 
-def test_slots_are_those_of_the_largest_numbers():
-    config = load(((NAMES[0], 3, 7), (NAMES[2], 1, 2)))
-    assert build.count_slots(config.arrangement, [False], OBJECTS) == (9, 0)
-    assert not build.must_repeat(config.arrangement, OBJECTS)
-
-
 # ---- capacities ----
 
 
@@ -145,10 +134,6 @@ def with_capacities(config: Config, objects: Catalog) -> Physics:
     return capacities.with_capacities(config.physics, config.arrangement.max_objects, objects)
 
 
-def capacities_of(physics: Physics) -> tuple[int, int, int, int]:
-    return physics.contacts_per_world, physics.pairs_per_world, physics.rows_per_world, physics.gripper_rows_per_world
-
-
 def test_only_objects_thinner_than_the_contact_margin_raise_capacities():
     config = settings(bake__mode="move", arrangement__max_objects=24)
     assert with_capacities(config, catalog(BOX, CUBE, ANGLE)) is config.physics
@@ -159,8 +144,10 @@ def test_only_objects_thinner_than_the_contact_margin_raise_capacities():
         assert physics.pairs_per_world >= 1024
     few = settings(bake__mode="move", arrangement__max_objects=3)
     assert with_capacities(few, catalog(((0.1, 0.08, 0.001),))) is few.physics
-    roomy = settings(arrangement__max_objects=24, physics__contacts_per_world=8192)
-    assert with_capacities(roomy, catalog(((0.1, 0.08, 0.001),))) is roomy.physics
+    assert capacities.MAX_ROWS == contact_sweep.MAX_SHARED_ROWS
+    for count, contacts, shape in ((24, 8192, ((0.1, 0.08, 0.001),)), (251, 20000, CUBE)):
+        roomy = settings(arrangement__max_objects=count, physics__contacts_per_world=contacts)
+        assert with_capacities(roomy, catalog(shape)) is roomy.physics
 
 
 def test_bins_of_more_shapes_than_a_box_raise_capacities(tmp_path):
@@ -179,10 +166,6 @@ def test_bins_of_more_shapes_than_a_box_raise_capacities(tmp_path):
     assert capacities.with_capacities(config.physics, 24, catalog(BOX, CUBE), make_bins(config.cell.bins)) is config.physics
 
 
-def test_rows_stay_in_shared_memory():
-    assert capacities.MAX_ROWS == contact_sweep.MAX_SHARED_ROWS
-
-
 def test_the_embedded_objects_keep_the_capacities():
     margin = 2.0 * settings().physics.gap
     for raw in procedural_objects():
@@ -191,20 +174,14 @@ def test_the_embedded_objects_keep_the_capacities():
 
 @pytest.mark.parametrize(
     ("shapes", "count", "each"),
-    [
-        ((BOX, CUBE), 33, LEAST),
-        ((CUBE,), 251, LEAST),
-        ((SMALL,), 150, OF_SMALL),
-        ((CUBE, SMALL), 60, OF_SMALL),
-    ],
+    [((BOX, CUBE), 33, LEAST), ((CUBE,), 251, LEAST), ((SMALL,), 150, OF_SMALL), ((CUBE, SMALL), 60, OF_SMALL)],
 )
 def test_many_objects_have_contacts_in_proportion_and_three_rows_for_each(shapes, count, each):
-    config = settings(arrangement__max_objects=count)
-    contacts, pairs, rows, gripper = capacities_of(with_capacities(config, catalog(*shapes)))
+    physics = with_capacities(settings(arrangement__max_objects=count), catalog(*shapes))
+    contacts = physics.contacts_per_world
     assert contacts == pytest.approx(count * each, abs=1)
-    assert pairs == 2 * contacts
-    assert rows == 3 * contacts
-    assert gripper == round(each / LEAST * 256)
+    assert (physics.pairs_per_world, physics.rows_per_world) == (2 * contacts, 3 * contacts)
+    assert physics.gripper_rows_per_world == round(each / LEAST * 256)
 
 
 def test_numbers_of_parts_count_by_their_own_contacts():
@@ -218,8 +195,3 @@ def test_numbers_of_parts_count_by_their_own_contacts():
     mixed = cluttered_catalog()
     few, many = (capacities.with_capacities(config.physics, 60, mixed, (), ((mixed.entries[0].name, 1, most),)) for most in (40, 60))
     assert few == many
-
-
-def test_larger_capacities_of_the_settings_stay():
-    config = settings(arrangement__max_objects=251, physics__contacts_per_world=20000)
-    assert with_capacities(config, catalog(CUBE)) is config.physics

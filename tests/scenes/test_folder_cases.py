@@ -17,21 +17,30 @@ from synpick_warp.scenes import catalog as catalog_reader
 from synpick_warp.scenes import lights as lights_reader
 from synpick_warp.scenes import looks as looks_reader
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.system.processes import isolation
 from synpick_warp.system.processes.isolation import Failure
-from tests.builders import mistake
-from tests.scenes.test_fuzz_assets import OBJ, picture
-from tests.worlds.model_files import box, exported, load_models, put
+from tests.builders import mistake, refusal
+from tests.worlds.model_files import OBJ, box, exported, load_models, put
 
 CASES = Path(__file__).resolve().parents[1] / "cases"
 SMALL = OBJ.replace("v 1 ", "v 0.1 ").replace("v 0 1 ", "v 0 0.1 ").replace("v 0 0 1\n", "v 0 0 0.1\n", 1)
 """A textured tetrahedron of 0.1 m."""
+CUBE = box(0.1, 0.1, 0.1)
 
 
-def write(folder: Path, **files: str | bytes) -> Path:
-    """Files by name, with __ for / and _dot_ for the dot."""
+PART = box(100.0, 60.0, 20.0)
+"""Diameter 118.3 mm."""
+
+
+def write(folder: Path, files: dict[str, str | bytes]) -> Path:
+    """Files by name."""
     for name, content in files.items():
-        put(folder / name.replace("__", "/").replace("_dot_", "."), content)
+        put(folder / name, content)
     return folder
+
+
+def picture() -> bytes:
+    return cv2.imencode(".png", np.full((4, 3, 3), 9, np.uint8))[1].tobytes()
 
 
 # ---- the inputs of tests/cases ----
@@ -40,14 +49,14 @@ def write(folder: Path, **files: str | bytes) -> Path:
 @pytest.mark.parametrize(("case", "names"), [("one", ["u"]), ("two", ["a", "b"])])
 def test_where_coacd_crashes_the_hull_stands(tmp_path, monkeypatch, case, names):
     monkeypatch.syspath_prepend(str(CASES / "coacd_crash" / "stub"))
-    restart_server()
+    isolation._server.stop()
     try:
         catalog, lines = load_models(CASES / "coacd_crash" / case, tmp_path)
     finally:
-        restart_server()
+        isolation._server.stop()
     assert [(entry.name, len(entry.pieces)) for entry in catalog.entries] == [(name, 1) for name in names]
     said = [f"{name}: its convex decomposition crashed (SIGSEGV); its convex hull is used instead" for name in names]
-    assert [line.partition(":")[0] + ":" + line.split(":")[1] for line in lines[1:]] == said
+    assert [line.rpartition(": ")[0] for line in lines[1:]] == said
 
 
 LIGHT = cv2.imencode(".hdr", np.full((8, 16, 3), 0.5, np.float32))[1].tobytes()
@@ -79,25 +88,6 @@ def test_a_file_for_which_the_machine_does_not_suffice_is_not_left_out(
     said = mistake("bake", "--config", "smoke", "--device", "cpu", "--out", tmp_path / "set", "--set", f"{option}={folder}")
     assert said == f"{folder / f'slow.{suffix}'}: the process that reads it {reason}; {remedy}"
     assert not (tmp_path / "set").exists()
-
-
-def restart_server() -> None:
-    from synpick_warp.system.processes import isolation
-
-    isolation._server.stop()
-
-
-def test_the_diagonal_in_models_info_is_named(tmp_path):
-    catalog, (line,) = load_models(CASES / "models_info_diagonal", tmp_path)
-    assert catalog.entries[0].diameter == pytest.approx(0.01)
-    assert "diameter 12.81 mm, which is the diagonal of its bounding box; its own, 10 mm, is used" in line
-
-
-def test_a_folder_per_object(tmp_path):
-    catalog, lines = load_models(CASES / "gso_layout", tmp_path)
-    assert [entry.name for entry in catalog.entries] == ["Shoe"]
-    assert catalog.entries[0].material.texture is not None
-    assert not lines
 
 
 @pytest.mark.parametrize(
@@ -148,28 +138,25 @@ def test_files_of_formats_that_are_not_read_are_named(tmp_path, names, beside):
 
 
 def test_a_bad_mesh_is_left_out_with_a_line_and_keeps_its_number(tmp_path):
-    folder = write(tmp_path / "models", a_dot_ply=box(0.1, 0.1, 0.1), b_dot_ply=b"no mesh", c_dot_ply=box(3.0, 3.0, 3.0), d_dot_glb=b"glTF")
-    write(folder, e_dot_ply=box(0.1, 0.1, 0.0), f_dot_ply=box(0.1, 0.1, 0.1))
-    write(folder, g_dot_ply=box(0.1, 0.1, 0.1), g_dot_obj=box(0.1, 0.1, 0.1, kind="obj"))
+    bad = {"b.ply": b"no mesh", "c.ply": box(3.0, 3.0, 3.0), "d.glb": b"glTF", "e.ply": box(0.1, 0.1, 0.0)}
+    good = {"a.ply": CUBE, "f.ply": CUBE, "g.ply": CUBE, "g.obj": box(0.1, 0.1, 0.1, kind="obj")}
+    folder = write(tmp_path / "models", bad | good)
     catalog, lines = load_models(folder, tmp_path)
     assert [(entry.obj_id, entry.name) for entry in catalog.entries] == [(1, "a"), (6, "f"), (7, "g")]
     assert all(line.startswith("left out: ") for line in lines)
-    with pytest.raises(CatalogError):
+    with pytest.raises(CatalogError, match=r"g\.obj and g\.ply have the same name"):
         load_models(folder, tmp_path, strict=True)
-
-
-def test_a_folder_of_bad_meshes_ends_in_one_line(tmp_path):
-    folder = write(tmp_path / "models", a_dot_ply=b"no mesh", b_dot_ply=b"no mesh either")
-    with pytest.raises(CatalogError) as caught:
-        load_models(folder, tmp_path)
-    assert str(caught.value).startswith(f"models folder {folder}: none of its 2 objects can be used; the first: {folder / 'a.ply'}: ")
+    none = write(tmp_path / "none", {"a.ply": b"no mesh", "b.ply": b"no mesh either"})
+    said = f"models folder {none}: none of its 2 objects can be used; the first: {none / 'a.ply'}: "
+    assert refusal(load_models, none, tmp_path).startswith(said)
 
 
 def test_a_bad_light_map_is_left_out(tmp_path):
-    assert cv2.imwrite(str(tmp_path / "good.hdr"), np.full((8, 16, 3), 0.5, np.float32))
-    (tmp_path / "bad.hdr").write_bytes(b"#?RADIANCE\n")
+    """A set from Windows is read."""
+    maps = {"good.hdr": LIGHT, "bad.hdr": b"#?RADIANCE\n", "set/maps/ref.hdr": LIGHT}
+    write(tmp_path, maps | {"set/a.ibl": "[Reflection]\nREFfile = Maps\\REF.hdr\n"})
     lines: list[str] = []
-    assert [light.name for light in load_lights(str(tmp_path), lines.append)] == ["good"]
+    assert [light.name for light in load_lights(str(tmp_path), lines.append)] == ["a", "good"]
     assert lines[0].startswith(f"left out: {tmp_path / 'bad.hdr'} cannot be read as an image")
     with pytest.raises(LightError, match=r"bad\.hdr"):
         load_lights(str(tmp_path), strict=True)
@@ -179,39 +166,37 @@ def test_a_bad_light_map_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["SKIN.PNG", "Tex\\Skin.png", ".\\tex\\SKIN.png", "C:\\Users\\x\\skin.png", "/data/x/skin.png", "maps/skin.png"],
+    ("name", "place"),
+    [
+        *((name, "skin.png") for name in ("SKIN.PNG", "C:\\Users\\x\\skin.png", "/data/x/skin.png", "maps/skin.png")),
+        *((name, "tex/skin.png") for name in ("Tex\\Skin.png", ".\\tex\\SKIN.png")),
+    ],
 )
-def test_a_texture_is_found_by_names_of_other_systems(tmp_path, name):
-    folder = write(tmp_path / "models", a_dot_obj=SMALL.replace("a.mtl", "A.MTL"), a_dot_mtl=f"newmtl skin\nmap_Kd {name}\n")
-    write(folder, **{("skin_dot_png" if "Tex" not in name and "\\tex" not in name else "tex__skin_dot_png"): picture()})
-    catalog, lines = load_models(folder, tmp_path)
+def test_a_texture_is_found_by_names_of_other_systems(tmp_path, name, place):
+    files = {"a.obj": SMALL.replace("a.mtl", "A.MTL"), "a.mtl": f"newmtl skin\nmap_Kd {name}\n", place: picture()}
+    catalog, lines = load_models(write(tmp_path / "models", files), tmp_path)
     assert catalog.entries[0].material.texture is not None
     assert len(lines) == 1
     assert "is read" in lines[0]
 
 
-@pytest.mark.parametrize("name", ["../skin.png", "..\\skin.png", "textures/../../skin.png", "link/skin.png"])
-def test_such_names_do_not_lead_out_of_the_folder(tmp_path, name):
-    folder = write(tmp_path / "models", a_dot_obj=SMALL, a_dot_mtl=f"newmtl skin\nmap_Kd {name}\n")
-    (folder / "link").symlink_to("..")
-    (folder / "textures").symlink_to("..")
-    (tmp_path / "skin.png").write_bytes(picture())
-    with pytest.raises(CatalogError, match=r"skin\.png"):
-        load_models(folder, tmp_path)
+def test_a_folder_per_object(tmp_path):
+    catalog, lines = load_models(CASES / "gso_layout", tmp_path)
+    assert [entry.name for entry in catalog.entries] == ["Shoe"]
+    assert catalog.entries[0].material.texture is not None
+    assert not lines
 
 
 @pytest.mark.parametrize("mtl", ["texture.png", "../materials/textures/texture.png", "..\\materials\\textures\\Texture.PNG"])
-@pytest.mark.parametrize("depth", ["", "meshes__"])
+@pytest.mark.parametrize("depth", ["", "meshes/"])
 def test_a_folder_per_object_with_textures_beside(tmp_path, mtl, depth):
     if depth == "":
         mtl = mtl.replace("../", "").replace("..\\", "")
-    folder = tmp_path / "models"
+    files = {f"{depth}model.obj": SMALL, f"{depth}a.mtl": f"newmtl skin\nmap_Kd {mtl}\n", "meshes/nontextured.ply": CUBE}
     for name in ("Shoe", "Mug"):
-        files = {f"{depth}model_dot_obj": SMALL, f"{depth}a_dot_mtl": f"newmtl skin\nmap_Kd {mtl}\n"}
-        write(folder / name, **files, materials__textures__texture_dot_png=picture(), meshes__nontextured_dot_ply=box(0.1, 0.1, 0.1))
-    write(folder / "no_model", readme_dot_txt="none")
-    catalog, lines = load_models(folder, tmp_path)
+        write(tmp_path / "models" / name, files | {"materials/textures/texture.png": picture()})
+    put(tmp_path / "models" / "no_model" / "readme.txt", "none")
+    catalog, lines = load_models(tmp_path / "models", tmp_path)
     assert [(entry.obj_id, entry.name) for entry in catalog.entries] == [(1, "Mug"), (2, "Shoe")]
     assert all(entry.material.texture is not None for entry in catalog.entries)
     assert sum("2 meshes, of which" in line for line in lines) == 2
@@ -221,36 +206,29 @@ YCB = "002_master_chef_can"
 """Name of an object folder in the YCB data set; its download has meshes of several resolutions and reconstructions, and point clouds."""
 
 
+COLLISION, BY_KIND = "meshes/collision.stl thumbnails/0.jpg", "google_16k/nontextured.ply google_16k/nontextured.stl"
+
+
 @pytest.mark.parametrize(
-    ("files", "read"),
+    ("read", "others"),
     [
-        (
-            (
-                "google_16k/textured.obj",
-                "google_16k/nontextured.ply",
-                "google_16k/nontextured.stl",
-                "tsdf/textured.obj",
-                "clouds/merged_cloud.ply",
-            ),
-            "google_16k/textured.obj",
-        ),
-        (("google_64k/textured.obj", "google_512k/textured.obj", "google_16k/textured.obj"), "google_16k/textured.obj"),
-        (("poisson/nontextured.stl", "tsdf/textured.obj"), "tsdf/textured.obj"),
-        (("meshes/model.obj", "meshes/collision.stl", "thumbnails/0.jpg"), "meshes/model.obj"),
-        (("visual.glb", "collision.obj"), "visual.glb"),
-        ((f"{YCB}.stl", "a.stl"), f"{YCB}.stl"),
+        ("google_16k/textured.obj", f"{BY_KIND} tsdf/textured.obj clouds/merged_cloud.ply"),
+        ("google_16k/textured.obj", "google_64k/textured.obj google_512k/textured.obj"),
+        ("tsdf/textured.obj", "poisson/nontextured.stl"),
+        ("meshes/model.obj", COLLISION),
+        ("visual.glb", "collision.obj"),
+        (f"{YCB}.stl", "a.stl"),
     ],
 )
-def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, files, read):
+def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, read, others):
     """A box of 60 mm is the one to be read; its texture lies beside it, or where Google Scanned Objects have theirs."""
     folder = tmp_path / "models" / YCB
-    for name in files:
+    for name in (read, *others.split()):
         side = 0.06 if name == read else 0.1
         kind = Path(name).suffix[1:]
         content = SMALL.replace("0.1", str(side)) if kind == "obj" else b"" if kind == "jpg" else box(side, side, side, kind=kind)
-        put(folder / name, content)
-        put((folder / name).with_name("a.mtl"), "newmtl skin\nmap_Kd texture_map.png\n")
-        put((folder / name).with_name("texture_map.png"), picture())
+        beside = {"a.mtl": "newmtl skin\nmap_Kd texture_map.png\n", "texture_map.png": picture()}
+        write((folder / name).parent, {(folder / name).name: content} | beside)
     catalog, lines = load_models(tmp_path / "models", tmp_path)
     assert [entry.name for entry in catalog.entries] == [YCB]
     assert np.ptp(catalog.entries[0].mesh.vertices, axis=0) == pytest.approx([0.06] * 3, rel=1e-5)
@@ -259,28 +237,21 @@ def test_the_mesh_of_an_object_that_has_a_folder(tmp_path, files, read):
 
 
 def test_a_whole_bop_data_set_is_pointed_to_its_models(tmp_path):
-    write(tmp_path / "set", models__obj_000001_dot_ply=box(100.0, 60.0, 20.0), camera_dot_json="{}")
+    write(tmp_path / "set", {"models/obj_000001.ply": PART, "camera.json": "{}"})
     with pytest.raises(CatalogError, match=r"its folder models has BOP models; give .*/set/models$"):
         load_models(tmp_path / "set", tmp_path)
-
-
-def test_a_set_of_lights_from_windows(tmp_path):
-    folder = write(tmp_path / "set", a_dot_ibl="[Reflection]\nREFfile = Maps\\REF.hdr\n")
-    (folder / "maps").mkdir()
-    assert cv2.imwrite(str(folder / "maps" / "ref.hdr"), np.full((8, 16, 3), 0.5, np.float32))
-    assert [light.name for light in load_lights(str(tmp_path))] == ["a"]
 
 
 # ---- models_info.json ----
 
 
-def bop(tmp_path: Path, **info) -> Path:
-    """A box of 100 x 60 x 20 mm, diameter 118.3."""
-    return write(tmp_path / "models", obj_000001_dot_ply=box(100.0, 60.0, 20.0), models_info_dot_json=json.dumps({"1": info}))
+def bop(tmp_path: Path, model: bytes = PART, **info) -> Path:
+    return write(tmp_path / "models", {"obj_000001.ply": model, "models_info.json": json.dumps({"1": info})})
 
 
 TURN = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
 QUARTER = [0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+ELSEWHERE = "or elsewhere than it is; its own, 100 x 60 x 20 mm"
 SIZES = {"min_x": -50, "min_y": -30, "min_z": -10, "size_x": 100, "size_y": 60, "size_z": 20}
 
 
@@ -291,10 +262,7 @@ SIZES = {"min_x": -50, "min_y": -30, "min_z": -10, "size_x": 100, "size_y": 60, 
         ({"diameter": 119.0}, ""),
         ({"diameter": 250.0}, "diameter 250 mm, which belongs to another mesh; its own, 118.3 mm, is used"),
         ({"diameter": 0.1183}, "diameter 0.1183, where its mesh has 118.3 mm: lengths in metres; they are converted"),
-        (
-            {"diameter": 118.3, **SIZES, "size_x": 200},
-            "a bounding box of 200 x 60 x 20 mm, or elsewhere than it is; its own, 100 x 60 x 20 mm",
-        ),
+        ({"diameter": 118.3, **SIZES, "size_x": 200}, f"a bounding box of 200 x 60 x 20 mm, {ELSEWHERE}"),
         ({"symmetries_discrete": [QUARTER]}, "symmetries_discrete[0], which moves its surface by "),
         ({"symmetries_continuous": [{"axis": [0, 0, 1]}]}, "symmetries_continuous[0], which moves its surface by "),
     ],
@@ -311,19 +279,20 @@ def test_a_stale_models_info_is_named_and_not_copied(tmp_path, info, said):
     assert written.get("size_x", 100) == pytest.approx(100) or not sizes
 
 
-def test_a_diagonal_that_is_hardly_longer_than_the_diameter_is_named(tmp_path):
-    """By 2 % only, for a rod."""
+def test_the_diagonal_in_models_info_is_named(tmp_path):
+    """Also where it is hardly longer than the diameter: by 2 % for a rod."""
+    catalog, (line,) = load_models(CASES / "models_info_diagonal", tmp_path)
+    assert catalog.entries[0].diameter == pytest.approx(0.01)
+    assert "diameter 12.81 mm, which is the diagonal of its bounding box; its own, 10 mm, is used" in line
     rod = exported(trimesh.creation.cylinder(10.0, 100.0))
-    folder = write(tmp_path / "models", obj_000001_dot_ply=rod, models_info_dot_json=json.dumps({"1": {"diameter": 103.923}}))
-    _, (line,) = load_models(folder, tmp_path)
+    _, (line,) = load_models(bop(tmp_path, rod, diameter=103.923), tmp_path)
     assert "diagonal" in line
 
 
 def test_an_object_without_an_entry_goes_without_symmetries(tmp_path):
-    folder = bop(tmp_path, diameter=118.3, symmetries_discrete=[TURN])
-    write(folder, obj_000002_dot_ply=box(50.0, 50.0, 50.0), obj_000003_dot_ply=box(50.0, 50.0, 50.0))
-    info = json.loads((folder / "models_info.json").read_text())
-    (folder / "models_info.json").write_text(json.dumps({**info, "3": {"diameter": "big"}}))
+    info = {"1": {"diameter": 118.3, "symmetries_discrete": [TURN]}, "3": {"diameter": "big"}}
+    models = {f"obj_{number:06d}.ply": box(50.0, 50.0, 50.0) for number in (2, 3)}
+    folder = write(bop(tmp_path), models | {"models_info.json": json.dumps(info)})
     catalog, lines = load_models(folder, tmp_path)
     assert [len(entry.symmetries_discrete) for entry in catalog.entries] == [1, 0, 0]
     assert [line.rpartition("; ")[2] for line in lines] == ["until then it has no symmetries"] * 2
@@ -335,7 +304,5 @@ def test_an_object_without_an_entry_goes_without_symmetries(tmp_path):
 
 
 def test_a_mesh_in_metres_among_millimetres_is_told(tmp_path):
-    folder = write(tmp_path / "models", obj_000001_dot_ply=box(0.1, 0.06, 0.02))
-    (folder / "models_info.json").write_text(json.dumps({"1": {"diameter": 118.3}}))
     with pytest.raises(SynpickError, match=r"diameter is 0\.1183 mm, but models_info\.json says 118\.3; scale it to millimetres"):
-        load_models(folder, tmp_path)
+        load_models(bop(tmp_path, box(0.1, 0.06, 0.02), diameter=118.3), tmp_path)
