@@ -1,7 +1,9 @@
-"""Broad phase: the same contacts as with Newton's, from fewer pairs."""
+"""Broad phase: the same contacts as with Newton's, from fewer pairs; narrow phase: which kernels are compiled."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import newton
@@ -10,6 +12,7 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
+from newton._src.sim import collide
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
@@ -198,3 +201,30 @@ def test_worlds_that_differ_keep_the_broad_phase_of_newton(world, body, group):
     pipeline = SimpleNamespace(model=model, broad_phase=newtons)
     broad_phase.replace_broad_phase(pipeline)  # pyright: ignore[reportArgumentType]
     assert pipeline.broad_phase is newtons
+
+
+# ---- compilation: what a bake does not launch is not compiled ----
+
+SHARED_MODULES = """
+from warp._src import context
+from synpick_warp.factory import assembly
+from newton.solvers import SolverSteel
+for name, module in context.user_modules.items():
+    if name.startswith(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.steel.")) and len(module._get_live_kernels()) > 1:
+        print(name)
+"""
+
+
+@pytest.mark.slow
+def test_no_two_kernels_of_newton_share_a_module():
+    """In a process of its own: what others have imported before decides nothing."""
+    assert subprocess.run([sys.executable, "-c", SHARED_MODULES], check=True, capture_output=True, text=True).stdout == ""
+
+
+def test_one_small_world_has_the_kernels_of_many(device):
+    """On a GPU, Newton chooses by the number of pairs in all worlds; the thresholds must still be where they are replaced."""
+    for count in (1, 64):
+        config = settings(bake__worlds=count, arrangement__max_objects=2)
+        pipeline = physics.make_pipeline(config.physics, build.build_model(config, catalog(CUBE), device).model)
+        assert pipeline.narrow_phase.split_gjk_mpr == device.is_cuda
+    assert {collide._SPLIT_GJK_MPR_LEAN_PAIR_COUNT_THRESHOLD, collide._SPLIT_GJK_MPR_FULL_PAIR_COUNT_THRESHOLD} == {0}
