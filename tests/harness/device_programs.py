@@ -10,8 +10,10 @@ from collections.abc import Sequence
 from types import SimpleNamespace
 
 from synpick_warp.errors import OutputError
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.system.processes.worker import start_process
+from tests.harness.processes import wait_for
 
 FOREVER = 60.0
 """Longer than any test waits [s]."""
@@ -23,28 +25,26 @@ def program(behaviour: str) -> str:
     return f"from synpick_warp.factory.worker import main; from {__name__} import {behaviour}; main({behaviour})"
 
 
-def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> SimpleNamespace:
+def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> BakeSummary:
     """Report each episode, and end."""
     link.stage("compiling")
     link.note("an object is never drawn")
     for done, episode in enumerate(share.episodes, start=1):
         counts = {"episodes": len(share.episodes), "worlds_active": 1, "views_per_s": 2.0, "seconds_left": 10.0 * episode}
         link.update(episodes_done=done, views=3 * done, **counts)
-    return SimpleNamespace(episodes=share.episodes, stopped=0)
+    return BakeSummary(episodes=share.episodes)
 
 
-def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
     """Start a writer that never ends by itself, report its process id, and wait for a stop; the first device is ended by SIGTERM."""
     writer = start_process(_SLEEPER, (), handles)
     link.writers = (writer.process.pid,)
     link.note(f"{os.getpid()} {writer.process.pid}")
     if share.episodes == [0]:
         os.kill(os.getpid(), signal.SIGTERM)
-    deadline = time.monotonic() + FOREVER
-    while not link.number and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(lambda: bool(link.number), FOREVER)
     writer.kill()
-    return SimpleNamespace(episodes=[], stopped=link.number)
+    return BakeSummary(stopped=link.number)
 
 
 def ignore_stop(_: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> None:
@@ -55,14 +55,14 @@ def ignore_stop(_: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> N
     time.sleep(FOREVER)
 
 
-def die(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+def die(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
     """The first device is killed, the others finish."""
     if share.episodes == [0]:
         os.kill(os.getpid(), signal.SIGKILL)
     return finish(share, handles, link)
 
 
-def fail(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+def fail(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
     """The first device has an error of the program, the others finish."""
     if share.episodes == [0]:
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (for the rest of the process)
@@ -70,7 +70,7 @@ def fail(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> Simp
     return finish(share, handles, link)
 
 
-def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
     """The first device has an error that the user can correct, the others wait."""
     if share.episodes == [0]:
         raise OutputError("cannot write here")

@@ -1,4 +1,4 @@
-"""Processes of devices: what they report, how they are stopped and lost, and that none of them outlives the bake."""
+"""Processes of devices: what they report, how they are stopped and lost, that none outlives the bake; and the bytes of bakes on several."""
 
 from __future__ import annotations
 
@@ -7,39 +7,34 @@ import signal
 import subprocess
 import sys
 import threading
-import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from synpick_warp.cli.main import EXIT_MISTAKE, main
+from synpick_warp.dataset.commit.manifest import committed_episodes
+from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.factory.devices import DeviceProcesses
+from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.hardware import device as devices
 from synpick_warp.system.hardware.device import describe_kinds, pick_devices
-from tests.builders import refusal
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import assignments, mistake, refusal
+from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.device_programs import program
-from tests.harness.processes import wait_until_gone
+from tests.harness.exporter_contract import digests
+from tests.harness.processes import wait_for, wait_until_gone
+from tests.worlds.small_worlds import QUICK
 
 
-class Summary:
-    """Summary of a bake, as far as the processes use it: two episodes are there from before."""
-
-    def __init__(self) -> None:
-        self.total, self.resumed, self.stopped = 5, 2, 0
-        self.episodes = [10, 11]
-
-    def take_summary(self, other: SimpleNamespace) -> None:
-        self.episodes += other.episodes
-        self.stopped = self.stopped or other.stopped
-
-
-class Reports:
+class Reports(SilentProgress):
     """Observer that keeps all reports."""
 
     def __init__(self) -> None:
-        self.stages: list[str] = []
-        self.notes: list[str] = []
-        self.updates: list[dict] = []
+        self.stages, self.notes, self.updates = [], [], []
 
     def stage(self, text: str) -> None:
         self.stages.append(text)
@@ -50,6 +45,10 @@ class Reports:
     def update(self, **counts: object) -> None:
         self.updates.append(counts)
 
+    def pids(self) -> list[int]:
+        """Processes and writers that have reported themselves."""
+        return [int(number) for note in self.notes for number in note.split() if number.isdigit()]
+
 
 @pytest.fixture
 def lock(tmp_path):
@@ -58,9 +57,9 @@ def lock(tmp_path):
     os.close(handle)
 
 
-def run(lock: int, behaviour: str, shares: list[list[int]], reports: Reports | None = None) -> tuple[str, Summary, Reports]:
-    """Which devices were lost, and what was reported, of a bake with a share per device."""
-    summary, reports = Summary(), reports or Reports()
+def run(lock: int, behaviour: str, shares: list[list[int]], reports: Reports | None = None) -> tuple[str, BakeSummary, Reports]:
+    """Which devices were lost, and what was reported, of a bake with a share per device; two of five episodes are there from before."""
+    summary, reports = BakeSummary(total=5, resumed=2, episodes=[10, 11]), reports or Reports()  # type: ignore[list-item]
     names = [f"cuda:{index}" for index in range(len(shares))]
     with DeviceProcesses(names, program(behaviour), lock) as processes:
         lost = processes.run([SimpleNamespace(episodes=share) for share in shares], summary, reports)  # type: ignore[arg-type]
@@ -70,7 +69,7 @@ def run(lock: int, behaviour: str, shares: list[list[int]], reports: Reports | N
 def test_reports_are_those_of_one_bake(lock):
     lost, summary, reports = run(lock, "finish", [[0, 2], [1]])
     assert lost == ""
-    assert sorted(summary.episodes) == [0, 1, 2, 10, 11]
+    assert summary.episodes == [0, 1, 2, 10, 11]
     assert (reports.stages, reports.notes) == (["compiling"], ["an object is never drawn"])
     last = reports.updates[-1]
     assert (last["episodes_done"], last["episodes"], last["views"]) == (5, 5, 9)
@@ -86,7 +85,7 @@ def test_reports_are_those_of_one_bake(lock):
 def test_a_lost_device_is_named_and_the_others_go_on(lock, behaviour, fault):
     lost, summary, reports = run(lock, behaviour, [[0], [1, 2]])
     assert lost.startswith(f"lost cuda:0: {fault}")
-    assert sorted(summary.episodes) == [1, 2, 10, 11]
+    assert summary.episodes == [1, 2, 10, 11]
     assert any(note.startswith(lost) for note in reports.notes)
 
 
@@ -94,13 +93,13 @@ def test_the_users_error_ends_all_processes_and_their_writers(lock):
     reports = Reports()
     with pytest.raises(OutputError, match=r"^cannot write here$"):
         run(lock, "refuse", [[0], [1], [2]], reports)
-    wait_until_gone(pids(reports), timeout=10.0)
+    wait_until_gone(reports.pids(), timeout=10.0)
 
 
 def test_sigterm_to_one_process_stops_all(lock):
     _, summary, reports = run(lock, "wait_for_stop", [[0], [1]])
     assert summary.stopped == signal.SIGTERM
-    wait_until_gone(pids(reports), timeout=10.0)
+    wait_until_gone(reports.pids(), timeout=10.0)
 
 
 def test_ctrl_c_stops_all_and_the_second_ends_them(lock, capfd):
@@ -115,32 +114,24 @@ def test_ctrl_c_stops_all_and_the_second_ends_them(lock, capfd):
             with pytest.raises(KeyboardInterrupt):
                 run(lock, "ignore_stop", [[1], [2]], reports)
         timer.join()
-        wait_until_gone(pids(reports), timeout=10.0)
+        wait_until_gone(reports.pids(), timeout=10.0)
     assert capfd.readouterr().err.count("stopping after this tick") == 2
 
 
 def interrupt_when_running(reports: Reports, signals: int) -> None:
-    deadline = time.monotonic() + 30
-    while len(reports.notes) < 2 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_for(lambda: len(reports.notes) >= 2)
     for number in range(signals):
         handler = signal.getsignal(signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
         # Signals that wait at the same time count as one: the second comes after the first one's handler, which restores the one before.
-        while number + 1 < signals and signal.getsignal(signal.SIGINT) is handler and time.monotonic() < deadline:
-            time.sleep(0.01)
-
-
-def pids(reports: Reports) -> list[int]:
-    """Processes and writers that have reported themselves."""
-    return [int(number) for note in reports.notes for number in note.split() if number.isdigit()]
+        if number + 1 < signals:
+            wait_for(lambda handler=handler: signal.getsignal(signal.SIGINT) is not handler)
 
 
 PARENT = """
 import os, sys
 from types import SimpleNamespace
 from synpick_warp.factory.devices import DeviceProcesses
-from tests.builders import refusal
 from tests.harness.device_programs import program
 reports = SimpleNamespace(note=lambda text: print(text, flush=True))
 with DeviceProcesses(["cuda:0", "cuda:1"], program("wait_for_stop"), os.open("/", os.O_RDONLY)) as processes:
@@ -200,3 +191,74 @@ def test_wrong_names_of_devices_are_one_line(machine, names, said):
 def test_without_a_gpu_all_is_the_cpu(machine, monkeypatch):
     monkeypatch.setattr(devices.wp, "get_cuda_device_count", lambda: 0)
     assert pick_devices(["all"]) == ("cpu",)
+
+
+# ---- bakes on several devices, here processes of the CPU ----
+
+EPISODES = 10
+"""So many that some are left when the process is killed, on a machine that is used by others, too."""
+SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": ["bop"], "arrangement.max_objects": 2, "render.layers": []}
+SETTINGS |= TINY_PICKS
+"""Objects are the embedded ones: each process loads them for itself."""
+
+
+def command(out: Path) -> list[str]:
+    overrides = {key: value for key, value in (QUICK | SETTINGS).items() if key != "bake.device"}
+    return ["bake", "--out", str(out), "--config", "smoke", *assignments(overrides)]
+
+
+def bake(out: Path, *arguments: str) -> int:
+    return main([*command(out), *arguments])
+
+
+def kill_one(out: Path, killed: list[int]) -> None:
+    """Kill a device's process when an episode is committed."""
+    wait_for(lambda: len(committed_episodes(out)) >= 2, timeout=300)
+    for process in device_processes()[:1]:
+        killed.append(process)
+        os.kill(process, signal.SIGKILL)
+
+
+def device_processes() -> list[int]:
+    """Process ids of the children of this process that simulate."""
+    numbers = [number for task in Path("/proc/self/task").iterdir() for number in (task / "children").read_text().split()]
+    return sorted(int(number) for number in numbers if b"generate_share" in Path(f"/proc/{number}/cmdline").read_bytes())
+
+
+@pytest.mark.slow(minutes=2)
+def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path, capsys):
+    """Begun on one device, continued on two, of which one is killed, and finished on one."""
+    one, several = tmp_path / "one", tmp_path / "several"
+    assert bake(one, "--device", "cpu") == 0
+    assert bake(several, "--device", "cpu", "--episodes", "1") == 0
+    killed: list[int] = []
+    killer = threading.Thread(target=kill_one, args=(several, killed))
+    killer.start()
+    assert bake(several, "--devices", "cpu,cpu") == EXIT_MISTAKE
+    killer.join()
+    there = committed_episodes(several)
+    assert len(killed) == 1
+    assert 2 <= len(there) < EPISODES
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("synpick-warp: error: ")]
+    assert "lost cpu: its process was ended by SIGKILL" in line
+    assert f"{len(there)} of {EPISODES} episodes are complete; the same command resumes" in line
+    assert verify(several).problem == ""
+    assert not (several / PARTIAL).exists()
+    assert bake(several, "--device", "cpu") == 0
+    assert f"{EPISODES} of {EPISODES} episodes ({len(there)} of them before)" in capsys.readouterr().out
+    assert digests(several) == digests(one)
+    assert device_processes() == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--devices", "cpu", "--device", "cpu"], "--device and --devices are both given"),
+        (["--devices", "cpu,cpu", "--profile"], "--profile records the process of one device"),
+        (["--devices", "cpu,cuda:99"], "cuda:99 was requested, but Warp finds "),
+        (["--devices", ""], '--devices names ""; allowed: '),
+    ],
+)
+def test_wrong_options_are_one_line_and_leave_nothing(tmp_path, arguments, said):
+    assert mistake(*command(tmp_path / "set"), *arguments).startswith(said)
+    assert not (tmp_path / "set").exists()
