@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import os
 import subprocess
 import sys
 import weakref
 from collections.abc import Iterator
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,8 +22,10 @@ from synpick_warp.online import stream as online
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.views.layer_codec import decode_layer, encode_layer
+from tests.dataset.test_drawn_cameras import CELL
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
+from tests.worlds.cells import make_camera
 from tests.worlds.small_worlds import QUICK, settings
 
 View = dict[str, np.ndarray]
@@ -204,18 +205,21 @@ def held_by(stream) -> tuple[weakref.ref, ...]:
     return tuple(weakref.ref(part) for part in parts)
 
 
-@pytest.mark.parametrize("end", ["break", "error", "close", "before the first"])
-def test_nothing_is_left_of_a_stream(end):
+@pytest.fixture
+def collects_nothing() -> Iterator[None]:
+    """What is freed is freed by its last reference."""
     gc.collect()
     gc.disable()
-    try:
-        refs = leave(end)
-        assert [ref() for ref in refs] == [None] * len(refs)
-    finally:
-        gc.enable()
+    yield
+    gc.enable()
 
 
-def test_worlds_are_freed_where_a_traceback_holds_the_frames(monkeypatch):
+@pytest.mark.parametrize("end", ["break", "error", "close", "before the first"])
+def test_nothing_is_left_of_a_stream(collects_nothing, end):
+    assert [ref() for ref in leave(end)] == [None] * 6
+
+
+def test_worlds_are_freed_where_a_traceback_holds_the_frames(collects_nothing, monkeypatch):
     """As Warp's code generation leaves them: exceptions in cycles with the frames that caught them, whose callers are the tick loop."""
     tick_parts = Simulation.tick_parts
 
@@ -227,12 +231,7 @@ def test_worlds_are_freed_where_a_traceback_holds_the_frames(monkeypatch):
         return tick_parts(simulation)
 
     monkeypatch.setattr(Simulation, "tick_parts", compile_and_tick)
-    gc.collect()
-    gc.disable()
-    try:
-        assert [ref() for ref in leave("break")] == [None] * 6
-    finally:
-        gc.enable()
+    assert [ref() for ref in leave("break")] == [None] * 6
 
 
 def leave(end: str) -> tuple[weakref.ref, ...]:
@@ -294,8 +293,39 @@ def test_a_script_needs_no_main_guard(tmp_path):
         SCRIPT.format(settings=QUICK | {"bake.device": "cpu"})
         + "import os\nos.execvp('ps', ['ps', '--ppid', str(os.getpid()), '--no-headers'])"
     )
-    root = Path(__file__).resolve().parents[2]
-    environment = checkout_environment(PYTHONPATH=os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")]))
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300)
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, cwd=tmp_path, env=checkout_environment(), timeout=300)
     assert (done.stdout, done.stderr) == ("3 (3, 18, 32, 3)\n", "")
     assert done.returncode == 1  # ps found no children.
+
+
+# ---- [[camera]] tables: two image sizes, drawn and carried cameras ----
+
+CAMERAS = (*CELL, make_camera("small", resolution=[64, 48], fov=40.0))
+SIZES = [(96, 72)] * 3 + [(64, 48)]
+
+
+def test_views_of_two_sizes_are_those_that_a_bake_writes(tmp_path):
+    config = replace(tiny(bake__episodes=1, bake__worlds=1, render__layers=["flow"]), camera=CAMERAS)
+    synpick_warp.bake(config, tmp_path / "set")
+    data, stream = synpick_warp.open(tmp_path / "set"), synpick_warp.stream(config)
+    views = taken(stream)
+    assert views.keys() == {(0, camera, frame) for camera in range(len(SIZES)) for frame in range(len(data[0]))}
+    for (episode, camera, frame), made in views.items():
+        view = data[episode].view(frame, camera)
+        assert made["color"].shape == (*SIZES[camera][::-1], 3)
+        np.testing.assert_array_equal(made["color"], view.rgb)
+        np.testing.assert_array_equal(made["depth"] * np.float32(config.bop.depth_scale / 1000), view.depth)
+        np.testing.assert_allclose(made["intrinsics"], view.intrinsics, rtol=1e-6)
+        np.testing.assert_allclose(made["world_to_camera"], view.world_to_camera, rtol=0, atol=1e-6)
+        present = made["object_id"] >= 0
+        np.testing.assert_allclose(made["object_to_camera"][present], view.object_to_camera, rtol=0, atol=1e-6)
+        if camera in (0, 2):
+            np.testing.assert_allclose(made["host_matrix"], view.intrinsics, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(made["host_translation"], view.world_to_camera[:3, 3], rtol=0, atol=1e-12)
+
+
+def test_a_choice_of_cameras_gives_those_alone():
+    config = replace(tiny(bake__episodes=1, bake__worlds=1), camera=CAMERAS)
+    views = taken(synpick_warp.stream(config, cameras=[3, 0], stride=2))
+    assert {camera for _, camera, _ in views} == {0, 3}
+    assert {frame % 2 for *_, frame in views} == {0}
