@@ -1,4 +1,4 @@
-"""Environment of whole picks: seeds, rewards, resets, states, and actions that are refused."""
+"""Environment of whole picks, and of twists: seeds, rewards, resets, states, and actions that are refused."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.environment.episodes import Episodes, make_seeds
 from synpick_warp.environment.make import make_picking
+from synpick_warp.environment.picking import TWIST_SPEED
 from synpick_warp.environment.settings import make_choice
 from synpick_warp.errors import ActionError, ConfigError, StateError
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.trials import Trials, own_grasps
 from synpick_warp.system.random_numbers import _mix
 from tests.builders import PICKING, boxes
-from tests.environment.conftest import SIZE, build, centers, same
+from tests.environment.conftest import build, centers, same
 from tests.worlds.small_worlds import QUICK
 
 FLOOR = 1e-3
@@ -113,25 +114,6 @@ def test_an_empty_bin_terminates_the_episode(environment):
     assert (again.reward[world], again.terminated[world], again.info["steps"][world]) == (0.0, False, 0)
 
 
-@pytest.mark.parametrize(
-    ("actions", "message"),
-    [
-        ([[1, 2], [64, 2]], r"environment 1 lies outside of the image: \[64, 2\]; allowed: \[0, 0\] to \[63, 47\]"),
-        ([[-1, 2], [3, 2]], "environment 0 lies outside of the image"),
-        ([[1.0, np.nan], [3, 2]], "the action of environment 0 is not finite"),
-        ([[1.5, 2.0], [3, 2]], "the action of environment 0 is no pixel"),
-        ([1, 2], r"actions have the shape \(2,\); allowed: \(2, 2\), of a pixel for each environment"),
-        ([[1, 2], [3]], "actions have no common shape"),
-        ([["a", "b"]] * 2, "allowed: numbers"),
-    ],
-)
-def test_bad_actions_are_refused(environment, actions, message):
-    before = environment.observe()
-    with pytest.raises(ActionError, match=message):
-        environment.step(actions)
-    assert same(environment.observe(), before)
-
-
 # ---- the ends of episodes ----
 
 
@@ -172,29 +154,6 @@ def test_disabled_waits_for_a_reset_of_the_mask(environment):
     assert info["episode_index"][1] != last.info["episode_index"][1]
     assert obs["depth"][0].tobytes() == last.obs["depth"][0].tobytes()
     assert environment.step(floor_pixels(obs)).info["steps"].tolist() == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"env": [0]}, "reset has no option env; options: reset_mask, env_idx, episode"),
-        ({"reset_mask": np.ones(3, bool)}, "reset_mask has the type bool and the shape"),
-        ({"reset_mask": np.ones(2)}, "reset_mask has the type float64"),
-        ({"env_idx": [2]}, "allowed: different environments of 0 to 1"),
-        ({"env_idx": [0, 0]}, "allowed: different environments"),
-        ({"episode": -1}, "allowed: an index from 0 on, or one for each of 2 environments"),
-        ({"episode": [1, 2, 3]}, "episode is"),
-    ],
-)
-def test_bad_options_are_refused(environment, options, message):
-    with pytest.raises(ConfigError, match=message):
-        environment.reset(options=options)
-
-
-@pytest.mark.parametrize("seed", [[1], [1, "b"], [1, True], "ab", -1, [3, -1]])
-def test_bad_seeds_are_refused(environment, seed):
-    with pytest.raises(ConfigError, match=r"for each of 2 environments$"):
-        environment.reset(seed=seed)
 
 
 @pytest.mark.parametrize("seed", [3, np.int64(3), [3, 4], np.array([3, 4])])
@@ -253,34 +212,61 @@ def test_a_state_continues_as_before(environment):
 
 
 @pytest.mark.parametrize(
-    ("ask", "message"),
+    ("changes", "message"),
     [
-        (lambda one: one.branch(0, [2]), "there is no environment 2; there are 0 to 1"),
-        (lambda one: one.state_from_host({}), "the state lacks episodes.seed; allowed: all arrays"),
-        (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"version": np.array(0)}), "the state has version 0"),
-        (lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"catalog": np.array("ab")}), "of another catalog"),
-        (
-            lambda one: one.state_from_host(one.state_to_host(one.get_state()) | {"episodes.steps": np.zeros(3, int)}),
-            r"episodes.steps of the state is int64 \(3,\); allowed: int64 \(2,\)",
-        ),
-        (lambda one: one.worlds.bank.fetch(range(99)), "99 piles are asked for at once, but the bank keeps [48]"),
-        (lambda one: one.worlds.set_state(one.worlds.simulation.get_state([0]), [0]), "the state is of 1 environments, not of 2"),
+        ({"episodes.seed": None}, "the state lacks episodes.seed; allowed: all arrays"),
+        ({"version": np.array(0)}, "the state has version 0"),
+        ({"episodes.steps": np.zeros(3, int)}, r"episodes.steps of the state is int64 \(3,\); allowed: int64 \(2,\)"),
     ],
 )
-def test_states_that_do_not_fit_are_refused(environment, ask, message):
+def test_states_that_do_not_fit_are_refused(environment, changes, message):
+    arrays = dict(environment.state_to_host(environment.get_state())) | changes
     with pytest.raises(StateError, match=message):
+        environment.state_from_host({name: array for name, array in arrays.items() if array is not None})
+
+
+BAD_ACTIONS = [
+    ([[1, 2], [64, 2]], r"environment 1 lies outside of the image: \[64, 2\]; allowed: \[0, 0\] to \[63, 47\]"),
+    ([[-1, 2], [3, 2]], "environment 0 lies outside of the image"),
+    ([[1.0, np.nan], [3, 2]], "the action of environment 0 is not finite"),
+    ([[1.5, 2.0], [3, 2]], "the action of environment 0 is no pixel"),
+    ([1, 2], r"actions have the shape \(2,\); allowed: \(2, 2\), of a pixel for each environment"),
+    ([[1, 2], [3]], "actions have no common shape"),
+    ([["a", "b"]] * 2, "allowed: numbers"),
+]
+BAD_OPTIONS = [
+    ({"env": [0]}, "reset has no option env; options: reset_mask, env_idx, episode"),
+    ({"reset_mask": np.ones(3, bool)}, "reset_mask has the type bool and the shape"),
+    ({"reset_mask": np.ones(2)}, "reset_mask has the type float64"),
+    ({"env_idx": [2]}, "allowed: different environments of 0 to 1"),
+    ({"env_idx": [0, 0]}, "allowed: different environments"),
+    ({"episode": -1}, "allowed: an index from 0 on, or one for each of 2 environments"),
+    ({"episode": [1, 2, 3]}, "episode is"),
+]
+BAD_STATES = [
+    (lambda one: one.branch(0, [2]), "there is no environment 2; there are 0 to 1"),
+    (lambda one: one.worlds.bank.fetch(range(99)), "99 piles are asked for at once, but the bank keeps [48]"),
+    (lambda one: one.worlds.set_state(one.worlds.simulation.get_state([0]), [0]), "the state is of 1 environments, not of 2"),
+]
+
+
+@pytest.mark.parametrize(
+    ("ask", "error", "message"),
+    [
+        *((lambda one, actions=actions: one.step(actions), ActionError, message) for actions, message in BAD_ACTIONS),
+        *((lambda one, options=options: one.reset(options=options), ConfigError, message) for options, message in BAD_OPTIONS),
+        *(
+            (lambda one, seed=seed: one.reset(seed=seed), ConfigError, "for each of 2 environments$")
+            for seed in ([1], [1, "b"], [1, True], "ab", -1, [3, -1])
+        ),
+        *((ask, StateError, message) for ask, message in BAD_STATES),
+    ],
+)
+def test_mistakes_are_refused_and_change_nothing(environment, ask, error, message):
+    before = environment.observe()
+    with pytest.raises(error, match=message):
         ask(environment)
-
-
-def test_more_branches_than_memory_holds_are_refused(environment, monkeypatch):
-    monkeypatch.setattr("synpick_warp.stages.sim.states.free_host_memory", lambda: 1000)
-    monkeypatch.setattr("synpick_warp.stages.sim.states.free_device_memory", lambda device: 1000)
-    with pytest.raises(StateError, match=r"states of 2 worlds take .* are free; take at most 0"):
-        environment.get_state()
-
-
-def test_pixels_are_those_of_the_user(environment):
-    assert environment.observe()["depth"].shape == (2, SIZE[1], SIZE[0])
+    assert same(environment.observe(), before)
 
 
 def test_a_pixel_is_picked_as_its_label_was(device):
@@ -300,3 +286,86 @@ def test_a_pixel_is_picked_as_its_label_was(device):
         for name in ("point", "normal", "yaw", "tilt"):
             np.testing.assert_allclose(getattr(worlds.simulation.plan, name).numpy()[0], getattr(grasps, name).numpy()[row], atol=1e-6)
         environment.set_state(state)
+
+
+# ---- twists: a setpoint that follows velocities, a seal that a bit switches, and stirring ----
+
+APPROACH = 0.015
+"""Distance beside an object within which the gripper descends [m]."""
+
+
+@pytest.fixture(scope="module")
+def pick(device):
+    return build(device, action="twist", obs=("state",), max_steps=200)
+
+
+@pytest.fixture(scope="module")
+def move(device):
+    return build(device, task="move", obs=("state", "depth"), max_steps=200)
+
+
+def servo(state: np.ndarray) -> np.ndarray:
+    """Twist of each world's gripper to its highest object, and up with what it holds."""
+    twists = []
+    for values in state:
+        objects, wrist = values[6:].reshape(-1, 10), values[:3]
+        if values[5] > 0:
+            twists.append((0, 0, 1, 0, 0, 1))
+            continue
+        highest = objects[np.argmax(np.where(objects[:, 0] > 0, objects[:, 5], -1.0))]
+        across = highest[3:5] - wrist[:2]
+        down = -0.8 if np.linalg.norm(across) < APPROACH else 0.0
+        twists.append((*np.clip(10 * across, -1, 1), down, 0, 0, 1))
+    return np.array(twists)
+
+
+def test_the_wrist_moves_as_it_is_told(pick):
+    obs = pick.reset(seed=3)[0]
+    pick.step(np.zeros((2, 6)))
+    before = pick.observe()["state"]
+    for _ in range(8):
+        obs = pick.step([[1, 0, 0, 0.5, 0, -1], [0, -0.5, 0, 0, 9, -1]]).obs
+    time = 8 * pick.worlds.simulation.config.physics.tick_time
+    moved = (obs["state"] - before)[:, :5]
+    np.testing.assert_allclose(moved[:, :3], [[TWIST_SPEED * time, 0, 0], [0, -0.5 * TWIST_SPEED * time, 0]], atol=0.02)
+    np.testing.assert_allclose(moved[:, 3], [0.5 * time, 0.0], rtol=1e-5)
+    assert moved[1, 4] == pytest.approx(time, abs=0.1)  # A drive turns the cup, which lags.
+
+
+def test_suction_picks_what_it_is_lowered_on_and_lets_go_without(pick):
+    obs, rewards, outcomes = pick.reset(seed=3)[0], np.zeros(2), set()
+    released = False
+    for _ in range(70):
+        if obs["state"][:, 5].any() and not released:
+            before = pick.get_state()
+            assert not pick.step([[0, 0, 0, 0, 0, -1]] * 2).obs["state"][:, 5].any()
+            pick.set_state(before)
+            released = True
+        step = pick.step(servo(obs["state"]))
+        obs, rewards = step.obs, rewards + step.reward
+        outcomes |= set(step.info["outcome"].tolist())
+    assert released
+    assert rewards.max() >= 1.0
+    assert outcomes <= {Outcome.NONE, Outcome.TARGET_PICKED, Outcome.OTHER_PICKED}
+
+
+@pytest.mark.slow
+def test_stirring_moves_objects(move):
+    obs = move.reset(seed=3)[0]
+    moved = np.zeros(2)
+    for _ in range(30):
+        twists = servo(obs["state"])
+        twists[:, 2] = -1
+        step = move.step(twists)
+        obs, moved = step.obs, moved + step.reward
+    assert moved.max() >= 1.0
+
+
+def test_bad_twists_are_refused(pick):
+    pick.reset(seed=3)
+    for twist, message in (
+        ([np.nan] * 6, "the action of environment 0 is not finite"),
+        ([0.0] * 5, r"shape \(2, 5\); allowed: \(2, 6\), of a"),
+    ):
+        with pytest.raises(ActionError, match=message):
+            pick.step([twist] * 2)
