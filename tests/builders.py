@@ -21,22 +21,15 @@ from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.progress import SilentProgress
+from tests.worlds import small_worlds
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 
-COARSE = {
-    "physics.step": 4e-3,
-    "physics.steps_per_tick": 16,
-    "physics.substeps": 1,
-    "physics.iterations": 6,
-    "render.coarse_pixel": 2,
-    "render.coarse_paths": 1,
-}
+COARSE = small_worlds.COARSE | {"render.coarse_pixel": 2, "render.coarse_paths": 1}
 """Settings under which physics takes few steps, and light few paths."""
 STIRRING = COARSE | {"move.speed": 4.0}
 """Episodes of some ten frames."""
-PICKING = COARSE | {key.replace("__", "."): value for key, value in SHORT.items()}
-PICKING |= {"arrangement.max_objects": 2, "pick.failures": 1, "perception.resolution": [160, 90]}
+PICKING = COARSE | SHORT | {"arrangement.max_objects": 2, "pick.failures": 1, "perception.resolution": [160, 90]}
 """Two objects, picked or not."""
 PICKED = PICKING | {
     "bake.worlds": 2,

@@ -64,7 +64,7 @@ def drawn(device, count: object, worlds: int = 400, **more):
         **more,
     )
     made.begin(Phase.START)
-    arrange.sample_episodes(made.scene, made.state, SEED)
+    made.run(arrange.sample_episodes, SEED)
     return made
 
 
@@ -84,7 +84,7 @@ def test_distractors_follow_the_objects_which_are_those_of_a_cell_without_any(de
 
 def test_each_body_has_a_slot_of_its_type_of_its_own(device):
     made = drawn(device, 3)
-    index, slot = made.state.catalog_index.numpy(), made.state.body_slot.numpy()
+    index, slot = made["catalog_index"], made["body_slot"]
     for row, slots in zip(index, slot, strict=True):
         used = slots[row >= 0]
         assert len(set(used)) == len(used)
@@ -94,16 +94,16 @@ def test_each_body_has_a_slot_of_its_type_of_its_own(device):
 def test_draws_are_those_of_the_episode_and_its_arrangement(device):
     many, few = drawn(device, {"uniform": [0, 3]}), drawn(device, {"uniform": [0, 3]}, worlds=3)
     few.begin(Phase.START, [399, 7, 200])
-    arrange.sample_episodes(few.scene, few.state, SEED)
-    np.testing.assert_array_equal(few.state.catalog_index.numpy(), many.state.catalog_index.numpy()[[399, 7, 200]])
+    few.run(arrange.sample_episodes, SEED)
+    np.testing.assert_array_equal(few["catalog_index"], many.state.catalog_index.numpy()[[399, 7, 200]])
     key = rng.stream_key(SEED, 7, 0, Stream.DISTRACTORS)
     assert (many.state.catalog_index.numpy()[7] >= 2).sum() == round(3 * float(rng.uniform(key, 6 * 7)))
 
 
 def test_distractors_lie_anywhere_in_the_column(device):
     made = drawn(device, 1)
-    arrange.drop_objects(made.scene, made.state, made.physics, SEED)
-    index, slot = made.state.catalog_index.numpy(), made.state.body_slot.numpy()
+    made.run(arrange.drop_objects, SEED)
+    index, slot = made["catalog_index"], made["body_slot"]
     heights = made.coordinates()[..., 2]
     ranks = []
     for world in range(400):
@@ -123,14 +123,13 @@ def test_slots_suffice_but_for_the_accepted_share():
 def test_a_bin_is_emptied_when_distractors_alone_are_left(device):
     made = drawn(device, 2, worlds=3)
     made.begin(Phase.ACT)
-    made.set(made.state.mode, Mode.PICK)
-    made.set(made.attempts.task, Task.LOOK)
+    made.put(mode=Mode.PICK, task=Task.LOOK)
     made.scene.pick.failures = 1
     left = np.full((3, made.instances), -1)
     left[0, 3], left[1, :2] = 2, (1, 3)
-    made.set(made.state.catalog_index, left)
-    arrange.judge_episodes(made.scene, made.state, made.attempts, made.observation, made.physics)
-    assert made.state.ending.numpy().tolist() == [Ending.EMPTIED, Ending.RUNNING, Ending.EMPTIED]
+    made.put(catalog_index=left)
+    made.run(arrange.judge_episodes)
+    assert made["ending"].tolist() == [Ending.EMPTIED, Ending.RUNNING, Ending.EMPTIED]
 
 
 # ---- data sets ----

@@ -11,17 +11,11 @@ import pytest
 from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.environment.settings import make_choice
-from tests.worlds.small_worlds import COARSE, QUICK
+from tests.worlds.small_worlds import COARSE, QUICK, QUICK_PICKS
 
 SIZE = (64, 48)
-BRIEF = {key.replace("__", "."): value for key, value in COARSE.items()} | {
-    "pick.appear_height": 0.2,
-    "pick.near_speed": 0.5,
-    "pick.lift_height": 0.2,
-    "pick.lift_speed": 1.2,
-    "physics.guide_height": 0.4,
-}
-SETTINGS = {key: value for key, value in QUICK.items() if key.split(".")[0] in ("arrangement", "settle", "move")} | BRIEF
+SETTINGS = {key: value for key, value in QUICK.items() if key.split(".")[0] in ("arrangement", "settle", "move")}
+SETTINGS |= COARSE | QUICK_PICKS | {"physics.guide_height": 0.4}
 SETTINGS.pop("settle.tries")
 """Three objects that settle soon, and attempts of few and short ticks."""
 ARGUMENTS: dict[str, Any] = {

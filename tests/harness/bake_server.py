@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import json
 import os
 import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
-from tests.worlds.small_worlds import QUICK, catalog
+from tests.worlds.small_worlds import QUICK, QUICK_PICKS, catalog
 
 TINY = {
     "bake.device": "cpu",  # A forked process cannot use its parent's CUDA context.
@@ -37,13 +39,9 @@ TINY = {
     "settle.max_time": 3.0,
 }
 """Overrides on top of QUICK: an episode takes less than a second."""
-TINY_PICKS = {
+TINY_PICKS = QUICK_PICKS | {
     "bake.mode": "pick",
     "bake.formats": ["bop", "picks"],
-    "pick.appear_height": 0.2,
-    "pick.near_speed": 0.5,
-    "pick.lift_height": 0.2,
-    "pick.lift_speed": 1.2,
     "pick.failures": 1,
     "perception.resolution": [160, 90],
     "picks.states": 1,
@@ -168,11 +166,11 @@ def _prepare(request: dict) -> None:
 
         pipeline.WriterPool = make_inline_pool
     if "kill_at" in request:
-        _kill_at(request["kill_at"], request["out"])
+        _watch(request["out"], lambda number: os.kill(os.getpid(), signal.SIGKILL) if number == request["kill_at"] else None)
     if "allocated" in request:
         _fill_allocations(request["allocated"])
     if "count" in request:
-        _count(Path(request["count"]), request["out"])
+        _watch(request["out"], lambda number: Path(request["count"]).write_text(str(number)))
 
 
 def _fill_allocations(value: int) -> None:
@@ -191,33 +189,16 @@ def _fill_allocations(value: int) -> None:
         ctypes.CDLL(None).mallopt(_PERTURB, perturb)
 
 
-def _kill_at(nth: int, out: str) -> None:
-    """Kill this process before the nth change to the data set's folder."""
-    left = [nth]
+def _watch(out: str, at_change: Callable[[int], object]) -> None:
+    """Call with the number of each change to the data set's folder, before it is made."""
+    numbers = itertools.count(1)
 
     def watch(event: str, arguments: tuple) -> None:
-        if _is_change(event, arguments, out):
-            left[0] -= 1
-            if left[0] == 0:
-                os.kill(os.getpid(), signal.SIGKILL)
+        reads = event == "open" and arguments[1] in ("r", "rb", None)
+        if event in _EVENTS and str(arguments[0]).startswith(out) and not reads:
+            at_change(next(numbers))
 
     sys.addaudithook(watch)
-
-
-def _count(file: Path, out: str) -> None:
-    """Count the changes to the data set's folder in a file."""
-    count = [0]
-
-    def watch(event: str, arguments: tuple) -> None:
-        if _is_change(event, arguments, out):
-            count[0] += 1
-            file.write_text(str(count[0]))
-
-    sys.addaudithook(watch)
-
-
-def _is_change(event: str, arguments: tuple, out: str) -> bool:
-    return event in _EVENTS and str(arguments[0]).startswith(out) and not (event == "open" and arguments[1] in ("r", "rb", None))
 
 
 if __name__ == "__main__":

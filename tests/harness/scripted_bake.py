@@ -23,31 +23,14 @@ from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import box_views, trajectories
+from tests.worlds.attempt_records import seen_object
 from tests.worlds.pick_tables import pick_batch
 
 FRAMES = 2
 INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}
+SEEN = {"visible": 5, "centroid": [1.0, 1.5], "midpoint": [1.0, 1.25], "distances": [1.0, 0.5, 0.75], "depth": 1.9, "ancestors": [3]}
 ATTEMPT = trajectories.ATTEMPT | {
-    "observation": {
-        "resolution": [4, 3],
-        "instances": [
-            {
-                "instance": 2,
-                "object_id": 7,
-                "visible": 5,
-                "visible_fraction": 0.5,
-                "pole": [1.0, 1.0],
-                "centroid": [1.0, 1.5],
-                "midpoint": [1.0, 1.25],
-                "distances": [1.0, 0.5, 0.75],
-                "grasp_pixel": [1, 1],
-                "depth": 1.9,
-                "above": [],
-                "ancestors": [3],
-            }
-        ],
-        "votes": [[2, 3, 0.5]],
-    }
+    "observation": {"resolution": [4, 3], "instances": [seen_object(2, 7, (1.0, 1.0), **SEEN)], "votes": [[2, 3, 0.5]]}
 }
 _LENSES = box_views.cameras(16, 12)
 

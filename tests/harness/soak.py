@@ -57,20 +57,6 @@ def relabel(batch: Any, episodes: np.ndarray, frame: int) -> Any:
     return dataclasses.replace(batch, episode=index, frame=np.full(len(index), frame, np.int32))
 
 
-def make_frames(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
-    """View and tick batches of REPEATED frames."""
-    worlds = tuple(range(WORLDS))
-    views = list(box_views.batches(WORLDS * len(lenses), worlds, REPEATED, lenses))
-    return list(zip(views, trajectories.ticks(worlds, REPEATED), strict=True))
-
-
-def make_end(episode: int) -> EpisodeEnd:
-    """Successful end of an episode, with one attempt."""
-    row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
-    attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
-    return EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
-
-
 def sample(pool: WriterPool) -> tuple[int, int]:
     """Measure resident memory [B] and number of open files of the bake and its writers."""
     memory = files = 0
@@ -83,8 +69,9 @@ def sample(pool: WriterPool) -> tuple[int, int]:
 def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     """Run the writers; returns samples of memory and of open files."""
     config, lenses = settings()
-    needs = Needs.of(config)
-    frames = make_frames(lenses)
+    needs, worlds = Needs.of(config), tuple(range(WORLDS))
+    views = box_views.batches(WORLDS * len(lenses), worlds, REPEATED, lenses)
+    frames: list[tuple[FrameBatch, TickBatch]] = list(zip(views, trajectories.ticks(worlds, REPEATED), strict=True))
     memory, files = [], []
     with OutputFolder(out, config, ()) as output, WriterPool(writers, needs.slot_bytes, output.lock) as pool:
         exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), lenses, skies(), pool))
@@ -92,12 +79,14 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)
             episodes = np.arange(WORLDS) + WORLDS * first
-            views, worlds = frames[frame % REPEATED]
-            exporters.write_ticks(relabel(worlds, episodes, frame))
-            exporters.write_views(relabel(views, episodes, frame))
+            view_batch, tick_batch = frames[frame % REPEATED]
+            exporters.write_ticks(relabel(tick_batch, episodes, frame))
+            exporters.write_views(relabel(view_batch, episodes, frame))
             if frame == FRAMES - 1:
                 for episode in episodes.tolist():
-                    end = make_end(episode)
+                    row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
+                    attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
+                    end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
                     exporters.end_episode(end, partial(output.commit, exporters, pool, end))
                 _remove_old(out, exporters, WORLDS * (first - KEPT))
             if (tick + 1) % max(1, ticks // SAMPLES) == 0:

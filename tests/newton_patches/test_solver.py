@@ -21,8 +21,7 @@ from synpick_warp.newton_patches.narrow_phase import BLOCK
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.cubes import place_cubes
-from tests.worlds.small_worlds import catalog, settings
+from tests.worlds.small_worlds import catalog, place_cubes, settings
 
 TICKS = 30
 ARCHITECTURE, BODIES, ROWS, GRIPPER_ROWS, MOST_BODIES = 90, 5, 96, 256, 253

@@ -251,7 +251,7 @@ def test_the_whole_planner(device):
     harness = GraspHarness(device, ToyScene([entry(box(0.2, 0.15, 0.04)), entry(box(0.12, 0.08, 0.04))], placed, (VIEW,)))
     harness.images.views.world.assign(np.array([0, 1, 2, -1]))
     worlds, attempts = harness.worlds, allocate(AttemptState, {"world": 4, "instance": 4, "word": 1}, device)
-    worlds.set(worlds.state.catalog_index, [[0, 1, -1, -1], [1, 0, -1, -1], [-1] * 4, [0, -1, -1, -1]])
+    worlds.put(catalog_index=[[0, 1, -1, -1], [1, 0, -1, -1], [-1] * 4, [0, -1, -1, -1]])
     for name in ("contour", "contour_length"):
         getattr(harness.arrays, name).assign(harness.expected[name])
     for name in ("visible", "visible_fraction", "grasp_pixel", "depth"):

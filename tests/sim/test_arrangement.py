@@ -1,8 +1,9 @@
-"""Which objects are expected_arrangements, where they fall from, and who gets which episode."""
+"""Which episode a world gets; its mode, objects and light, and where the objects fall from."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Mode, Phase, Stream
-from synpick_warp.configs.schema import Split
+from synpick_warp.configs.episodes.randomize import Distribution, Randomize
+from synpick_warp.configs.schema import Config, Split
 from synpick_warp.kernels.sim.drop import PARKED_HEIGHT
-from synpick_warp.scenes import build
-from synpick_warp.stages.constants import make_scene_data
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.stages.constants import mode_data, mode_rows
+from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.sim import arrange
 from tests.twins import arrangement, rng
 from tests.worlds import small_worlds
@@ -22,6 +25,22 @@ from tests.worlds.kernel_worlds import BIN, KernelWorlds, arrangement_worlds
 
 WORLDS = 24
 SEED = 2**40 + 3
+CYCLE = [Mode.PICK, Mode.TARGET, Mode.MOVE]
+
+
+def drawn(device, worlds: int = WORLDS, episodes=None, arrangement: object = 0, **sizes) -> KernelWorlds:
+    """Worlds whose episodes are sampled; see `arrangement_worlds`."""
+    result = arrangement_worlds(device, worlds, **sizes)
+    result.begin(Phase.START, episodes, arrangement)
+    result.run(arrange.sample_episodes, SEED)
+    return result
+
+
+def dropped(device, worlds: int = WORLDS, episodes=None, arrangement: object = 0, **sizes) -> KernelWorlds:
+    """Worlds whose objects begin to fall."""
+    result = drawn(device, worlds, episodes, arrangement, **sizes)
+    result.run(arrange.drop_objects, SEED)
+    return result
 
 
 @st.composite
@@ -50,42 +69,41 @@ def catalogs(draw):
 def may_repeat(worlds: KernelWorlds, world: int) -> bool:
     """Whether objects may come several times in the mode that this world has."""
     drop = worlds.scene.drop
-    return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == Mode.MOVE else drop.pick_repeats)
+    return bool(drop.move_repeats if worlds["mode"][world] == Mode.MOVE else drop.pick_repeats)
 
 
-def expected_arrangements(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
-    """Arrangement that the twin samples for each world, in the mode of that world."""
-    return [
-        arrangement.sample_objects(
-            seed,
-            *map(int, arrangement_id),
-            volume=worlds.volume,
-            compound=worlds.compound,
-            budget=worlds.scene.drop.volume,
-            exceed=bool(worlds.scene.drop.exceed),
-            repeats=may_repeat(worlds, world),
-            room=worlds.instances,
-            single_slots=worlds.single_slots,
-            compound_slots=worlds.compound_slots,
-        )
-        for world, arrangement_id in enumerate(worlds.state.arrangement_id.numpy())
-    ]
+def expected_arrangement(worlds: KernelWorlds, world: int, seed: int) -> arrangement.Arrangement:
+    """Arrangement that the twin samples for a world, in its mode."""
+    return arrangement.sample_objects(
+        seed,
+        *map(int, worlds["arrangement_id"][world]),
+        volume=worlds.volume,
+        compound=worlds.compound,
+        budget=worlds.scene.drop.volume,
+        exceed=bool(worlds.scene.drop.exceed),
+        repeats=may_repeat(worlds, world),
+        room=worlds.instances,
+        single_slots=worlds.single_slots,
+        compound_slots=worlds.compound_slots,
+    )
 
 
 @given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), arrangement=st.integers(0, 20))
 def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, arrangement, device):
     worlds = arrangement_worlds(device, WORLDS, **sizes)
     worlds.begin(Phase.START, first + np.arange(WORLDS), arrangement)
-    worlds.set(worlds.state.catalog_index, 99)
-    arrange.sample_episodes(worlds.scene, worlds.state, seed)
-    catalog_index, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
-    for world, expected in enumerate(expected_arrangements(worlds, seed)):
+    worlds.put(catalog_index=99)
+    worlds.run(arrange.sample_episodes, seed)
+    catalog_index, slot = worlds["catalog_index"], worlds["body_slot"]
+    for world in range(WORLDS):
+        expected = expected_arrangement(worlds, world, seed)
         count = len(expected.entries)
         assert tuple(catalog_index[world, :count]) == expected.entries
         assert (catalog_index[world, count:] == -1).all()
         assert tuple(slot[world, :count]) == expected.slots
-        state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
-        assert state == ((Phase.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (Phase.START, Ending.RUNNING))
+        assert (worlds["phase"][world], worlds["ending"][world]) == (
+            (Phase.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (Phase.START, Ending.RUNNING)
+        )
         check_law(worlds, world, catalog_index[world, :count], slot[world, :count])
 
 
@@ -110,121 +128,77 @@ def check_law(worlds: KernelWorlds, world: int, catalog_index: np.ndarray, slot:
 # ---- modes ----
 
 
-@pytest.fixture(scope="module")
-def built(device) -> build.BuiltModel:
-    return build.build_model(small_worlds.settings(), small_worlds.catalog(), device)
-
-
-def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, arrangement: object = 0) -> np.ndarray:
+def modes(device, config: Config, episodes: np.ndarray, arrangement: object = 0) -> np.ndarray:
     """Mode of each episode, one world an episode, from settings to the device and back."""
-    config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
-    worlds = arrangement_worlds(device, worlds=len(episodes))
-    scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
-    worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
+    worlds = arrangement_worlds(device, len(episodes))
+    worlds.scene = dataclasses.replace(worlds.scene, modes=mode_data(mode_rows(config.bake, config.splits), device))
     worlds.begin(Phase.START, episodes, arrangement)
-    worlds.set(worlds.state.mode, 99)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    return worlds.state.mode.numpy()
+    worlds.put(mode=99)
+    worlds.run(arrange.sample_episodes, SEED)
+    return worlds["mode"]
 
 
-@pytest.mark.parametrize(("mode", "code"), [("pick", Mode.PICK), ("target", Mode.TARGET), ("move", Mode.MOVE)])
-def test_a_single_mode_is_every_episodes(built, device, mode, code):
-    assert (modes(built, device, mode, (1.0, 2.0, 3.0), np.arange(500)) == code).all()
+def weighted(mode: str, mix: Sequence[float]) -> Config:
+    return small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
 
 
-@given(mix=st.tuples(*[st.integers(0, 5)] * 3).filter(any), first=st.integers(0, 2**30))
-def test_mixed_modes_are_the_twins(mix, first, built, device):
-    episodes = first + np.arange(WORLDS)
-    np.testing.assert_array_equal(modes(built, device, "mixed", mix, episodes), arrangement.sample_modes(SEED, episodes, mix))
+@given(mix=st.tuples(*[st.integers(0, 5)] * 3).filter(any), first=st.integers(0, 2**30), arrangements=st.integers(0, 20))
+def test_mixed_modes_are_the_twins(mix, first, arrangements, device):
+    """Whatever world has the episode, and however often its arrangement was drawn again."""
+    episodes = np.random.default_rng(first).permutation(first + np.arange(2 * WORLDS))[:WORLDS]
+    found = modes(device, weighted("mixed", mix), episodes, arrangements)
+    np.testing.assert_array_equal(found, arrangement.sample_modes(SEED, episodes, mix))
 
 
 @pytest.mark.parametrize("mix", [(1.0, 1.0, 1.0), (0.5, 0.3, 0.2), (3.0, 0.0, 1.0), (0.0, 2.0, 0.0), (1e-9, 0.0, 1e3), (1e3, 0.0, 1e-9)])
-def test_shares_of_modes_are_the_weights(built, device, mix):
+def test_shares_of_modes_are_the_weights(device, mix):
     """Within four standard deviations; a mode of weight 0 never comes, on whichever side it stands."""
     episodes = 4000
-    found = modes(built, device, "mixed", mix, np.arange(episodes))
-    for code, share in zip((Mode.PICK, Mode.TARGET, Mode.MOVE), np.array(mix) / sum(mix), strict=True):
+    found = modes(device, weighted("mixed", mix), np.arange(episodes))
+    for code, share in zip(CYCLE, np.array(mix) / sum(mix), strict=True):
         assert (found == code).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / episodes))
 
 
+@pytest.mark.parametrize(("mode", "codes"), [*((code.name.lower(), [code]) for code in CYCLE), ("cycle", CYCLE)])
 @given(mix=st.tuples(*[st.integers(0, 5)] * 3), first=st.integers(0, 2**31 - WORLDS))
-def test_a_cycle_has_each_mode_once_in_three_episodes(mix, first, built, device):
-    """Of any three episodes in a row, whatever the weights of mode mixed."""
+def test_a_single_mode_is_every_episodes_and_a_cycle_has_each_in_turn(mix, first, mode, codes, device):
+    """Whatever the weights of mode mixed."""
     episodes = first + np.arange(WORLDS)
-    found = modes(built, device, "cycle", mix, episodes)
-    np.testing.assert_array_equal(found, np.array((Mode.PICK, Mode.TARGET, Mode.MOVE))[episodes % 3])
+    assert modes(device, weighted(mode, mix), episodes).tolist() == np.array(codes)[episodes % len(codes)].tolist()
 
 
-def test_each_split_has_its_own_mode(built, device):
+def test_each_split_has_its_own_mode(device):
     """Splits in one range of indices, with a gap; a cycle begins with the split."""
-    config = small_worlds.settings()
     splits = (Split("train", 4, 0, "move", "train"), Split("val", 5, 4, "cycle", "val"), Split("test", 3, 20, "target", "test"))
-    episodes = np.array([0, 3, 4, 5, 6, 7, 8, 20, 22])
-    worlds = arrangement_worlds(device, worlds=len(episodes))
-    scene = make_scene_data(dataclasses.replace(config, splits=splits), small_worlds.catalog(), built, 1, device)
-    worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
-    worlds.begin(Phase.START, episodes, 0)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    cycle = [Mode.PICK, Mode.TARGET, Mode.MOVE, Mode.PICK, Mode.TARGET]
-    assert worlds.state.mode.numpy().tolist() == [Mode.MOVE, Mode.MOVE, *cycle, Mode.TARGET, Mode.TARGET]
+    config = dataclasses.replace(small_worlds.settings(), splits=splits)
+    found = modes(device, config, np.array([0, 3, 4, 5, 6, 7, 8, 20, 22]))
+    assert found.tolist() == [Mode.MOVE, Mode.MOVE, *CYCLE, *CYCLE[:2], Mode.TARGET, Mode.TARGET]
 
 
-def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
-    """Whatever world has the episode, of however many, and however often its arrangement was expected_arrangements again."""
-    mix, episodes = (1.0, 1.0, 1.0), np.arange(60)
-    expected = modes(built, device, "mixed", mix, episodes)
-    numbers = np.random.default_rng(5)
-    for count in (7, 60):
-        some = numbers.permutation(episodes)[:count]
-        arrangement = numbers.integers(0, 20, count)
-        np.testing.assert_array_equal(modes(built, device, "mixed", mix, some, arrangement), expected[some])
-
-
-def test_modes_are_drawn_apart_from_objects(device):
-    """Where modes differ and the rules of repeating do not, all else of an episode is the same."""
-    episodes, objects = np.arange(WORLDS), []
-    for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
-        worlds = arrangement_worlds(device, WORLDS, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
-        worlds.begin(Phase.START, episodes)
-        arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-        objects.append((worlds.state.catalog_index.numpy(), worlds.state.light_yaw.numpy()))
-    for pick, mixed in zip(*objects, strict=True):
-        np.testing.assert_array_equal(pick, mixed)
+# ---- objects ----
 
 
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
-    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 10.0, "move_repeats": 0})
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    assert (np.sort(worlds.state.catalog_index.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
-    assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
+    worlds = drawn(device, drop={"volume": 10.0, "move_repeats": 0})
+    assert (np.sort(worlds["catalog_index"], axis=1)[:, -3:] == [0, 1, 2]).all()
+    assert len(np.unique(worlds["catalog_index"], axis=0)) == 6
 
 
 @pytest.mark.parametrize("counts", [[(0, 0), (8, 8), (0, 0)], [(3, 3), (4, 4), (1, 1)], [(0, 2), (1, 3), (2, 3)]])
 def test_numbers_of_parts_are_those_that_are_set_whatever_the_budget(device, counts):
     """Homogeneous, kitted and random fills, with a compound object among the parts; results do not depend on the number of worlds."""
-    worlds = arrangement_worlds(device, WORLDS, counts=counts, drop={"volume": 1e-3})
-    worlds.begin(Phase.START, np.arange(WORLDS)[::-1] + 7, 1)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    found, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
+    worlds = drawn(device, WORLDS, np.arange(WORLDS)[::-1] + 7, 1, counts=counts, drop={"volume": 1e-3})
+    found, slot = worlds["catalog_index"], worlds["body_slot"]
     for world, episode in enumerate(range(WORLDS + 6, 6, -1)):
         expected = arrangement.draw_counted(SEED, episode, 1, counts)
         assert found[world].tolist() == expected + [-1] * (8 - len(expected))
         kinds = np.array(expected) == 1
         for kind, first in ((False, 0), (True, worlds.single_slots)):
             assert slot[world, : len(expected)][kinds == kind].tolist() == list(range(first, first + (kinds == kind).sum()))
-    drawn = (found[:, :, None] == np.arange(3)).sum(axis=1)
-    assert drawn.min(axis=0).tolist() == [low for low, _ in counts]
-    assert drawn.max(axis=0).tolist() == [high for _, high in counts]
+    numbers = (found[:, :, None] == np.arange(3)).sum(axis=1)
+    assert numbers.min(axis=0).tolist() == [low for low, _ in counts]
+    assert numbers.max(axis=0).tolist() == [high for _, high in counts]
     assert len(np.unique(found, axis=0)) > (WORLDS // 2 if sum(high > 0 for _, high in counts) > 1 else 0)
-
-
-def test_numbers_of_parts_without_slots_for_them_end_the_episode(device):
-    worlds = arrangement_worlds(device, WORLDS, counts=[(0, 0), (5, 5), (0, 0)], compound_slots=4)
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    assert (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).all()
-    assert (worlds.state.catalog_index.numpy() == -1).all()
 
 
 @pytest.mark.parametrize(
@@ -233,109 +207,39 @@ def test_numbers_of_parts_without_slots_for_them_end_the_episode(device):
 def test_the_budget_may_be_met_exactly_and_the_object_that_exceeds_it_stays_or_not(device, volume, exceed, objects):
     """Objects of a quarter, of which a world holds eight."""
     one = {"volume": np.array([0.25]), "compound": np.array([0]), "radius": np.array([0.1])}
-    worlds = arrangement_worlds(device, WORLDS, **one, drop={"volume": volume, "exceed": exceed})
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == objects).all()
-
-
-@pytest.mark.parametrize("repeats", [0, 1])
-@pytest.mark.parametrize("exceed", [0, 1])
-def test_an_object_that_never_fits_is_never_drawn(device, exceed, repeats):
-    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25, "exceed": exceed, "move_repeats": repeats})
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    catalog_index = worlds.state.catalog_index.numpy()
-    assert (catalog_index[:, 0] >= 0).all()
-    assert not (catalog_index == 2).any()
-
-
-def test_each_mode_has_its_own_rule_of_repeating(device):
-    """One bake: episodes of picking without repeats, episodes of moving with them."""
-    worlds = arrangement_worlds(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    moving = worlds.state.mode.numpy() == Mode.MOVE
-    assert 0 < moving.sum() < 200
-    count = (worlds.state.catalog_index.numpy() >= 0).sum(axis=1)
-    # Three entries, room for eight instances, a budget for all.
-    np.testing.assert_array_equal(count, np.where(moving, 8, 3))
-
-
-@pytest.mark.parametrize(
-    ("mix", "fill", "slots"),
-    [
-        ((1.0, 0.0, 0.0), "within", (2, 1)),
-        ((1.0, 1.0, 2.0), "within", None),
-        ((1.0, 0.0, 0.0), "exceed", (2, 1)),
-        ((1.0, 1.0, 2.0), "exceed", None),
-    ],
-)
-def test_counted_slots_hold_the_draws_of_all_modes(device, mix, fill, slots):
-    """What scenes.build counts is enough for what the device draws, but for the accepted share."""
-    shortfall, episodes = 0.02, 2000
-    config = small_worlds.settings(
-        bake__mode="mixed",
-        bake__mix=list(mix),
-        arrangement__volume=1.2e-3,
-        arrangement__max_objects=12,
-        arrangement__slot_shortfall=shortfall,
-        arrangement__fill=fill,
-    )
-    objects = small_worlds.catalog()
-    single, compound = build.count_slots(config.arrangement, build.find_repeat_rules(config.bake, config.pick, config.move), objects)
-    worlds = arrangement_worlds(
-        device,
-        episodes,
-        mix,
-        volume=np.array([catalog_index.volume for catalog_index in objects.entries]),
-        compound=np.array([len(catalog_index.pieces) > 1 for catalog_index in objects.entries]),
-        instances=12,
-        single_slots=single,
-        compound_slots=compound,
-        drop={"volume": 1.2e-3, "exceed": int(fill == "exceed"), "move_repeats": 1, "pick_repeats": 0},
-    )
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
-    assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
-    assert (single, compound) == slots if slots else over > 0.0
+    worlds = drawn(device, **one, drop={"volume": volume, "exceed": exceed})
+    assert ((worlds["catalog_index"] == 0).sum(axis=1) == objects).all()
 
 
 @pytest.mark.parametrize("phase", [Phase.EMPTY, Phase.SETTLE, Phase.ACT, Phase.OVER])
 def test_worlds_at_work_keep_their_objects(device, phase):
     worlds = arrangement_worlds(device, WORLDS)
     worlds.begin(phase)
-    worlds.set(worlds.state.catalog_index, 2)
-    worlds.set(worlds.state.light, 7)
-    worlds.set(worlds.state.mode, 9)
-    joints = worlds.physics.state.joint_q
-    worlds.set(joints, 0.5)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    assert (worlds.state.catalog_index.numpy() == 2).all()
-    assert (worlds.state.light.numpy() == 7).all()
-    assert (worlds.state.mode.numpy() == 9).all()
+    kept = {"catalog_index": 2, "light": 7, "mode": 9} | ({"joint_q": 0.5} if phase != Phase.OVER else {})
+    worlds.put(**kept)
+    worlds.run(arrange.sample_episodes, SEED)
+    worlds.run(arrange.drop_objects, SEED)
+    assert all((worlds[name] == value).all() for name, value in kept.items())
     if phase != Phase.OVER:
-        assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
-        assert (joints.numpy() == 0.5).all()
-        assert not worlds.state.restarted.numpy().any()
+        assert (worlds["variant"].reshape(WORLDS, -1)[:, 2:] == -1).all()
+        assert not worlds["restarted"].any()
+
+
+# ---- drops ----
 
 
 @given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))
 def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance, episode, device):
     sizes["drop"] |= {"spread": spread, "clearance": clearance}
-    worlds = arrangement_worlds(device, WORLDS, **sizes)
-    worlds.begin(Phase.START, episode + np.arange(WORLDS))
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    over = worlds.state.phase.numpy() == Phase.OVER
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, Phase.OVER, Phase.SETTLE))
+    worlds = drawn(device, WORLDS, episode + np.arange(WORLDS), **sizes)
+    over = worlds["phase"] == Phase.OVER
+    worlds.run(arrange.drop_objects, SEED)
+    np.testing.assert_array_equal(worlds["phase"], np.where(over, Phase.OVER, Phase.SETTLE))
     rim = (*worlds.bins[0].opening, worlds.bins[0].height)
     for world in range(WORLDS):
-        catalog_index = worlds.state.catalog_index.numpy()[world]
+        catalog_index = worlds["catalog_index"][world]
         catalog_index = catalog_index[catalog_index >= 0]
-        poses = worlds.coordinates()[world, worlds.state.body_slot.numpy()[world, : len(catalog_index)]]
+        poses = worlds.coordinates()[world, worlds["body_slot"][world, : len(catalog_index)]]
         radius = worlds.radius[catalog_index]
         expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
         np.testing.assert_allclose(poses, expected, atol=1e-5)
@@ -355,10 +259,8 @@ def test_in_layers_objects_fall_from_cells_of_their_compartments(seed, compartme
     sizes = dataclasses.replace(BIN, floor=(0.5, 0.3), compartments=compartments)
     counts = [(int(number), int(number)) for number in most]
     room = {"instances": 40, "single_slots": 40, "compound_slots": 40, "counts": counts, "radius": radius}
-    worlds = arrangement_worlds(device, 4, **room, bins=(sizes,), drop={"spread": spread, "layers": 1, "clearance": 0.004})
-    worlds.begin(Phase.START, seed % 1000 + np.arange(4))
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    drop = {"spread": spread, "layers": 1, "clearance": 0.004}
+    worlds = dropped(device, 4, seed % 1000 + np.arange(4), **room, bins=(sizes,), drop=drop)
     count, pitch = int(most.sum()), np.float32(2 * radius.max()) + np.float32(0.004)
     centers, halves = np.hsplit(np.array(sizes.openings) * (1, 1, 0.5, 0.5), 2)
     for world in range(4):
@@ -383,13 +285,11 @@ def test_scattered_objects_rest_on_the_rim_or_on_those_below(number, device):
     """Cylinders about objects, their own if upright, do not overlap, are over the opening, and one clearance above what carries them."""
     radius, clearance = np.array([0.03, 0.04, 0.05]), 0.004
     room = {"instances": 36, "single_slots": 36, "compound_slots": 36, "counts": [(number // 2, number // 2)] * 3, "radius": radius}
-    worlds = arrangement_worlds(device, 4, **room, drop={"spread": 1.0, "clearance": clearance})
+    worlds = drawn(device, 4, **room, drop={"spread": 1.0, "clearance": clearance})
     own = np.array([(0.015, -0.02, 0.026), (0.02, -0.03, 0.03), (0.04, -0.03, 0.03)], np.float32)
     cylinder = wp.array(own, dtype=wp.vec3, device=device)
     worlds.scene = dataclasses.replace(worlds.scene, upright=0.5, scattered=True, cylinder=cylinder)
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    worlds.run(arrange.drop_objects, SEED)
     count, stacked = 3 * (number // 2), 0
     for world in range(4):
         entries, slots = (array.numpy()[world, :count] for array in (worlds.state.catalog_index, worlds.state.body_slot))
@@ -410,29 +310,14 @@ def test_scattered_objects_rest_on_the_rim_or_on_those_below(number, device):
     assert (stacked > 0) == (number > 2)
 
 
-def test_the_drop_uses_the_whole_spread(device):
-    worlds = arrangement_worlds(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
-    np.testing.assert_allclose(full[:, :2].min(axis=0), [-0.2, -0.1], atol=5e-3)
-    np.testing.assert_allclose(full[:, :2].max(axis=0), [0.2, 0.1], atol=5e-3)
-
-
 def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device):
-    worlds = arrangement_worlds(device, WORLDS)
-    worlds.begin(Phase.START)
-    worlds.set(worlds.physics.state.joint_qd, 1.0)
-    worlds.set(worlds.physics.control.joint_f, 7.0)
-    worlds.set(worlds.state.stuck, 5)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    state, catalog = worlds.state, worlds.scene.catalog
-    variant = state.variant.numpy().reshape(WORLDS, -1)
+    worlds = drawn(device)
+    worlds.put(joint_qd=1.0, joint_f=7.0, stuck=5)
+    worlds.run(arrange.drop_objects, SEED)
+    catalog, variant = worlds.scene.catalog, worlds["variant"].reshape(WORLDS, -1)
     full = np.zeros((WORLDS, worlds.slots), dtype=bool)
-    for world, instance in zip(*np.nonzero(state.catalog_index.numpy() >= 0), strict=True):
-        slot, catalog_index = state.body_slot.numpy()[world, instance], state.catalog_index.numpy()[world, instance]
+    for world, instance in zip(*np.nonzero(worlds["catalog_index"] >= 0), strict=True):
+        slot, catalog_index = worlds["body_slot"][world, instance], worlds["catalog_index"][world, instance]
         full[world, slot] = True
         assert variant[world, 2 + slot] == catalog.variant.numpy()[catalog_index]
     empty = np.where(np.arange(worlds.slots) < worlds.single_slots, catalog.empty_single, catalog.empty_compound)
@@ -441,23 +326,131 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     np.testing.assert_allclose(worlds.forces(), np.where(full[:, :, None], 0.0, weight), rtol=1e-6)
     parked = [0.0, 0.0, PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
     np.testing.assert_array_equal(worlds.coordinates()[~full], np.broadcast_to(np.float32(parked), worlds.coordinates()[~full].shape))
-    assert (worlds.physics.state.joint_qd.numpy() == 0.0).all()
-    assert (state.stuck.numpy() == 0).all()
-    np.testing.assert_array_equal(state.progress.numpy(), np.broadcast_to([0, 0, 0, 1], (WORLDS, 4)))
-    assert state.restarted.numpy()[:-1].all()
-    assert not state.restarted.numpy()[-1]
-    gripper = worlds.physics.state.joint_q.numpy().reshape(WORLDS, -1)[:, :4]
-    np.testing.assert_array_equal(gripper, np.tile([3.0, 0.0, 1.0, 0.0], (WORLDS, 1)))
+    assert (worlds["joint_qd"] == 0.0).all()
+    assert (worlds["stuck"] == 0).all()
+    assert (worlds["progress"] == [0, 0, 0, 1]).all()
+    assert worlds["restarted"].tolist() == [True] * WORLDS + [False]
+    assert (worlds["joint_q"].reshape(WORLDS, -1)[:, :4] == [3.0, 0.0, 1.0, 0.0]).all()
 
 
-def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
-    worlds = arrangement_worlds(device, WORLDS, compound_slots=0)
-    worlds.begin(Phase.START)
-    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
-    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
+@pytest.mark.parametrize("sizes", [{"compound_slots": 0}, {"counts": [(0, 0), (5, 5), (0, 0)], "compound_slots": 4}])
+def test_a_world_without_room_for_what_was_drawn_has_no_objects(device, sizes):
+    worlds = dropped(device, **sizes)
+    over = worlds["ending"] == Ending.ARRANGEMENT_OVERFLOW
     assert over.any()
-    assert not over.all()
-    assert (worlds.state.catalog_index.numpy()[over] == -1).all()
+    assert over.all() == ("counts" in sizes)
+    assert (worlds["catalog_index"][over] == -1).all()
     assert (worlds.coordinates()[over][:, :, 2] == PARKED_HEIGHT).all()
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()
+
+
+# ---- lights ----
+
+
+def test_maps_turns_and_exposures_are_even_and_the_episodes_own(device):
+    """Of exposures, half a stop either way: mean 0 and deviation 0.5 / √3, within four standard errors; other worlds draw the same."""
+    worlds = drawn(device, 2000)
+    counts = np.bincount(worlds["light"], minlength=5)
+    assert counts.min() > 330
+    assert len(counts) == 5
+    exposure = worlds["light_exposure"]
+    assert np.abs(exposure).max() <= 0.5
+    assert exposure.mean() == pytest.approx(0.0, abs=4 * 0.5 / np.sqrt(3 * 2000))
+    np.testing.assert_allclose(np.quantile(exposure, (0.05, 0.25, 0.5, 0.75, 0.95)), (-0.45, -0.25, 0.0, 0.25, 0.45), atol=0.05)
+    keys = [rng.stream_key(SEED, episode, 0, Stream.LIGHT) for episode in range(2000)]
+    np.testing.assert_allclose(worlds["light_yaw"], [2 * np.pi * rng.uniform(key, 1) for key in keys], rtol=1e-6)
+    np.testing.assert_allclose(exposure, [rng.uniform(key, 2) - 0.5 for key in keys], atol=1e-6)
+    few = drawn(device, 3, np.array([1999, 7, 300]))
+    np.testing.assert_array_equal(few["light_exposure"], exposure[[1999, 7, 300]])
+    wide = drawn(device, 2000, drop={"exposure_spread": 2.0})
+    np.testing.assert_allclose(wide["light_exposure"], 4.0 * exposure, rtol=1e-6)
+    np.testing.assert_array_equal(wide["light_yaw"], worlds["light_yaw"])
+
+
+def test_a_distribution_of_exposure_replaces_the_spread_and_is_that_of_the_record(device):
+    """A look is the episode's, not that of one of its arrangements."""
+    randomize = Randomize(exposure=Distribution.parse({"uniform": [1.0, 3.0]}))
+    plain, own = drawn(device, arrangement=2), drawn(device, arrangement=2, randomize=randomize)
+    recorded = [draw_looks(Looks(randomize, (), ()), SEED, episode, 0)["exposure"] for episode in range(WORLDS)]
+    np.testing.assert_allclose(own["light_exposure"], recorded, atol=1e-6)
+    assert 1.0 <= min(recorded) < 1.5
+    assert 2.5 < max(recorded) <= 3.0
+    assert np.abs(plain["light_exposure"]).max() <= 0.5
+
+
+@pytest.mark.parametrize("setting", ["random_yaw", "exposure_spread"])
+def test_what_is_not_to_be_drawn_is_zero(device, setting):
+    worlds = drawn(device, drop={setting: 0})
+    for name, array in (("random_yaw", "light_yaw"), ("exposure_spread", "light_exposure")):
+        assert (worlds[array] == 0.0).all() == (name == setting)
+
+
+# ---- who gets which episode ----
+
+
+@pytest.mark.parametrize(
+    ("before", "following", "listed", "tries", "after", "taken"),
+    [
+        ([(Phase.EMPTY, 0, -1, 0)] * 3, 0, [7, 2], 1, [(Phase.START, 0, 7, 0), (Phase.START, 0, 2, 0), (Phase.IDLE, 0, -1, 0)], 2),
+        (
+            [
+                (Phase.OVER, Ending.UNSETTLED, 3, 0),
+                (Phase.OVER, Ending.FINISHED, 4, 0),
+                (Phase.OVER, Ending.NOT_FINITE, 5, 1),
+                (Phase.OVER, Ending.UNSETTLED, 6, 2),
+            ],
+            9,
+            range(100),
+            3,
+            [(Phase.START, Ending.RUNNING, *episode) for episode in ((3, 1), (9, 0), (5, 2), (10, 0))],
+            11,
+        ),
+        (busy := [(Phase.SETTLE, 0, 0, 0), (Phase.ACT, 0, 1, 0), (Phase.IDLE, 0, -1, 0)], 2, range(9), 3, busy, 2),
+    ],
+    ids=["empty worlds take the list in order", "without delivery an episode is resampled, then given up", "busy worlds keep theirs"],
+)
+def test_assignment_of_episodes(device, before, following, listed, tries, after, taken):
+    """Phase, ending, episode and arrangement of each world, and the position in the list, before and after."""
+    worlds = arrangement_worlds(device, len(before))
+    phase, ending, *ids = zip(*before, strict=True)
+    worlds.put(phase=phase, ending=ending, arrangement_id=np.transpose(ids), next_episode=following)
+    worlds.run(arrange.assign_episodes, wp.array(list(listed), dtype=wp.int32, device=device), tries)
+    found = np.column_stack([worlds["phase"], worlds["ending"], worlds["arrangement_id"]])
+    assert [tuple(row) for row in found.tolist()] == after
+    assert worlds["next_episode"].tolist() == [taken]
+
+
+def test_idle_worlds_that_are_freed_take_episodes_of_another_list(device):
+    worlds = arrangement_worlds(device, 3)
+    worlds.put(phase=[Phase.IDLE, Phase.ACT, Phase.IDLE], arrangement_id=[[-1, 0], [4, 1], [-1, 0]])
+    worlds.run(arrange.free_idle_worlds)
+    worlds.run(arrange.assign_episodes, wp.array([8], dtype=wp.int32, device=device), 1)
+    assert worlds["arrangement_id"].tolist() == [[8, 0], [4, 1], [-1, 0]]
+    assert worlds["phase"].tolist() == [Phase.START, Phase.ACT, Phase.IDLE]
+
+
+@given(count=st.integers(1, 6), episodes=st.integers(1, 20), tries=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
+def test_every_episode_ends_once(count, episodes, tries, seed, device):
+    """With random endings, each episode is delivered or given up exactly once; then all worlds are idle."""
+    numbers, worlds = np.random.default_rng(seed), arrangement_worlds(device, count)
+    worlds.begin(Phase.EMPTY, -1)
+    started, ended = [], []
+    listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
+    for _ in range(8 * episodes * tries):
+        worlds.run(arrange.assign_episodes, listed, tries)
+        phase, ending, arrangement_id = worlds["phase"], worlds["ending"], worlds["arrangement_id"]
+        started += [tuple(arrangement_id[world]) for world in np.flatnonzero(phase == Phase.START)]
+        for world in np.flatnonzero(phase != Phase.IDLE):
+            phase[world], ending[world] = Phase.ACT, Ending.RUNNING
+            if numbers.uniform() < 0.5:
+                phase[world], ending[world] = Phase.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
+                if ending[world] == Ending.FINISHED or arrangement_id[world, 1] == tries - 1:
+                    ended.append(int(arrangement_id[world, 0]))
+        if (phase == Phase.IDLE).all():
+            break
+        worlds.put(phase=phase, ending=ending)
+    assert (worlds["phase"] == Phase.IDLE).all()
+    assert sorted(ended) == list(range(episodes))
+    assert len(set(started)) == len(started)
+    assert [episode for episode, arrangement in started if arrangement == 0] == list(range(episodes))
+    assert (worlds["arrangement_id"][:, 0] == -1).all()

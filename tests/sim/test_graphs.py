@@ -18,9 +18,8 @@ from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics as physics_module
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.system.hardware.green_contexts import SmPartition
-from tests.worlds.cubes import place_cubes
 from tests.worlds.sights import SHORT, picking
-from tests.worlds.small_worlds import BOX, COARSE, CUBE, catalog, report, settings
+from tests.worlds.small_worlds import BOX, COARSE, CUBE, catalog, place_cubes, report, settings
 
 WORLDS, TICKS = 8, 5
 MAX_TICKS = 60

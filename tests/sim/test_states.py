@@ -192,7 +192,6 @@ def test_a_state_survives_a_file(scene, device, tmp_path):
         ({"cell": np.array("0123456789")}, "the state is of another cell or gripper \\(01234567, not "),
         ({"cell": None}, "the state is of another cell or gripper \\(unknown, not "),
         ({"plan.point": None}, "the state lacks plan.point"),
-        ({"worlds.stuck": np.zeros((2, 9), np.int32)}, r"worlds.stuck of the state is int32 \(2, 9\); allowed: int32 \(2, "),
         ({"plan.yaw": np.array([0.0, np.nan], np.float32)}, "plan.yaw of the state has a value that is not finite, in row 1"),
         ({"contacts.count": np.array([3, -1], np.int32)}, "contacts.count of the state is -1; allowed: 0 or more"),
     ],

@@ -1,24 +1,41 @@
-"""Tick loop: ticks come in order, physics is ahead as far as it may be, and no snapshot is overwritten while a queue still reads it."""
+"""Tick loop: ticks come in order, physics is ahead as far as it may be, and no snapshot is overwritten while a queue still reads it.
+
+First on the device; then on a model of a GPU that executes its streams in random order; last, what a snapshot says of the frame before.
+"""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+import itertools
+import random
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import fields
+from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 import warp as wp
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
 
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
-from synpick_warp.stages import tick_queue, ticks
+from synpick_warp.kernels.sim import snapshot as snapshots
+from synpick_warp.stages import host_copies, tick_queue, ticks
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.buffers import LastFrame, Snapshot
+from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
+from synpick_warp.system.hardware.device import pick_device
+from tests.harness.cuda_model import ModelArray, ModelDevice
+from tests.harness.devices import default_device
 from tests.harness.memory_tables import queued_ticks
 from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings
@@ -62,17 +79,6 @@ class NumberingSimulation:
 @pytest.fixture
 def simulation(device) -> NumberingSimulation:
     return NumberingSimulation(device)
-
-
-@pytest.mark.parametrize("batches", [0, 1, 5, 100])
-@pytest.mark.parametrize("lead", [None, 0, 1, 5])
-def test_ticks_come_in_order_with_their_own_reports_and_snapshots(simulation, lead, batches):
-    with ticks.TickLoop(simulation, lead) as loop:
-        for number in range(TICKS):
-            report, snapshot = loop.advance()
-            assert set(report.plan.target.tolist()) == set(snapshot.frame.numpy().tolist()) == {number}
-            for _ in range(batches):
-                loop.enqueue()
 
 
 def test_physics_is_one_tick_ahead_until_a_world_is_idle_then_by_the_queue_and_stops_at_the_end(simulation):
@@ -187,3 +193,292 @@ def test_the_memory_plan_counts_the_queue(device, monkeypatch, formats):
 def size_of(arrays: Iterable[wp.array]) -> int:
     """Size of arrays [bytes]."""
     return sum(array.numpy().nbytes for array in arrays)
+
+
+# ---- on a model of a GPU ----
+
+NAMES = [item.name for item in fields(Snapshot)]
+UNFINISHED = -1
+"""Value of all arrays of a record while a tick is simulated."""
+TRIALS = 150
+
+
+class ModelReader:
+    """`TickReader` of a record whose only reported array is a pair: the tick's number, and the phases of the worlds."""
+
+    def __init__(self, record: SimpleNamespace, target: list[ModelArray]) -> None:
+        self.copy = host_copies.HostCopy(self.reported(record), target)
+
+    @staticmethod
+    def reported(record: SimpleNamespace) -> list[Any]:
+        return [record.status]
+
+    def start(self) -> None:
+        self.copy.start(None)
+
+    def phase(self) -> np.ndarray | None:
+        return self.copy.target[0].numpy()[1] if self.copy.is_done else None
+
+    def wait(self) -> Any:
+        return self.copy.wait()[0]
+
+
+class ModelSimulation:
+    """Writes the number of each tick, from 0 on, into all arrays of its record; world w is idle from tick `ends[w]` on."""
+
+    def __init__(self, device: ModelDevice, ends: list[int], waiting: int, parts: int) -> None:
+        self.device, self.ends, self.parts, self.count = device, np.array(ends), parts, 0
+        self.episodes, self.layout = range(len(ends) + waiting), SimpleNamespace(worlds=len(ends))
+        snapshot = SimpleNamespace(**{name: ModelArray(device) for name in NAMES})
+        self.record = SimpleNamespace(snapshot=snapshot, status=ModelArray(device))
+
+    def phases(self, tick: int) -> np.ndarray:
+        return np.where(tick < self.ends, Phase.ACT, Phase.IDLE)
+
+    def tick_parts(self) -> Iterator[None]:
+        tick = self.count
+        self.count += 1
+        for _ in range(self.parts - 1):
+            self.device.stream.enqueue(lambda: self._write(UNFINISHED))
+            yield
+        self.device.stream.enqueue(lambda: self._write(tick))
+
+    def _write(self, tick: int) -> None:
+        for array in vars(self.record.snapshot).values():
+            array.value = tick
+        self.record.status.value = tick, self.phases(tick)
+
+
+@pytest.fixture
+def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
+    """Factory that replaces Warp by the model of a GPU, which executes queued operations whenever the host sleeps."""
+
+    def make(seed: int) -> ModelDevice:
+        device = ModelDevice(random.Random(seed))
+        clock = itertools.count(step=host_copies.PAUSE_SECONDS)
+        time = SimpleNamespace(sleep=lambda _: device.run(device.chance.choice((0, 1, 3, 30))), monotonic=lambda: next(clock))
+        for module in (ticks, tick_queue, host_copies):
+            monkeypatch.setattr(module, "wp", device.wp)
+        monkeypatch.setattr(host_copies, "time", time)
+        monkeypatch.setattr(tick_queue, "TickReader", ModelReader)
+        monkeypatch.setattr(tick_queue, "allocate_slots", partial(allocate_slots, device))
+        return device
+
+    return make
+
+
+def allocate_slots(device: ModelDevice, arrays: list[ModelArray], slots: int, *_: object, **__: object) -> list[list[ModelArray]]:
+    return [[ModelArray(device) for _ in arrays] for _ in range(slots)]
+
+
+def test_renderer_and_host_read_whole_ticks_in_order_whatever_the_device_does_first(make_device):
+    for seed in range(TRIALS):
+        run_trial(make_device(seed))
+
+
+def run_trial(device: ModelDevice) -> None:
+    """Random worlds, lengths of episodes, leads, parts of a tick, batches, and rates of the streams."""
+    chance = device.chance
+    ends = [chance.randint(1, 30) for _ in range(chance.randint(1, 6))]
+    simulation = ModelSimulation(device, ends, chance.choice((0, 3)), chance.choice((1, 2, 5, 66)))
+    lead, rendered = chance.choice((0, 1, 2, 7, 50)), []
+    with ticks.TickLoop(simulation, lead) as loop:
+        for tick in range(max(ends) + 1):
+            (number, phases), snapshot = loop.advance()
+            assert number == tick
+            assert (phases == simulation.phases(tick)).all()
+            assert simulation.count <= tick + 1 + lead
+            for _ in range(chance.randint(0, 3)):
+                for _ in range(chance.choice((0, 5, 50))):
+                    device.stream.enqueue(lambda: None)
+                device.stream.enqueue(lambda tick=tick, snapshot=snapshot: rendered.append((tick, values(snapshot))))
+                loop.enqueue()
+                device.run(chance.choice((0, 10, 100)))
+    while device.run(1):
+        pass
+    assert not any(stream.queue for stream in device.streams)
+    assert rendered == [(tick, {tick}) for tick, _ in rendered]
+
+
+def values(snapshot: Snapshot) -> set[int]:
+    """Values of all arrays of a snapshot."""
+    return {getattr(snapshot, name).value for name in NAMES}
+
+
+class RefilledSimulation(ModelSimulation):
+    """Model whose worlds run episodes of given lengths [ticks], from a list after another."""
+
+    def __init__(self, device: ModelDevice, worlds: int, episodes: list[int], parts: int) -> None:
+        super().__init__(device, [0] * worlds, 0, parts)
+        self.episodes, self.left, self.ran, self.past = list(episodes), [0] * worlds, 0, []
+
+    def restart(self, episodes: list[int]) -> None:
+        assert not self.episodes
+        self.episodes = list(episodes)
+
+    def tick_parts(self) -> Iterator[None]:
+        for world, left in enumerate(self.left):
+            if not left and self.episodes:
+                left, self.ran = self.episodes.pop(0), self.ran + 1
+            self.left[world] = max(0, left - 1)
+            self.past.append(Phase.ACT if left else Phase.IDLE)
+        yield from super().tick_parts()
+
+    def phases(self, tick: int) -> np.ndarray:
+        worlds = self.layout.worlds
+        return np.array(self.past[tick * worlds : (tick + 1) * worlds])
+
+
+def test_idle_worlds_run_further_lists_whenever_they_come(make_device):
+    """Each list comes at a random time after it was asked for, at last when the loop waits; every episode runs once, to its end."""
+    for seed in range(TRIALS):
+        device = make_device(seed)
+        chance = device.chance
+        lists = [[chance.randint(1, 8) for _ in range(chance.randint(1, 5))] for _ in range(chance.randint(1, 4))]
+        simulation = RefilledSimulation(device, chance.randint(1, 4), lists[0], chance.choice((1, 2, 30)))
+        rest, lead, busy = lists[1:], chance.choice((0, 1, 7, 50)), 0
+
+        def more(wait: bool, chance=chance, rest=rest) -> list[int]:
+            return rest.pop(0) if rest and (wait or chance.random() < 0.2) else []
+
+        with ticks.TickLoop(simulation, lead, more) as loop:
+            for tick in itertools.count():
+                (number, phases), _ = loop.advance()
+                assert number == tick
+                busy += int((phases == Phase.ACT).sum())
+                if (phases == Phase.IDLE).all() and not loop.refill():
+                    break
+        assert not rest
+        assert simulation.ran == sum(map(len, lists))
+        assert busy == sum(map(sum, lists))
+
+
+@pytest.mark.parametrize("lead", [1, 5])
+def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_device, lead):
+    """Otherwise a GPU would be idle from the end of each tick until the host asks for the next one."""
+    device = make_device(0)
+    simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_IN_FLIGHT + 3)
+    host_copies.time.sleep = lambda _: device.run(1)
+    with ticks.TickLoop(simulation, lead) as loop:
+        for tick in range(15):
+            loop.advance()
+            assert simulation.count == tick + 2
+            assert len(loop.stream.queue) >= ticks.PARTS_IN_FLIGHT
+
+
+@pytest.mark.parametrize(("waiting", "max_lead", "safe_lead"), [(3, 1, 512), (0, 10, 512), (0, 200, 512), (0, 200, 60)])
+def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead_is_short(
+    make_device, monkeypatch, waiting, max_lead, safe_lead
+):
+    """First physics is the bottleneck: the device executes nothing until the host waits. Then it executes all work between two ticks."""
+    monkeypatch.setattr(ticks, "SAFE_LEAD", safe_lead)
+    device = make_device(0)
+    host_copies.time.sleep = lambda _: device.run(1)
+    simulation = ModelSimulation(device, [2000], waiting, 5)
+    with ticks.TickLoop(simulation, max_lead) as loop:
+        for _ in range(5):
+            loop.advance()
+            assert loop.reserved_share == ticks.PHYSICS_SHARE
+        shares, leads = [], []
+        for _ in range(150):
+            for _ in range(5):
+                while device.run(1):
+                    pass
+                loop.enqueue()
+            loop.advance()
+            shares.append(loop.reserved_share)
+            leads.append(loop._simulated - loop._taken)
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] == 0.0
+    threshold = min(safe_lead, loop.lead // 2)
+    assert [share > 0.0 for share in shares] == [lead < threshold for lead in leads]
+    assert (shares.count(ticks.PHYSICS_SHARE) > 1) == (loop.lead > 100)
+
+
+def test_physics_that_has_nothing_left_to_do_gets_no_share(make_device):
+    device = make_device(0)
+    with ticks.TickLoop(ModelSimulation(device, [3], 0, 2), 10) as loop:
+        shares = []
+        for _ in range(4):
+            loop.advance()
+            shares.append(loop.reserved_share)
+    assert shares[0] == ticks.PHYSICS_SHARE
+    assert shares[-1] == 0.0
+
+
+@pytest.mark.parametrize(("busy", "is_confined"), [(16, True), (17, False)])
+def test_the_solver_is_restricted_to_reserved_multiprocessors_if_few_worlds_are_busy(make_device, busy, is_confined):
+    """A GPU with 11 multiprocessors reserves 2, for 8 worlds each; a third of the worlds is idle."""
+    device = make_device(0)
+    device.sm_count = 11
+    host_copies.time.sleep = lambda _: device.run(1)
+    simulation = ModelSimulation(device, [50] * busy + [0] * (busy // 2), 0, 2)
+    simulation.physics = SimpleNamespace(solver_stream=None)
+    with ticks.TickLoop(simulation, 10) as loop:
+        loop.confine_solver("reserved")
+        assert simulation.physics.solver_stream is None
+        for _ in range(3):
+            loop.advance()
+        loop.confine_solver("reserved")
+        assert simulation.physics.solver_stream == ("reserved" if is_confined else None)
+        loop.confine_solver(None)
+        assert simulation.physics.solver_stream is None
+
+
+# ---- the frame before ----
+
+LINKED_WORLDS = 3
+SIZES = {"world": LINKED_WORLDS, "instance": 2, "fixture": 3}
+KEPT = ("catalog_index", "pose", "fixture_pose", "fixture_visible")
+TICK = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(-1, 3)), min_size=LINKED_WORLDS, max_size=LINKED_WORLDS)
+"""live, episode and frame of each world."""
+
+
+class Linked:
+    """Snapshots one after the other, told by their number: tick t of world w puts t + 10 w into every array."""
+
+    def __init__(self) -> None:
+        self.device = pick_device(default_device())
+        self.last, self.count = allocate(LastFrame, SIZES, self.device), 0
+
+    def tick(self, worlds: list[tuple[int, int, int]]) -> Snapshot:
+        self.count += 1
+        made = allocate(Snapshot, SIZES, self.device)
+        for column, name in enumerate(("live", "episode", "frame")):
+            getattr(made, name).assign(np.array([row[column] for row in worlds]))
+        for name in KEPT:
+            values = getattr(made, name).numpy()
+            values[:] = (self.count + 10 * np.arange(LINKED_WORLDS)).reshape(LINKED_WORLDS, *(1,) * (values.ndim - 1))
+            getattr(made, name).assign(values)
+        launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, self.last)
+        return made
+
+
+@pytest.mark.parametrize(
+    ("world", "follows"),
+    [
+        ([(0, 4, -1), (1, 4, 0), (1, 4, 1), (1, 4, 2), (0, 7, -1), (1, 7, 0), (1, 7, 1)], [0, 0, 1, 1, 0, 0, 1]),
+        # The last frame of a failed try is not live; then the same number comes again from frame 0.
+        ([(1, 4, 0), (1, 4, 1), (0, 4, 2), (0, 4, -1), (1, 4, 0), (1, 4, 1)], [0, 1, 0, 0, 0, 1]),
+    ],
+    ids=["never across episodes", "drawn again"],
+)
+def test_frames_follow_within_an_episode(world, follows):
+    linked = Linked()
+    assert [linked.tick([tick] * LINKED_WORLDS).follows.numpy()[0] for tick in world] == follows
+
+
+@given(st.lists(TICK, min_size=1, max_size=6))
+@examples(max_examples=30)
+def test_every_snapshot_has_the_one_before_beside_it(script):
+    linked, before = Linked(), [(0, 0, 0)] * LINKED_WORLDS
+    for number, worlds in enumerate(script):
+        made = linked.tick(worlds)
+        pairs = zip(worlds, before, strict=True)
+        expected = [now[0] and was[0] and now[1] == was[1] and now[2] == was[2] + 1 for now, was in pairs]
+        assert made.follows.numpy().tolist() == expected
+        for name in KEPT:
+            values = getattr(made, f"last_{name}").numpy().reshape(LINKED_WORLDS, -1)
+            told = number + 10 * np.arange(LINKED_WORLDS) if number else np.zeros(LINKED_WORLDS)
+            np.testing.assert_array_equal(values, np.broadcast_to(told[:, None], values.shape))
+        before = worlds

@@ -53,13 +53,13 @@ def press(device, meshes, cup: float, places=((0.0, 0.0),), turn=UP, cups=((0.0,
     result.scene.cups.common_valve = valve
     for world, place in enumerate(places):
         for index, mesh in enumerate(meshes):
-            result.put(world, index, index, np.add(PLACE, (*place, -mesh.bounds[1, 2])), turn)
+            result.lay(world, index, index, np.add(PLACE, (*place, -mesh.bounds[1, 2])), turn)
     result.cast()
     return result
 
 
 def forces(*arguments, **given) -> list[float]:
-    return press(*arguments, **given).seals.break_force.numpy()[:, 0].tolist()
+    return press(*arguments, **given)["break_force"][:, 0].tolist()
 
 
 def test_a_tight_cup_holds_vacuum_times_area_and_the_settings_say_so(device):
@@ -137,18 +137,16 @@ def test_beside_an_edge_and_across_two_boxes_air_enters(device):
     boxes = [box((side, side, 0.03)).apply_translation((sign * side / 2, 0, 0)) for sign in (-1, 1)]
     pressed = press(device, boxes, cup, [(0.0, 0.0), (0.001, 0.0)])
     assert (np.count_nonzero(pressed.attached(), axis=1) == 1).all()
-    assert (pressed.seals.break_force.numpy() < 0.01 * full(cup)).all()
+    assert (pressed["break_force"] < 0.01 * full(cup)).all()
 
 
 @pytest.mark.parametrize(("valve", "good"), [(0, 0b01), (1, 0)])
 def test_an_open_cup_takes_the_vacuum_of_a_common_valve(device, valve, good):
     pressed = press(device, [box((0.05, 0.05, 0.01))], 0.022, cups=((0.0, 0.0), (0.06, 0.0)), valve=valve)
-    assert pressed.attempts.hits.numpy().tolist() == [[304, good]]
+    assert pressed["hits"].tolist() == [[304, good]]
     assert pressed.attached() == [[1, 0, 0, 0]]
     config = load_config("smoke", {"suction.vacuum": PRESSURE / 1e3, "gripper.cup_width": 0.022})
-    assert pressed.seals.break_force.numpy()[0].tolist() == pytest.approx(
-        [full(0.022) if good else config.suction.poor_force, 0.0], rel=1e-4
-    )
+    assert pressed["break_force"][0].tolist() == pytest.approx([full(0.022) if good else config.suction.poor_force, 0.0], rel=1e-4)
 
 
 class Lift(Hanging):

@@ -78,7 +78,7 @@ class PlannerHarness:
         ids, depths = np.stack(ids), np.stack(depths)
         self.views, height, width = ids.shape
         self.worlds = kernel_worlds.KernelWorlds(device, self.views, instances, radius=np.full(instances, diagonal))
-        self.worlds.set(self.worlds.state.catalog_index, np.arange(instances))
+        self.worlds.put(catalog_index=np.arange(instances))
         kernel_worlds.filled(self.worlds.scene.perception, {**SETTINGS, **(settings or {})})
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": CAPACITY}
         sizes["word"] = count_words(instances)
@@ -112,7 +112,7 @@ class PlannerHarness:
         self.planner.bound_contours(self.scene, self.worlds.state, self.observation)
         self.planner.count_votes(self.scene, self.observation)
         self.planner.weigh_votes(self.scene, self.observation)
-        return self.observation.votes.numpy()
+        return self["votes"]
 
     def graph(self, votes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Edges and paths of the clutter graph (view, instance, instance) bool: [v, i, j] means j above i."""

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-
-import cv2
 
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
@@ -23,8 +20,6 @@ from tests.worlds.pick_tables import pick_batch
 EPISODES = (0, 2)
 LAYERS = ("classes", "flow")
 ATTEMPT = trajectories.ATTEMPT | {"episode": 2, "outcome": "dropped"}
-HOLE = 10
-"""Columns of sensor depth, from the left, that `add_sensor_depth` empties."""
 
 
 def write_set(folder: Path, exporter: type, **bop: object) -> Path:
@@ -55,13 +50,3 @@ def write_pick_set(folder: Path) -> Path:
     settings = (folder / CONFIG_FILE).read_text()
     (folder / CONFIG_FILE).write_text(settings.replace('formats = ["bop"]', 'formats = ["bop", "picks"]'))
     return folder
-
-
-def add_sensor_depth(folder: Path) -> None:
-    """Add the layer depth_sensor to a BOP data set: its depth images with holes at the left."""
-    for scene in sorted((folder / "train").iterdir()):
-        shutil.copytree(scene / "depth", scene / "depth_sensor")
-        for path in (scene / "depth_sensor").iterdir():
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            image[:, :HOLE] = 0
-            cv2.imwrite(str(path), image)

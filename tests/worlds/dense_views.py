@@ -23,8 +23,8 @@ def dense_toy(count: int, lenses: tuple[Camera, ...], room: int, seed: int = 0) 
     return ToyScene(list(catalog().entries), [placed], lenses, instances=room, config=Config(bop=Bop(depth_scale=0.1)))
 
 
-def dense_batch(toy: ToyScene, device: wp.Device, lists: bool = True) -> FrameBatch:
-    """The world's views by all cameras, as frame 0 of episode 0; `lists`: with run boundaries."""
+def dense_batch(toy: ToyScene, device: wp.Device) -> FrameBatch:
+    """The world's views by all cameras, as frame 0 of episode 0, with run boundaries."""
     scene, count = build_scene(toy, device), len(toy.cameras)
     renderer = make_renderer(toy.settings(), scene, toy.instances, count)
     out = allocate_view_buffers(count, scene.width, scene.height, toy.instances, device)
@@ -35,11 +35,9 @@ def dense_batch(toy: ToyScene, device: wp.Device, lists: bool = True) -> FrameBa
     list_boundaries(scratch, count, out, boundaries)
     entries = world.catalog_index.numpy()[0]
     ids = np.append([entry.obj_id for entry in toy.entries], -1)[entries].astype(np.int32)
-    listed = {name: array.numpy() for name, array in vars(boundaries).items()} if lists else {}
-    images = {name: array.numpy() for name, array in vars(out).items() if name != "effects"}
+    images = {name: array.numpy() for name, array in (vars(out) | vars(boundaries)).items() if name != "effects"}
     return FrameBatch(
         **images,
-        **listed,
         episode=np.zeros(count, np.int32),
         camera=np.arange(count, dtype=np.int32),
         frame=np.zeros(count, np.int32),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import newton
 import numpy as np
 
 from synpick_warp.scenes import build
@@ -15,9 +16,9 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.behavior import BEHAVIORS
+from synpick_warp.stages.sim.physics import Physics, Watcher
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
 from tests.twins.raycast import rotation_of
-from tests.worlds.eager_physics import EagerPhysics
 from tests.worlds.small_worlds import catalog, settings
 
 Size = tuple[float, float, float]
@@ -27,6 +28,15 @@ COARSE = {"physics__steps_per_tick": 1, "physics__iterations": 4, "physics__rows
 """A step at a time, and no more room than bodies in the air need."""
 ROOM = 0.02
 """Volume for one object [m³]."""
+
+
+class EagerPhysics(Physics):
+    """Physics whose steps are launched one by one, never as a captured graph: hooks may read arrays and compute on the host."""
+
+    def tick_parts(
+        self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
+    ) -> Iterator[None]:
+        yield from self._run_substeps(before_step, after_collide, watcher)
 
 
 class Hanging:

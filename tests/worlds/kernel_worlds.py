@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,14 @@ from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.build import WorldPart
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.stages.arrays import allocate, count_words
+from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.render.looks import build_look_table
-from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+from synpick_warp.stages.sim.worlds import CORNERS, AttemptState, SealState, WorldState, world_sizes
 
+GROUPS = ("scene", "state", "attempts", "seals", "observation", "plan", "physics")
+"""Groups of arrays that stages take."""
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
 BIN = BinSizes("box", "bin", Tote(), outer=(0.55, 0.35), floor=(0.8, 0.4), opening=(0.5, 0.3), height=0.2, base=-0.005)
@@ -71,7 +74,7 @@ MOVE: dict[str, Any] = {
 
 @dataclass
 class KernelWorlds:
-    """State and constants of worlds; stages take `scene`, `state`, `attempts`, `seals`, `observation`, `plan` and `physics`."""
+    """State and constants of worlds, which stages take by GROUPS; arrays are read and written by name."""
 
     device: Any
     worlds: int
@@ -87,13 +90,6 @@ class KernelWorlds:
     drop: dict[str, Any] = field(default_factory=dict)
     settle: dict[str, Any] = field(default_factory=dict)
     move: dict[str, Any] = field(default_factory=dict)
-    scene: Any = None
-    state: Any = None
-    attempts: Any = None
-    seals: Any = None
-    observation: Any = None
-    plan: Any = None
-    physics: Any = None
     pick: dict[str, Any] = field(default_factory=dict)
     bins: tuple[BinSizes, ...] = (BIN,)
     places: Bins = field(default_factory=Bins)
@@ -114,30 +110,25 @@ class KernelWorlds:
         self.single_slots = self.instances if self.single_slots is None else self.single_slots
         self.slots = self.single_slots + self.compound_slots
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
+        move = MOVE | self.move
+        layout = {"gripper_bodies": GRIPPER_BODIES, "gripper_dofs": GRIPPER_DOFS, "shapes": SHAPES, "finger_shape": 10}
+        places = wp.array([(x, y, -move["tcp_offset"]) for x, y in self.cups], dtype=wp.vec3, device=self.device)
+        parts = [WorldPart(*part) for part in self.parts]
         self.scene = SceneData(
-            self._layout(),
+            fill(structs.LayoutData, self, **layout),
             self._catalog(),
             fill(structs.DropData, **(DROP | {"objects": self.instances} | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
             mode_data([(0, 0.0, 0.0, 0)], self.device),
-            fill(structs.MoveData, **(MOVE | self.move)),
+            fill(structs.MoveData, **move),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
-            filled(structs.SuctionData(), {"tcp_offset": (MOVE | self.move)["tcp_offset"]}),
-            filled(structs.CupData(), {"count": len(self.cups), "place": self._places()}),
-            self._bins(),
+            filled(structs.SuctionData(), {"tcp_offset": move["tcp_offset"]}),
+            filled(structs.CupData(), {"count": len(self.cups), "place": places}),
+            bin_data(self.bins, self.places, Move(corner=0.5), parts, self.device),
             build_look_table(Looks(self.randomize, (), ()), 0, self.device),
         )
-        sizes = {
-            "one": 1,
-            "world": self.worlds,
-            "world_and_global": self.worlds + 1,
-            "instance": self.instances,
-            "word": count_words(self.instances),
-            "body": self.worlds * self.bodies,
-            "waypoint": self.scene.move.waypoints,
-            "cup": len(self.cups),
-        }
+        sizes = world_sizes(self.worlds, self.instances, move["waypoints"] // CORNERS, self.bodies, len(self.cups))
         self.state = allocate(WorldState, sizes, self.device)
         self.state.bin_pose.fill_(wp.transform_identity())
         self.scene.bins.chosen, self.scene.bins.pose = self.state.bin, self.state.bin_pose
@@ -146,24 +137,6 @@ class KernelWorlds:
         self.observation = allocate(Observation, sizes, self.device)
         self.plan = allocate(Plan, sizes, self.device)
         self.physics = self._physics()
-
-    def _layout(self) -> Any:
-        return fill(
-            structs.LayoutData,
-            self,
-            gripper_bodies=GRIPPER_BODIES,
-            gripper_dofs=GRIPPER_DOFS,
-            shapes=SHAPES,
-            finger_shape=10,
-        )
-
-    def _places(self) -> wp.array:
-        tcp_offset = (MOVE | self.move)["tcp_offset"]
-        return wp.array([(x, y, -tcp_offset) for x, y in self.cups], dtype=wp.vec3, device=self.device)
-
-    def _bins(self) -> Any:
-        """Bins by `bins`."""
-        return bin_data(self.bins, self.places, Move(corner=0.5), [WorldPart(*part) for part in self.parts], self.device)
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)
@@ -212,29 +185,52 @@ class KernelWorlds:
             load=lambda variant, restarted: None,
         )
 
-    def set(self, array: wp.array, values: Any) -> None:
-        """Write values, broadcast, to an array of the state."""
-        array.assign(np.broadcast_to(np.asarray(values, array.numpy().dtype), array.numpy().shape).copy())
+    def array(self, name: str) -> wp.array:
+        """The array of this name in whichever group of state or physics has it."""
+        physics = self.physics
+        groups = (self.state, self.attempts, self.seals, self.observation, self.plan)
+        owners = (*groups, physics.state, physics.control, physics.solver, physics.model, physics)
+        return next(getattr(owner, name) for owner in owners if hasattr(owner, name))
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Values of the array of this name, on the host."""
+        return self.array(name).numpy()
+
+    def row(self, *names: str, world: int = 0) -> list[Any]:
+        """What arrays have of a world, as Python numbers and lists."""
+        return [self[name][world].tolist() for name in names]
+
+    def put(self, **values: Any) -> None:
+        """Write values, broadcast, to arrays by their names."""
+        for name, value in values.items():
+            array = self.array(name)
+            array.assign(np.broadcast_to(np.asarray(value, array.numpy().dtype), array.numpy().shape).copy())
+
+    def run(self, stage: Callable[..., None], *others: Any) -> None:
+        """Run a stage on the groups that its parameters name, and `current`, the physics' state; its other arguments are `others`."""
+        given = {name: getattr(self, name) for name in GROUPS} | {"current": self.physics.state}
+        rest = iter(others)
+        parameters = inspect.signature(stage).parameters.values()
+        stage(*(given[item.name] if item.name in given else next(rest, item.default) for item in parameters))
 
     def begin(self, phase: int, episodes: Any = None, arrangement: Any = 0) -> None:
         """Set the phase and arrangement of all worlds; by default world w has episode w."""
         episodes = np.arange(self.worlds) if episodes is None else episodes
-        self.set(self.state.arrangement_id, np.stack(np.broadcast_arrays(episodes, arrangement), axis=-1))
-        self.set(self.state.phase, phase)
+        self.put(phase=phase, arrangement_id=np.stack(np.broadcast_arrays(episodes, arrangement), axis=-1))
 
     def coordinates(self) -> np.ndarray:
         """Poses of all slots (world, slot, 7)."""
-        return self.physics.state.joint_q.numpy().reshape(self.worlds, -1)[:, GRIPPER_DOFS:].reshape(self.worlds, self.slots, 7)
+        return self["joint_q"].reshape(self.worlds, -1)[:, GRIPPER_DOFS:].reshape(self.worlds, self.slots, 7)
 
     def forces(self) -> np.ndarray:
         """Joint forces of all slots (world, slot, 6)."""
-        return self.physics.control.joint_f.numpy().reshape(self.worlds, -1)[:, GRIPPER_DOFS:].reshape(self.worlds, self.slots, 6)
+        return self["joint_f"].reshape(self.worlds, -1)[:, GRIPPER_DOFS:].reshape(self.worlds, self.slots, 6)
 
     def place(self, world: int, instance: int, pose: Any) -> None:
         """Write the pose (7) of an instance's body."""
-        body_q = self.physics.state.body_q.numpy()
-        body_q[world * self.bodies + GRIPPER_BODIES + self.state.body_slot.numpy()[world, instance]] = pose
-        self.physics.state.body_q.assign(body_q)
+        body_q = self["body_q"]
+        body_q[world * self.bodies + GRIPPER_BODIES + self["body_slot"][world, instance]] = pose
+        self.put(body_q=body_q)
 
 
 def filled(struct: Any, values: dict[str, Any]) -> Any:

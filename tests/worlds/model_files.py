@@ -93,54 +93,7 @@ def picture(path: Path, color=(200, 10, 30), size=(4, 2)) -> Path:
 
 def step_cylinder(radius: float, height: float, unit: str = ".MILLI.") -> str:
     """STEP file (AP214) of a cylinder about z, from z = 0 up; `unit`: prefix of the metre, $ for none."""
-    rows, none = [], "''"
-
-    def add(text: str) -> str:
-        rows.append(text)
-        return f"#{len(rows)}"
-
-    def frame(z: float, axis: int) -> str:
-        parts = [add(f"CARTESIAN_POINT('',(0.,0.,{z:.9E}))"), add(f"DIRECTION('',(0.,0.,{axis}.))"), add("DIRECTION('',(1.,0.,0.))")]
-        return add(f"AXIS2_PLACEMENT_3D('',{','.join(parts)})")
-
-    app = add("APPLICATION_CONTEXT('core data for automotive mechanical design processes')")
-    length = add(f"(LENGTH_UNIT()NAMED_UNIT(*)SI_UNIT({unit},.METRE.))")
-    angle, solid = (
-        add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))"),
-        add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())"),
-    )
-    context = add(
-        f"(GEOMETRIC_REPRESENTATION_CONTEXT(3)GLOBAL_UNIT_ASSIGNED_CONTEXT(({length},{angle},{solid}))REPRESENTATION_CONTEXT('',''))"
-    )
-    points = [add(f"CARTESIAN_POINT('',({radius:.9E},0.,{z:.9E}))") for z in (0.0, height)]
-    ends = [add(f"VERTEX_POINT('',{point})") for point in points]
-    circles = [add(f"CIRCLE('',{frame(z, 1)},{radius:.9E})") for z in (0.0, height)]
-    rims = [add(f"EDGE_CURVE('',{end},{end},{circle},.T.)") for end, circle in zip(ends, circles, strict=True)]
-    up = add("DIRECTION('',(0.,0.,1.))")
-    line = add(f"LINE('',{points[0]},{add(f'VECTOR({none},{up},1.)')})")
-    seam = add(f"EDGE_CURVE('',{ends[0]},{ends[1]},{line},.T.)")
-
-    def face(surface: str, *edges: tuple[str, bool]) -> str:
-        loop = ",".join(add(f"ORIENTED_EDGE('',*,*,{edge},.{'FT'[along]}.)") for edge, along in edges)
-        bound = add(f"FACE_OUTER_BOUND('',{add(f'EDGE_LOOP({none},({loop}))')},.T.)")
-        return add(f"ADVANCED_FACE('',({bound}),{surface},.T.)")
-
-    faces = [
-        face(add(f"CYLINDRICAL_SURFACE('',{frame(0.0, 1)},{radius:.9E})"), (rims[0], True), (seam, True), (rims[1], False), (seam, False)),
-        face(add(f"PLANE('',{frame(0.0, -1)})"), (rims[0], False)),
-        face(add(f"PLANE('',{frame(height, 1)})"), (rims[1], True)),
-    ]
-    shell = add(f"CLOSED_SHELL('',({','.join(faces)}))")
-    body = add(f"MANIFOLD_SOLID_BREP('',{shell})")
-    shape = add(f"ADVANCED_BREP_SHAPE_REPRESENTATION('',({frame(0.0, 1)},{body}),{context})")
-    product = add(f"PRODUCT('part','part','',({add(f'PRODUCT_CONTEXT({none},{app},{none})')}))")
-    form = add(f"PRODUCT_DEFINITION_FORMATION('','',{product})")
-    stage = add(f"PRODUCT_DEFINITION_CONTEXT('',{app},'design')")
-    definition = add(f"PRODUCT_DEFINITION('','',{form},{stage})")
-    add(f"SHAPE_DEFINITION_REPRESENTATION({add(f'PRODUCT_DEFINITION_SHAPE({none},{none},{definition})')},{shape})")
-    head = "FILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\nFILE_SCHEMA(('AUTOMOTIVE_DESIGN'));"
-    data = "\n".join(f"#{index}={row};" for index, row in enumerate(rows, 1))
-    return f"ISO-10303-21;\nHEADER;\n{head}\nENDSEC;\nDATA;\n{data}\nENDSEC;\nEND-ISO-10303-21;\n"
+    return Path(__file__).with_name("cylinder.step").read_text().format(radius=radius, height=height, unit=unit)
 
 
 def heard(lines: list[str]) -> Callable[[str], None]:

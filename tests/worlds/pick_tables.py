@@ -15,13 +15,13 @@ EACH = 4
 """Candidates of a visible instance."""
 
 
-def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), seed: int = 0, own: bool = True) -> PickBatch:
+def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), own: bool = True) -> PickBatch:
     """Trials from states at these frames, in descending order of the states: EACH candidates of each visible box, REPEATS times each.
 
-    The first one is the episode's own, if `own` says so; the others are uniform
-    over visible pixels. A pick succeeds by chance, with a probability of seal times wrench.
+    The first one is the episode's own, if `own` says so; the others are uniform over visible pixels. A pick succeeds by chance, with a
+    probability of seal times wrench.
     """
-    generator = np.random.default_rng((episode, seed))
+    generator = np.random.default_rng((episode, 0))
     views = {int(batch.frame[0]): batch for batch in batches(1, (episode,), max(frames) + 1, cameras()[:1])}
     tables = [_trials(views[frame], state, generator, own) for state, frame in reversed(list(enumerate(frames)))]
     trials = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}

@@ -12,26 +12,17 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
-from tests.worlds.small_worlds import COARSE, catalog, settings
+from tests.worlds.small_worlds import COARSE, QUICK_PICKS, catalog, settings
 
 LIGHTS = 1
 
-SHORT = {
-    "bake__mode": "pick",
-    "perception__resolution": [320, 180],
-    "pick__appear_height": 0.2,
-    "pick__lift_height": 0.2,
-    "pick__lift_speed": 1.2,
-    "pick__near_speed": 0.5,
-}
-"""Settings under which an attempt takes about 10 ticks instead of 55."""
-CALM = {"pick__appear_height": 0.3, "pick__lift_height": 0.3, "pick__lift_speed": 0.6, "pick__near_speed": 0.2}
+SHORT = QUICK_PICKS | {"bake.mode": "pick", "perception.resolution": [320, 180]}
+"""Settings of short attempts."""
+CALM = {"pick.appear_height": 0.3, "pick.lift_height": 0.3, "pick.lift_speed": 0.6, "pick.near_speed": 0.2}
 """Changes to SHORT under which a descent takes several ticks, and what hangs at the end of a lift does not swing."""
 
-BRIEF = (
-    COARSE | SHORT | {"arrangement__max_objects": 3, "pick__failures": 1, "perception__resolution": [160, 90], "physics__guide_height": 0.4}
-)
-BRIEF |= {"bake__mode": "mixed", "bake__episodes": 8}
+BRIEF = COARSE | SHORT | {"arrangement.max_objects": 3, "pick.failures": 1, "perception.resolution": [160, 90]}
+BRIEF |= {"physics.guide_height": 0.4, "bake.mode": "mixed", "bake.episodes": 8}
 """Settings under which an attempt takes few and short ticks."""
 
 

@@ -17,42 +17,15 @@ from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 from tests.harness.exporter_contract import exporting, finish
 from tests.worlds import box_views
+from tests.worlds.attempt_records import nothing_seen, record
 
 STEP_COUNT = 4
 COMPUTED = ("time",)
-ATTEMPT = {
-    "episode": 0,
-    "attempt": 0,
-    "mode": "pick",
-    "frame": 1,
-    "end_frame": 5,
-    "outcome": "target_picked",
-    "sentence": "the target hung",
-    "target": 2,
-    "object_id": 7,
-    "point": [0.1, 0.2, 0.3],
-    "normal": [0.0, 0.0, 1.0],
-    "yaw": 0.25,
-    "tilt": -0.5,
-    "rays": 10,
-    "hits": 9,
-    "good_seal": False,
-    "engaged": [2],
-    "picked": [2, 3],
-    "peak_force": [0.0, 3.25],
-    "observation": {"resolution": [4, 3], "instances": [], "votes": []},
-}
-UNSEEN = ATTEMPT | {
-    "attempt": 1,
-    "frame": 6,
-    "end_frame": 7,
-    "outcome": "nothing_seen",
-    "hits": 0,
-    "engaged": [],
-    "picked": [],
-    "peak_force": [],
-    **dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt")),
-}
+PICKED = {"target": 2, "object_id": 7, "hits": 9, "engaged": [2], "picked": [2, 3], "peak_force": [0.0, 3.25]}
+GRASP = {"point": [0.1, 0.2, 0.3], "yaw": 0.25, "tilt": -0.5}
+OBSERVATION = {"resolution": [4, 3], "instances": [], "votes": []}
+ATTEMPT = record([], frame=1, end_frame=5, sentence="the target hung", observation=OBSERVATION, **PICKED, **GRASP)
+UNSEEN = nothing_seen(attempt=1, frame=6, end_frame=7, sentence="the target hung", observation=OBSERVATION)
 
 
 def config(**trajectory: Any) -> Config:
