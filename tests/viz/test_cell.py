@@ -16,7 +16,6 @@ from synpick_warp.apps.viz.cell.frusta import Canvas, draw_camera, footprint, im
 from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
 from synpick_warp.apps.viz.cell.sheet import describe_camera
 from synpick_warp.apps.viz.symmetries import group_turns
-from synpick_warp.cli.main import main
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.cameras import describe_cameras
@@ -25,7 +24,7 @@ from synpick_warp.scenes.symmetries.detection import turn_matrix
 from tests.builders import mistake, run
 from tests.worlds.bin_meshes import sloped_bin
 from tests.worlds.model_files import exported, put
-from tests.worlds.toy_scene import camera, distorted
+from tests.worlds.shapes import camera, distorted
 
 BEHIND = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """World to camera of a camera that looks along +y; up in the image is +z."""
@@ -194,26 +193,6 @@ def test_the_command_draws_a_cell(tmp_path, own, request):
     assert {path.name for path in tmp_path.iterdir()} - {"sloped.stl"} == {"cell.png", "cell.toml"}
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["gone.toml"], "there is no file gone.toml"),
-        (["smoky"], 'there is no preset "smoky"'),
-        (["smoke", "--symmetries"], "--symmetries is given beside --cell"),
-        (["smoke", "--config", "smoke"], "--config is given beside --cell"),
-        (["smoke", "--out", "a.txt"], "a.txt is not an image file"),
-        (["cell.toml"], "camera[0].fov is 500.0 in cell.toml"),
-        (["parts.toml"], "models folder {here}/gone: no such folder"),
-    ],
-)
-def test_mistakes_are_one_line(tmp_path, monkeypatch, arguments, said):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "cell.toml").write_text(CELL.replace("50.0", "500.0"))
-    (tmp_path / "parts.toml").write_text('preset = "smoke"\n[bake]\nmodels = "gone"\n')
-    assert mistake("preview", "--cell", *arguments).startswith(said.format(here=tmp_path))
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 # ---- symmetries ----
 
 
@@ -228,20 +207,10 @@ def test_axes_are_grouped_with_their_largest_fold():
     assert np.allclose(found[1].point[:2], middle[:2])
 
 
-def test_the_symmetries_of_a_folder_of_parts(tmp_path, capsys):
+def test_the_symmetries_of_a_folder_of_parts(tmp_path):
     put(tmp_path / "parts" / "nut.stl", exported(trimesh.creation.cylinder(30.0, 20.0, sections=6), "stl"))
     put(tmp_path / "cell.toml", "preset = 'smoke'\n[objects]\nunit = 'mm'\n")
-    arguments = [
-        "preview",
-        str(tmp_path / "parts"),
-        "--symmetries",
-        "--config",
-        str(tmp_path / "cell.toml"),
-        "--out",
-        str(tmp_path / "a.png"),
-    ]
-    assert main(arguments) == 0
-    said = capsys.readouterr().out
+    said = run("preview", tmp_path / "parts", "--symmetries", "--config", tmp_path / "cell.toml", "--out", tmp_path / "a.png").out
     assert "nut.stl: 60 x 51.96 x 20 mm, unit mm" in said
     assert "nut.stl: symmetries detected: 6-fold about (0, 0, 1), 2-fold about (" in said
     assert ", 3 more axes; they move its surface by up to " in said
@@ -251,30 +220,38 @@ def test_the_symmetries_of_a_folder_of_parts(tmp_path, capsys):
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 10
 
 
-def test_parts_are_compared_with_the_bins_mesh(tmp_path, capsys):
+def test_parts_are_compared_with_the_bins_mesh(tmp_path):
     """A part that does not fit into a bin of the default size."""
     put(tmp_path / "parts" / "plate.stl", exported(trimesh.creation.box((0.6, 0.5, 0.1)), "stl"))
     sloped_bin().apply_scale(3.0).export(tmp_path / "bin.stl")
     put(tmp_path / "cell.toml", "preset = 'smoke'\n[bins]\nkind = 'own'\n[[bin]]\nname = 'large'\nfile = 'bin.stl'\n")
-    assert main(["preview", str(tmp_path / "parts"), "--symmetries", "--config", str(tmp_path / "cell.toml")]) == 0
-    assert "plate.stl: symmetries detected" in capsys.readouterr().out
+    assert "plate.stl: symmetries detected" in run("preview", tmp_path / "parts", "--symmetries", "--config", tmp_path / "cell.toml").out
 
 
-def test_the_symmetries_that_a_data_set_states(picked_set, tmp_path, capsys):
-    assert main(["preview", str(picked_set), "--symmetries", "--out", str(tmp_path / "a.png")]) == 0
-    assert capsys.readouterr().out == f"symmetries: {tmp_path / 'a.png'}\n"
+def test_the_symmetries_that_a_data_set_states(picked_set, tmp_path):
+    assert run("preview", picked_set, "--symmetries", "--out", tmp_path / "a.png").out == f"symmetries: {tmp_path / 'a.png'}\n"
     assert "which has its settings" in mistake("preview", picked_set, "--symmetries", "--config", "smoke")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["--cell", "gone.toml"], "there is no file gone.toml"),
+        (["--cell", "smoky"], 'there is no preset "smoky"'),
+        (["--cell", "smoke", "--symmetries"], "--symmetries is given beside --cell"),
+        (["--cell", "smoke", "--config", "smoke"], "--config is given beside --cell"),
+        (["--cell", "smoke", "--out", "a.txt"], "a.txt is not an image file"),
+        (["--cell", "cell.toml"], "camera[0].fov is 500.0 in cell.toml"),
+        (["--cell", "parts.toml"], "models folder {here}/gone: no such folder"),
         (["gone", "--symmetries"], "models folder gone: no such folder"),
         (["--symmetries"], "no data set"),
         ([".", "--config", "smoke"], "--config is given without --symmetries"),
         ([".", "--symmetries", "--out", "a.txt"], "a.txt is not an image file"),
     ],
 )
-def test_mistakes_about_symmetries_are_one_line(tmp_path, monkeypatch, arguments, said):
+def test_mistakes_are_one_line(tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
-    assert said in mistake("preview", *arguments)
+    (tmp_path / "cell.toml").write_text(CELL.replace("50.0", "500.0"))
+    (tmp_path / "parts.toml").write_text('preset = "smoke"\n[bake]\nmodels = "gone"\n')
+    assert said.format(here=tmp_path) in mistake("preview", *arguments)
+    assert len(list(tmp_path.iterdir())) == 2

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,11 +21,10 @@ from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, Perception, Pick, Target
 from synpick_warp.dataset.view import View
-from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.types import Camera
-from tests.builders import mistake
+from tests.builders import mistake, refusal
 from tests.harness.charts import near, picture_of
 from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
@@ -93,15 +94,17 @@ def edge_share(image: np.ndarray, mask: np.ndarray, instance: int) -> float:
     return float((image[border] == instance_color(instance)).all(axis=1).mean())
 
 
-def test_the_target_is_bright_tinted_and_has_a_contour_where_its_mask_is(dataset):
-    color, image = colored(dataset), image_of(drawn(dataset))
-    target, other = masked(dataset, 1), masked(dataset, 0)
+@pytest.mark.parametrize(("number", "index", "instance"), [(0, 1, 2), (1, 2, 3)])
+def test_the_target_is_bright_tinted_and_has_a_contour_where_its_mask_is(dataset, number, index, instance):
+    """Attempt, which is at the frame of its number; index of the target's mask, and the target."""
+    color, image = colored(dataset, number), image_of(drawn(dataset, number))
+    target, other = masked(dataset, index, number), masked(dataset, 0, number)
     assert target.sum() > 500
     inside, beside = (cv2.erode(mask.astype(np.uint8), np.ones((15, 15))) > 0 for mask in (target, other))
-    tinted = 0.72 * color[inside] + 0.28 * np.array(instance_color(2))
+    tinted = 0.72 * color[inside] + 0.28 * np.array(instance_color(instance))
     assert np.median(np.abs(image[inside] - tinted).max(axis=1)) <= 1
     assert np.median(np.abs(image[beside] - 0.62 * color[beside]).max(axis=1)) <= 1
-    assert edge_share(image, target, 2) > 0.9
+    assert edge_share(image, target, instance) > 0.9
     assert edge_share(image, other, 0) > 0.8
     away = cv2.distanceTransform((~target).astype(np.uint8), cv2.DIST_L2, 5)
     around = (away > 3) & (away < 4)
@@ -112,13 +115,6 @@ def test_sets_of_several_sensors_look_the_same(dataset, tmp_path):
     other = bake(tmp_path / "sensors", split="train", color_format="png", layout="multisensor")
     shutil.copy(dataset / "attempts.jsonl", other)
     np.testing.assert_array_equal(drawn(dataset)[TOP:], drawn(other)[TOP:])
-
-
-def test_another_target_another_highlight(dataset):
-    image = image_of(drawn(dataset, 1))
-    inside = cv2.erode(masked(dataset, 2, 1).astype(np.uint8), np.ones((15, 15))) > 0
-    expected = 0.72 * colored(dataset, 1)[inside] + 0.28 * np.array(instance_color(3))
-    assert np.median(np.abs(image[inside] - expected).max(axis=1)) <= 1
 
 
 @pytest.mark.parametrize(("resolution", "factor"), [([96, 72], 1.0), ([192, 144], 2.0), ([48, 36], 0.5)])
@@ -136,10 +132,7 @@ def test_suction_points_are_drawn_where_they_are_at_any_sight_resolution(dataset
     assert abs(rows[disc].mean() - y) < 0.5
 
 
-def test_known_answers_of_scaling():
-    assert to_color_image((5.0, 7.0), (96, 72), (96, 72)) == (5.0, 7.0)
-    assert to_color_image((0.0, 0.0), (96, 72), (192, 144)) == (0.5, 0.5)
-    assert to_color_image((95.5, 71.5), (192, 144), (96, 72)) == (47.5, 35.5)
+def test_a_sight_of_another_shape_is_the_middle_of_the_colour_image():
     assert to_color_image((0.0, 0.0), (96, 36), (96, 72)) == (0.0, 18.0)
 
 
@@ -211,27 +204,17 @@ FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0
 @pytest.mark.parametrize(
     ("objects", "target", "mode", "said"),
     [
-        ((FIRST,), 0, "pick", "target: 1 tin: 0 objects above; the only visible object"),
-        (
-            (FIRST, SECOND, THIRD),
-            1,
-            "pick",
-            "target: 2 box: 0 objects above; visible area 0.60 of its box's largest face, the largest of 2 such",
-        ),
-        ((FIRST, THIRD), 0, "pick", "target: 1 tin: 0 objects above, the fewest of all"),
-        ((FIRST, SECOND, THIRD), 2, "target", "target: 3 mug: 1 object above, the most of all"),
-        (
-            (FIRST, SECOND),
-            0,
-            "target",
-            "target: 1 tin: 0 objects above; visible area 0.40 of its box's largest face, the smallest of 2 such",
-        ),
-        ((FIRST, SECOND, THIRD), 0, "pick", "target: 1 tin: 0 objects above; the rule would name 2 box"),
-        ((), None, "pick", "target: none, nothing is visible"),
+        ((FIRST,), 0, "pick", "1 tin: 0 objects above; the only visible object"),
+        ((FIRST, SECOND, THIRD), 1, "pick", "2 box: 0 objects above; visible area 0.60 of its box's largest face, the largest of 2 such"),
+        ((FIRST, THIRD), 0, "pick", "1 tin: 0 objects above, the fewest of all"),
+        ((FIRST, SECOND, THIRD), 2, "target", "3 mug: 1 object above, the most of all"),
+        ((FIRST, SECOND), 0, "target", "1 tin: 0 objects above; visible area 0.40 of its box's largest face, the smallest of 2 such"),
+        ((FIRST, SECOND, THIRD), 0, "pick", "1 tin: 0 objects above; the rule would name 2 box"),
+        ((), None, "pick", "none, nothing is visible"),
     ],
 )
 def test_why_it_was_chosen(objects, target, mode, said):
-    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target, Config().pick)[0] == said
+    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config().target, Config().pick)[0] == f"target: {said}"
 
 
 @pytest.mark.parametrize(
@@ -304,47 +287,36 @@ def test_text_fits():
     assert cv2.getTextSize(shorten(text, 200, 0.5), FONT, 0.5, 1)[0][0] <= 200
 
 
-def damaged(**changes: object) -> str:
-    return json.dumps(record([seen_object(2, 7, (50, 38))], episode=1) | changes)
+def second(line: str | None = None, **changes: object) -> Callable[[Path], None]:
+    """Harm: a second line of attempts.jsonl after a good one, by default a record with changes."""
+    good = record([seen_object(2, 7, (50, 38))], episode=1)
+    lines = [json.dumps(good | {"episode": 0}), json.dumps(good | changes) if line is None else line]
+    return lambda folder: (folder / "attempts.jsonl").write_text("\n".join(lines) + "\n")
 
 
-NO_POLE = {"resolution": [96, 72], "instances": [seen_object(2, 7, (5, 5), pole=None)], "votes": []}
-CIRCLE = {
-    "resolution": [96, 72],
-    "instances": [seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9), above=[2])],
-    "votes": [],
-}
+def observed(*seen: dict) -> dict[str, object]:
+    return {"resolution": [96, 72], "instances": list(seen), "votes": []}
 
 
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        ("{", r"attempts\.jsonl, line 2, is damaged: input data was truncated; restore the file, "),
-        ("", r"attempts\.jsonl, line 2, is damaged: input data was truncated"),
-        ("[1]", r"line 2, is damaged: expected object, got array"),
-        ('{"episode": 1, "attempt": "0"}', r"line 2, is damaged: expected int, got str - at \$\.attempt"),
-        ('{"episode": 1, "attempt": 0}', r"line 2, is damaged: object missing required field mode"),
-        (damaged(frame="first"), r"line 2, is damaged: expected int, got str - at \$\.frame"),
-        (damaged(mode="move"), r"line 2, is damaged: invalid enum value 'move' - at \$\.mode"),
-        (damaged(target=9), r"line 2, is damaged: target is 9, which was not visible"),
-        (damaged(peak_force=[float("inf")]), r"line 2, is damaged: JSON is malformed"),
-        (damaged(observation=NO_POLE), r"line 2, is damaged: expected array, got null - at \$\.observation\.instances\[0\]\.pole"),
-        (damaged(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
-        (damaged(frame=77), r"000003 has no image 77, as .*attempts\.jsonl names frame 77"),
-    ],
-)
-def test_a_damaged_record_is_one_clear_line(dataset, line, said):
-    good = json.dumps(record([seen_object(2, 7, (50, 38))], episode=0))
-    (dataset / "attempts.jsonl").write_text(f"{good}\n{line}\n")
-    with pytest.raises(DatasetError, match=said) as caught:
-        drawn(dataset)
-    assert "\n" not in str(caught.value)
-    assert not (dataset / "picture.png").exists()
+NO_POLE = observed(seen_object(2, 7, (5, 5), pole=None))
+CIRCLE = observed(seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9), above=[2]))
 
 
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
+        (second("{"), r"attempts\.jsonl, line 2, is damaged: input data was truncated; restore the file, "),
+        (second(""), r"attempts\.jsonl, line 2, is damaged: input data was truncated"),
+        (second("[1]"), r"line 2, is damaged: expected object, got array"),
+        (second('{"episode": 1, "attempt": "0"}'), r"line 2, is damaged: expected int, got str - at \$\.attempt"),
+        (second('{"episode": 1, "attempt": 0}'), r"line 2, is damaged: object missing required field mode"),
+        (second(frame="first"), r"line 2, is damaged: expected int, got str - at \$\.frame"),
+        (second(mode="move"), r"line 2, is damaged: invalid enum value 'move' - at \$\.mode"),
+        (second(target=9), r"line 2, is damaged: target is 9, which was not visible"),
+        (second(peak_force=[float("inf")]), r"line 2, is damaged: JSON is malformed"),
+        (second(observation=NO_POLE), r"line 2, is damaged: expected array, got null - at \$\.observation\.instances\[0\]\.pole"),
+        (second(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
+        (second(frame=77), r"000003 has no image 77, as .*attempts\.jsonl names frame 77"),
         (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
         (
             lambda folder: (folder / "attempts.jsonl").unlink(),
@@ -360,11 +332,9 @@ def test_a_damaged_record_is_one_clear_line(dataset, line, said):
         (lambda folder: (folder / "train/000003/mask_visib/000000_000001.png").unlink(), r"there is no .*000000_000001\.png"),
     ],
 )
-def test_what_is_missing_is_named_in_one_line(dataset, tmp_path, harm, said):
+def test_what_is_damaged_or_missing_is_named_in_one_line(dataset, tmp_path, harm, said):
     harm(dataset)
-    with pytest.raises(DatasetError, match=said) as caught:
-        write_explanation(dataset, tmp_path / "picture.png", 1, 0)
-    assert "\n" not in str(caught.value)
+    assert re.search(said, refusal(write_explanation, dataset, tmp_path / "picture.png", 1, 0))
     assert not (tmp_path / "picture.png").exists()
 
 

@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -108,11 +109,8 @@ def test_views_are_spread_over_cameras_scenes_and_time(dataset):
     assert [int(scene.folder.name) for scene, _ in views] == [0, 1, 2, 3, 4, 5]
     assert len({frame for _, frame in views}) >= 4
     assert {int(scene.folder.name) % 3 for scene, _ in sample(find_scenes(dataset), 3)} == {0, 1, 2}
-
-
-def test_more_views_than_there_are_show_each_at_most_once(dataset):
-    views = sample(find_scenes(dataset), 200)
-    assert len(views) == len(set(views)) <= len(EPISODES) * 3 * FRAMES
+    most = sample(find_scenes(dataset), 200)
+    assert len(most) == len(set(most)) <= len(EPISODES) * 3 * FRAMES
 
 
 def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
@@ -231,15 +229,25 @@ def test_a_set_without_masks_and_with_png_colour(tmp_path):
     assert write_contact_sheet(tmp_path / "set", tmp_path / "sheet.jpg", 2).is_file()
 
 
-def test_folders_that_are_no_data_set(tmp_path):
-    with pytest.raises(DatasetError, match="there is no folder"):
-        write_contact_sheet(tmp_path / "none", tmp_path / "sheet.png", 1)
-    with pytest.raises(DatasetError, match="has no complete scene"):
-        write_contact_sheet(tmp_path, tmp_path / "sheet.png", 1)
+def wrong(name: str, place: tuple, value: object) -> Callable[[Path], None]:
+    """Harm of a scene: another value in each image's entry of scene_{name}.json."""
+
+    def harm(scene: Path) -> None:
+        path = scene / f"scene_{name}.json"
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({frame: replaced(entry, place, value) for frame, entry in content.items()}))
+
+    return harm
+
+
+def shrunk(name: str, dtype: type) -> Callable[[Path], None]:
+    """Harm of a scene: images of 5 x 3 px."""
+    data = cv2.imencode(".png", np.zeros((3, 5), dtype))[1].tobytes()
+    return lambda scene: [path.write_bytes(data) for path in (scene / name).iterdir()]
 
 
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("harm", "said"),
     [
         (lambda scene: (scene / "scene_gt.json").unlink(), r"there is no file .*scene_gt\.json"),
         (
@@ -249,15 +257,24 @@ def test_folders_that_are_no_data_set(tmp_path):
         (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
         (lambda scene: [shutil.rmtree(scene / name) for name in ("rgb", "depth")], r"there is no .*rgb/.*\.png or \.jpg"),
         (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], r"^[a-z]+/train_pbr/.* is not an image"),
+        (shrunk("depth", np.uint16), r"depth/.*\.png has 5 x 3 pixels; the images of this camera have"),
+        (shrunk("mask_visib", np.uint8), r"mask_visib/.*\.png has 5 x 3 pixels; the images of this camera have"),
+        (wrong("gt", (0,), "x"), r"scene_gt\.json is damaged: expected object, got str"),
+        (wrong("gt", (0, "obj_id"), []), r"expected int, got array"),
+        (wrong("gt_info", (0, "px_count_visib"), "3"), r"expected int, got str"),
+        (wrong("gt_info", (0, "bbox_obj"), [1e300] * 4), r"expected int"),
+        (wrong("gt_info", (0, "visib_fract"), float("nan")), r"JSON is malformed"),
+        (wrong("camera", ("depth_scale",), None), r"expected float, got null"),
+        (wrong("camera", ("cam_R_w2c",), 3), r"expected array, got int"),
+        (lambda scene: shutil.rmtree(scene), "has no complete scene"),
+        (lambda scene: shutil.rmtree(scene.parent.parent, ignore_errors=True), "there is no folder"),
     ],
 )
-def test_a_damaged_data_set_is_one_clear_line(dataset, tmp_path, monkeypatch, damage, message):
-    for scene in (dataset / "train_pbr").iterdir():
-        damage(scene)
+def test_a_damaged_data_set_is_one_clear_line(dataset, tmp_path, monkeypatch, harm, said):
+    for scene in list((dataset / "train_pbr").iterdir()):
+        harm(scene)
     monkeypatch.chdir(dataset.parent)
-    with pytest.raises(DatasetError, match=message) as caught:
-        write_contact_sheet(Path(dataset.name), tmp_path / "sheet.png", 3)
-    assert "\n" not in str(caught.value)
+    assert re.search(said, mistake("preview", dataset.name, "--out", tmp_path / "sheet.png", "--views", 3))
     assert not (tmp_path / "sheet.png").exists()
 
 
@@ -269,9 +286,6 @@ def test_what_can_not_be_written_is_one_clear_line(dataset, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         write_contact_sheet(dataset, tmp_path / "file" / "sheet.png", 1)
-
-
-# ---- hostile data sets ----
 
 
 def test_a_sheet_has_at_most_the_views_of_the_set_and_at_most_max_views(dataset, tmp_path):
@@ -293,31 +307,3 @@ def test_a_link_in_place_of_the_sheet_is_replaced_and_not_followed(dataset, tmp_
     assert main(["preview", str(dataset), "--views", "1"]) == 0
     assert (tmp_path / "victim").read_text() == "mine"
     assert not (tmp_path / "set-contact-sheet.png").is_symlink()
-
-
-@pytest.mark.parametrize("name", ["depth", "mask_visib"])
-def test_an_image_of_another_size_than_the_colour_is_named(dataset, tmp_path, name):
-    for path in dataset.glob(f"*/*/{name}/*.png"):
-        path.write_bytes(cv2.imencode(".png", np.zeros((3, 5), np.uint16 if name == "depth" else np.uint8))[1].tobytes())
-    with pytest.raises(DatasetError, match=rf"{name}/.*\.png has 5 x 3 pixels; the images of this camera have"):
-        write_contact_sheet(dataset, tmp_path / "sheet.png", 2)
-
-
-@pytest.mark.parametrize(
-    ("name", "place", "value", "said"),
-    [
-        ("gt", (0,), "x", r"scene_gt\.json is damaged: expected object, got str"),
-        ("gt", (0, "obj_id"), [], r"expected int, got array"),
-        ("gt_info", (0, "px_count_visib"), "3", r"expected int, got str"),
-        ("gt_info", (0, "bbox_obj"), [1e300] * 4, r"expected int"),
-        ("gt_info", (0, "visib_fract"), float("nan"), r"JSON is malformed"),
-        ("camera", ("depth_scale",), None, r"expected float, got null"),
-        ("camera", ("cam_R_w2c",), 3, r"expected array, got int"),
-    ],
-)
-def test_wrong_types_in_annotations_are_one_line(dataset, name, place, value, said):
-    for path in dataset.glob(f"*/*/scene_{name}.json"):
-        content = json.loads(path.read_text())
-        path.write_text(json.dumps({frame: replaced(entry, place, value) for frame, entry in content.items()}))
-    assert re.search(said, mistake("preview", dataset))
-    assert not (dataset.parent / "set-contact-sheet.png").exists()
