@@ -34,8 +34,9 @@ from tests.builders import PICKING
 from tests.harness.bake_server import TINY
 from tests.worlds.bin_meshes import bracket, sloped_bin
 from tests.worlds.model_files import box, glb, put
+from tests.worlds.shapes import UPRIGHT, camera, entry, even_light, sheet, sun
 from tests.worlds.small_worlds import QUICK
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, even_light, render, sheet, sun
+from tests.worlds.toy_scene import ToyScene, render
 
 CELL = """preset = "smoke"
 [bins]

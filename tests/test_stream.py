@@ -31,8 +31,8 @@ from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, vie
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch, SelectedRows
 from tests.twins.depth_png import encode_depth
+from tests.worlds.shapes import even_light, sun
 from tests.worlds.small_worlds import settings
-from tests.worlds.toy_scene import even_light, sun
 from tests.worlds.trajectories import ticks
 
 WORLDS, ROOM = 5, 3

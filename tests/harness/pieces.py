@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.collision.hulls import mass_properties
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
-from tests.twins.rays import edges_match, first_hit
+from tests.twins.raycast import edges_match, first_hit
 
 
 def assert_valid(piece: ConvexPiece) -> None:

@@ -25,7 +25,8 @@ from tests.harness.probe import probe
 from tests.twins import planning
 from tests.twins.raycast import rotation_of
 from tests.worlds.kernel_worlds import KernelWorlds, filled
-from tests.worlds.toy_scene import ToyScene, ball, box, build_scene, camera, entry, flat_shaded, sheet, snapshot
+from tests.worlds.shapes import ball, box, camera, entry, flat_shaded, sheet
+from tests.worlds.toy_scene import ToyScene, build_scene, snapshot
 
 QUARTER = np.pi / 2
 VIEW = camera(160, 120, 400.0, (0.02, -0.03, 2.0))

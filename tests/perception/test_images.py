@@ -19,7 +19,8 @@ from synpick_warp.stages.perception import images
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.render.scene import build_render_scene
 from tests.harness.trace_probe import trace_gbuffer
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, entry, render, snapshot
+from tests.worlds.shapes import GREY, UPRIGHT, ball, box, entry
+from tests.worlds.toy_scene import ToyScene, build_scene, render, snapshot
 
 RESOLUTION = (96, 54)
 
@@ -30,15 +31,13 @@ def toy() -> ToyScene:
     config = Config()
     config = replace(config, cameras=replace(config.cameras, resolution=RESOLUTION))
     tote = Fixture(box(0.5, 0.3, 0.02), GREY)
-    placed = [
-        [(0, (0.05, 0.02, 0.06, 0.1, 0.2, 0.0, 0.97)), (1, (-0.08, 0.03, 0.05, *UPRIGHT))],
-        [(1, (0.0, 0.0, 0.05, *UPRIGHT)), (0, (0.04, 0.0, 0.1, *UPRIGHT)), (0, (-0.1, -0.05, 0.05, *UPRIGHT))],
-    ]
+    first = [(0, (0.05, 0.02, 0.06, 0.1, 0.2, 0.0, 0.97)), (1, (-0.08, 0.03, 0.05, *UPRIGHT))]
+    second = [(1, (0.0, 0.0, 0.05, *UPRIGHT)), (0, (0.04, 0.0, 0.1, *UPRIGHT)), (0, (-0.1, -0.05, 0.05, *UPRIGHT))]
     gripper = (Fixture(box(0.1, 0.1, 0.3), GREY), Fixture(box(0.04, 0.04, 0.05), GREY))
     poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.4, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT))
     return ToyScene(
         [entry(box(0.1, 0.06, 0.04)), entry(ball(0.04, 3))],
-        placed,
+        [first, second],
         make_cameras(config.rig)[:1],
         fixtures=(tote, *gripper),
         fixture_poses=poses,

@@ -22,7 +22,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
 from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, rim_height, tote_colliders, tote_fixture
 from tests.harness.pieces import assert_closed, felt, filled, is_convex
-from tests.twins.rays import edges_match, first_hit
+from tests.twins.raycast import edges_match, first_hit
 
 TOTE = Tote()
 MESH = tote_fixture(TOTE).mesh

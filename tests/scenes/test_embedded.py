@@ -25,7 +25,7 @@ from synpick_warp.scenes.embedded.surfaces import KINDS, SIDE, surface_textures
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from tests.harness.pieces import assert_closed
-from tests.twins.rays import edges_match
+from tests.twins.raycast import edges_match
 from tests.worlds.model_files import REAL_HULLS
 from tools.embedded_shapes import modelled_shape
 

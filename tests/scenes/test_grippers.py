@@ -21,7 +21,7 @@ from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
 from synpick_warp.scenes.grippers.tool_mesh import measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.harness.pieces import assert_closed, felt, is_convex
-from tests.twins.rays import first_hit
+from tests.twins.raycast import first_hit
 from tests.worlds.small_worlds import catalog
 
 ARRAY = {"kind": "suction_array"}

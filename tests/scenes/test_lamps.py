@@ -15,7 +15,8 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT, SOLAR_TANGENT, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.stages.render.light_tables import precompute_environment, sh_basis
-from tests.worlds import toy_scene
+from tests.worlds.shapes import UPRIGHT, camera, entry, sheet
+from tests.worlds.toy_scene import ToyScene, render
 
 ROWS = 64
 
@@ -219,12 +220,12 @@ def test_without_a_set_the_bright_place_of_the_map_is_a_lamp():
 
 def test_the_sun_of_a_set_casts_a_shadow_in_its_colour(device):
     """A small sheet 0.1 m above a large one; the set's sun at 45° over +x, red, over an even map: light returns where it does not reach."""
-    view = toy_scene.camera(64, 48, 200.0, (0.0, 0.0, 2.0))
-    flat, above = (0.0, 0.0, 0.0, *toy_scene.UPRIGHT), (0.0, 0.0, 0.1, *toy_scene.UPRIGHT)
-    entries = [toy_scene.entry(toy_scene.sheet(0.6, 0.4)), toy_scene.entry(toy_scene.sheet(0.04, 0.04))]
+    view = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
+    flat, above = (0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.1, *UPRIGHT)
+    entries = [entry(sheet(0.6, 0.4)), entry(sheet(0.04, 0.04))]
     sun = Sun(np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0), np.array([4.0, 0.0, 0.0]))
     lights = (EnvironmentMap("set", np.ones((64, 128, 3), np.float32), sun),)
-    lit = toy_scene.render(toy_scene.ToyScene(entries, [[(0, flat), (1, above)]], (view,), lights=lights), device).radiance[0]
+    lit = render(ToyScene(entries, [[(0, flat), (1, above)]], (view,), lights=lights), device).radiance[0]
     assert lit[24, 22, 0] < 0.7 * lit[24, 42, 0]
     np.testing.assert_allclose(lit[24, 22, 1:], lit[24, 42, 1:], rtol=0.1)
 

@@ -14,7 +14,8 @@ from synpick_warp.scenes.assets.meshes import merge_positions, read_mesh, signed
 from synpick_warp.scenes.assets.normals import crease_normals, smooth_normals
 from tests.twins.layers import render_layers
 from tests.worlds.model_files import exported, load_models, put
-from tests.worlds.toy_scene import ToyScene, camera, entry
+from tests.worlds.shapes import camera, entry
+from tests.worlds.toy_scene import ToyScene
 
 KINDS = ("ply", "obj", "glb", "gltf", "stl")
 

@@ -24,8 +24,9 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.builders import FEW_STEPS, assignments
+from tests.worlds.shapes import GREY, UPRIGHT, ball, box, camera, entry, sheet
 from tests.worlds.small_worlds import catalog
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
+from tests.worlds.toy_scene import ToyScene, render, snapshot
 from tools.bench import __main__ as bench
 from tools.bench import engines, peers, pictures, run, worlds
 from tools.bench import sensor as bench_sensor

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from synpick_warp.codes import Segment
@@ -23,23 +21,7 @@ LUMINANCE = np.array([0.299, 0.587, 0.114])
 """Weights of sRGB values in luma (Rec. 601)."""
 
 
-@dataclass(frozen=True)
-class Lattice:
-    """Strength of periodic artefacts in an image: amplitude relative to neighbouring frequencies (1: none), share of windows [%], largest
-    amplitude [grey levels].
-    """
-
-    ratio: float
-    """RMS amplitude at the strongest grid frequency over all windows, relative to neighbouring frequencies; 1: no lattice."""
-    share: float
-    """Share of windows with an amplitude of at least VISIBLE and STRONG times that of neighbouring frequencies [%]."""
-    amplitude: float
-    """Largest amplitude of any window at any grid frequency [grey levels]."""
-    windows: int
-    """Number of windows."""
-
-
-def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int, ...]) -> Lattice:
+def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int, ...]) -> tuple[float, float, int]:
     """Measure periodic artefacts: power spectra of image windows at the frequencies (i / P, j / P), relative to neighbouring frequencies.
 
     Windows are several periods P wide, overlap by half (Welch's method), and are tapered by a Hann window; only windows within one surface
@@ -51,20 +33,22 @@ def measure_lattice(image: np.ndarray, instance: np.ndarray, periods: tuple[int,
         image: Grey levels (H, W, 3).
         instance: Segmentation ids (H, W); windows that show more than the tote or the table alone are left out.
         periods: Periods P [px]; the result is that of the one with the strongest lattice.
+
+    Returns:
+        RMS amplitude at the strongest grid frequency over all windows, relative to neighbouring ones, 1: no lattice; share of windows
+        with an amplitude of at least VISIBLE and STRONG times that of neighbouring frequencies; number of windows.
     """
-    return max((_measure_period(image, instance, period) for period in periods), key=lambda lattice: lattice.ratio)
+    return max(_measure_period(image, instance, period) for period in periods)
 
 
-def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> Lattice:
+def _measure_period(image: np.ndarray, instance: np.ndarray, period: int) -> tuple[float, float, int]:
     """Measure the artefacts of one period; see `measure_lattice`."""
     lattice, near = _window_spectra(image, instance, period)
-    if not len(lattice):
-        return Lattice(0.0, 0.0, 0.0, 0)
     near = near + FLOOR**2
     strong = (lattice > VISIBLE**2) & (lattice > STRONG**2 * near)
     weight = 1.0 / near.mean(axis=1, keepdims=True)
     ratio = float(np.sqrt(((weight * lattice).sum(axis=0) / (weight * near).sum(axis=0)).max()))
-    return Lattice(ratio, 100.0 * float(strong.any(axis=1).mean()), float(np.sqrt(lattice.max())), len(lattice))
+    return ratio, float(strong.any(axis=1).mean()), len(lattice)
 
 
 def _window_spectra(image: np.ndarray, instance: np.ndarray, period: int) -> tuple[np.ndarray, np.ndarray]:
@@ -86,7 +70,7 @@ def _window_spectra(image: np.ndarray, instance: np.ndarray, period: int) -> tup
                 flat = taper * (window - (taper * window).sum() / taper.sum())
                 power = np.abs(np.fft.fft2(flat) * (2.0 / taper.sum())) ** 2
                 found.append((power[rows, columns], [NOISE_RATIO * float(np.exp(np.log(power[each] + 1e-12).mean())) for each in near]))
-    first, second = zip(*found, strict=True) if found else ((), ())
+    first, second = zip(*found, strict=True)
     return np.array(first), np.array(second)
 
 

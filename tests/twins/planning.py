@@ -19,6 +19,7 @@ from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.aimed_views import aimed_views
+from tests.twins import perception
 from tests.worlds import kernel_worlds
 
 FOCAL = 100.0
@@ -137,7 +138,7 @@ class PlannerHarness:
 
 
 def segment(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np.ndarray]:
-    """Components, contours and grasp points (the poles) of images (V, H, W), by OpenCV."""
+    """Components, contours and grasp points (the poles) of images of ids (V, H, W), by OpenCV and SciPy."""
     views, height, width = ids.shape
     result = {
         "component": np.full(ids.shape, -1, np.int32),
@@ -148,30 +149,21 @@ def segment(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np
         "distance": np.zeros(ids.shape, np.float32),
         "grasp_pixel": np.zeros((views, instances, 2), np.int32),
         "depth": np.zeros((views, instances), np.float32),
-        "visible_fraction": np.zeros((views, instances), np.float32),
     }
-    for view, i in itertools.product(range(views), range(instances)):
-        count, labels = cv2.connectedComponents((ids[view] == i).astype(np.uint8), connectivity=8)
-        best = 0
-        for label in range(1, count):
-            mask = labels == label
-            name = np.flatnonzero(mask)[0]
-            result["component"][view][mask] = name
-            if mask.sum() > best:
-                best = mask.sum()
-                result["largest"][view, i] = name
-        if best == 0:
-            continue
-        mask = (result["component"][view] == result["largest"][view, i]).astype(np.uint8)
-        outer, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        points = outer[0][:, 0]
-        result["contour"][view, i, : len(points)], result["contour_length"][view, i] = points, len(points)
-        distance = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        row, column = np.unravel_index(np.argmax(distance), distance.shape)
-        result["distance"][view] = np.maximum(result["distance"][view], distance)
-        result["visible"][view, i], result["visible_fraction"][view, i] = best, best / (height * width)
-        result["grasp_pixel"][view, i], result["depth"][view, i] = (column, row), depths[view, row, column]
-    return result
+    for view in range(views):
+        labels = result["component"][view] = perception.label_components(ids[view] + 1, instances)
+        for i in range(instances):
+            result["largest"][view, i] = largest = perception.largest_label(labels, ids[view] + 1, i)
+            if largest < 0:
+                continue
+            mask = labels == largest
+            points, distance = perception.contour(mask), np.sqrt(perception.squared_distance(mask))
+            result["contour"][view, i, : len(points)], result["contour_length"][view, i] = points, len(points)
+            result["distance"][view] += distance.astype(np.float32)
+            row, column = np.unravel_index(np.argmax(distance), distance.shape)
+            result["visible"][view, i] = mask.sum()
+            result["grasp_pixel"][view, i], result["depth"][view, i] = (column, row), depths[view, row, column]
+    return result | {"visible_fraction": (result["visible"] / (height * width)).astype(np.float32)}
 
 
 def votes(harness: PlannerHarness, diagonal: float | np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Reference G-buffer in float64: every triangle against the rays of the pixels in its box."""
+"""Ray casting in float64: a reference G-buffer, hits of rays on a mesh; and whether a mesh is closed and consistently oriented."""
 
 from __future__ import annotations
 
@@ -53,3 +53,29 @@ def cast_scene(meshes: list[TriangleMesh], poses: list[np.ndarray], camera: Came
     depth = depths.min(axis=0)
     instance = np.where(np.isfinite(depth), 1 + depths.argmin(axis=0), 0).astype(np.uint8)
     return depth, instance, np.isfinite(depths)
+
+
+def first_hit(vertices: np.ndarray, faces: np.ndarray, origin: ArrayLike, direction: ArrayLike) -> np.ndarray:
+    """Distances (...) to the nearest triangle from points (..., 3) along unit directions (Möller and Trumbore, 1997); infinity: a miss."""
+    corners = vertices[faces].astype(np.float64)
+    edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    along = np.asarray(direction, np.float64)[..., None, :]
+    p = np.cross(along, edge2)
+    det = (edge1 * p).sum(axis=-1)
+    usable = np.abs(det) > 1e-14
+    inverse = 1.0 / np.where(usable, det, 1.0)
+    t = np.asarray(origin, np.float64)[..., None, :] - corners[:, 0]
+    u = (t * p).sum(axis=-1) * inverse
+    q = np.cross(t, edge1)
+    v = (q * along).sum(axis=-1) * inverse
+    distance = (edge2 * q).sum(axis=-1) * inverse
+    hit = usable & (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (distance > 0)
+    return np.where(hit, distance, np.inf).min(axis=-1)
+
+
+def edges_match(faces: np.ndarray) -> bool:
+    """True if each directed edge has exactly one opposite: the mesh is closed and consistently oriented."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    codes = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
+    opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]
+    return len(np.unique(codes)) == len(codes) and np.array_equal(np.sort(codes), np.sort(opposite))

@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece
-from tests.twins.raycast import rotation_of
-from tests.twins.rays import first_hit
+from tests.twins.raycast import first_hit, rotation_of
 
 
 def ray_starts(cup: np.ndarray, rays: int, radius: float, tcp_offset: float) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,8 @@ from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratc
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.views.frames import FrameBatch
 from tests.worlds.box_views import catalog
-from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, random_pile, snapshot
+from tests.worlds.shapes import random_pile
+from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, snapshot
 
 
 def dense_toy(count: int, lenses: tuple[Camera, ...], room: int, seed: int = 0) -> ToyScene:

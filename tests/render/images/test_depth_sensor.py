@@ -11,12 +11,11 @@ import warp as wp
 
 from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera, sensor_settings
 from synpick_warp.configs.cell.sensors import DepthSensor
-from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, build_scene, camera, entry, sheet, snapshot
+from tests.worlds.shapes import UPRIGHT, box, camera, entry, sheet
+from tests.worlds.toy_scene import ToyScene, build_scene, one, snapshot, views_of
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 400.0
 TOP = 2.0
@@ -59,23 +58,18 @@ def measure(
     toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, first_episode: int = 0, count: float = COUNT, **sensor: Any
 ) -> Measured:
     """Simulate the sensor for every world and camera, in `frames` batches for frames 0, 1, ..., stacked."""
-    config = replace(toy.settings(), depth_sensor=DepthSensor(**sensor))
-    config = replace(config, render=replace(config.render, layers=("depth_sensor",)), bake=replace(config.bake, seed=seed))
-    config = config.with_values({"bop.depth_scale": count * 1e3})
-    scene = build_scene(toy, device)
-    worlds, cameras = len(toy.placed), len(toy.cameras)
-    views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.instances, views, colors=False)
-    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
+    values = {"bop.depth_scale": count * 1e3, "bake.seed": seed, "render.layers": ("depth_sensor",)}
+    config = replace(toy.settings(), depth_sensor=DepthSensor(**sensor)).with_values(values)
+    scene, views = build_scene(toy, device), views_of(toy, device)
+    renderer = make_renderer(config, scene, toy.instances, views.count, colors=False)
+    sizes = view_buffer_sizes(views.count, scene.width, scene.height, toy.instances)
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
-    world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
-    camera_index = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     worlds_now = snapshot(toy, device)
-    worlds_now.episode.assign(first_episode + np.arange(worlds))
+    worlds_now.episode.assign(first_episode + np.arange(len(toy.placed)))
     frames_measured = []
     for frame in range(frames):
         worlds_now.frame.fill_(frame)
-        renderer.render(worlds_now, make_views(world, camera_index, views, toy.instances), images, layers)
+        renderer.render(worlds_now, views, images, layers)
         frames_measured.append(layers.depth_sensor.numpy().copy())
     return Measured(np.concatenate(frames_measured), images.depth.numpy(), renderer.gbuffer.depth.numpy(), count)
 
@@ -83,7 +77,7 @@ def measure(
 def wall(depth: float, tilt: float = 0.0) -> ToyScene:
     """A large sheet across the optical axis at a depth [m], rotated about the image's columns by `tilt` [rad]."""
     turn = (0.0, np.sin(tilt / 2.0), 0.0, np.cos(tilt / 2.0))
-    return ToyScene([entry(sheet(4.0, 4.0))], [[(0, (0.0, 0.0, TOP - depth, *turn))]], (VIEW,), config=Config())
+    return one(sheet(4.0, 4.0), (0.0, 0.0, TOP - depth, *turn), VIEW)
 
 
 def deviation(depth: float, angle: float = 0.0, **given: float) -> float:
@@ -93,8 +87,9 @@ def deviation(depth: float, angle: float = 0.0, **given: float) -> float:
     return law["noise"] + law["noise_growth"] * off**2 + law["noise_angle"] / depth**0.5 * (angle / (np.pi / 2 - angle)) ** 2
 
 
-def test_an_ideal_sensor_measures_the_rendered_depth(device):
-    measured = measure(wall(1.3, 0.6), device, **PERFECT)
+@pytest.mark.parametrize("settings", [PERFECT, sensor_settings("ideal")], ids=["perfect", "ideal"])
+def test_an_ideal_sensor_measures_the_rendered_depth(device, settings):
+    measured = measure(wall(1.3, 0.6), device, **settings)
     np.testing.assert_allclose(measured.counts.astype(int), measured.clean.astype(int), atol=1)
     np.testing.assert_allclose(measured.depth, measured.exact, atol=0.6 * COUNT)
 
@@ -111,27 +106,6 @@ def test_axial_noise_grows_with_the_square_of_depth(device, depth):
     assert abs(np.corrcoef(*pairs)[0, 1]) < 0.05
 
 
-@pytest.mark.parametrize("depth", [0.6, 1.0, 2.0])
-@pytest.mark.parametrize("name", SENSORS)
-def test_noise_of_presets_is_that_of_disparity(device, name, depth):
-    """σz = z² σd / (f b), by the preset's own focal length; quantization alone is below 5 % of it."""
-    settings, lens = sensor_settings(name), sensor_camera(name)
-    focal = FOCAL if lens is None else lens.fx
-    toy = replace(wall(depth), cameras=(camera(WIDTH, HEIGHT, focal, (0.0, 0.0, TOP)),))
-    settings |= {
-        "noise_width": 1,
-        "distances": (0.1, 10.0),
-        "max_disparity": 0.0,
-        "disparity_step": min(settings["disparity_step"], 1 / 32),
-    }
-    settings = {"baseline": DepthSensor().baseline} | settings
-    measured = measure(toy, device, count=depth / 60000, **settings)
-    expected = depth**2 * settings["disparity_noise"] / (focal * settings["baseline"])
-    middle = measured.depth[0, 20:76, 20:140]
-    np.testing.assert_allclose(middle.std(), expected, rtol=0.05, atol=2e-5)
-    np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * expected / middle.size**0.5 + 2e-3 * depth**2)
-
-
 @pytest.mark.parametrize("depth", [0.6, 1.0, 1.95])
 @pytest.mark.parametrize("name", [name for name in SENSORS if name != "ideal"])
 def test_presets_as_they_are_have_the_noise_of_their_steps_too(device, name, depth):
@@ -146,6 +120,7 @@ def test_presets_as_they_are_have_the_noise_of_their_steps_too(device, name, dep
         return
     expected = depth**2 * np.hypot(settings["disparity_noise"], settings["disparity_step"] / 12**0.5) / scale
     np.testing.assert_allclose(middle.std(), expected, rtol=0.05)
+    np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * expected / middle.size**0.5 + 2e-3 * depth**2)
 
 
 def test_no_disparity_beyond_the_search_is_measured(device):
@@ -255,8 +230,7 @@ def test_a_narrow_body_casts_its_shadow_beside_it(device):
 
 
 def test_background_and_depth_out_of_range_are_invalid(device):
-    toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[(0, (0.0, 0.0, TOP - 1.0, *UPRIGHT))]], (VIEW,))
-    measured = measure(toy, device, **PERFECT)
+    measured = measure(one(box(0.1, 0.1, 0.1), (0.0, 0.0, TOP - 1.0, *UPRIGHT), VIEW), device, **PERFECT)
     np.testing.assert_array_equal(measured.counts > 0, measured.clean > 0)
     assert (measured.counts == 0).any()
     for distances in ((1.2, 5.0), (0.1, 0.5)):

@@ -32,7 +32,8 @@ from tests.builders import refusal
 from tests.harness.aimed_views import aimed_views
 from tests.harness.devices import default_device
 from tests.harness.memory_tables import device_arrays
-from tests.worlds.toy_scene import ANNOTATIONS, UPRIGHT, ToyScene, assert_same, box, camera, entry, render
+from tests.worlds.shapes import UPRIGHT, box, camera, entry
+from tests.worlds.toy_scene import ANNOTATIONS, ToyScene, assert_same, render
 
 WIDTH, HEIGHT = 72, 40
 LENS = camera(WIDTH, HEIGHT, 60.0, (0.0, 0.0, 2.0))

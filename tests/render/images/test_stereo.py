@@ -21,7 +21,8 @@ from synpick_warp.stages.render.stereo import StereoRenderer, count_disparities
 from synpick_warp.stages.render.view_setup import first_views
 from tests.twins.layers import render_layers
 from tests.twins.stereo import matching_costs, path_costs
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, sheet, surface
+from tests.worlds.shapes import UPRIGHT, box, camera, entry, sheet, surface
+from tests.worlds.toy_scene import ToyScene
 
 WIDTH, HEIGHT, FOCAL, TOP, BASELINE = 240, 120, 400.0, 2.0, 0.06
 VIEW = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, TOP))

@@ -1,4 +1,4 @@
-"""Variance-guided denoiser on synthetic input: shrinkage, edges, noise."""
+"""Variance-guided denoiser on synthetic input, orders of coarse pixels, and lists of those that trace paths."""
 
 from __future__ import annotations
 
@@ -9,8 +9,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.render.lighting import coarse_grid, denoise
+from synpick_warp.kernels.render.lighting.paths.coarse import SEQUENCE_PERIOD
+from synpick_warp.kernels.render.lighting.paths.lists import AGED, FRESH, REGION_PIXELS, PathLists, append_pixel, listed_pixel
+from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.kernels.render.visibility.records import read_record, write_record
+from synpick_warp.stages.arrays import allocate_struct
+from synpick_warp.stages.render.denoised import PATH_LISTS, build_coarse_grid
+from synpick_warp.stages.render.sampling_rates import interleaved_threads
+from synpick_warp.stages.render.scene import build_grid
 from tests.harness.denoise_probe import FlatDenoiser
+from tests.harness.devices import default_device
 from tests.harness.probe import probe
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
@@ -124,3 +132,82 @@ def test_other_bodies_and_other_depths_do_not_mix():
     # The same body in another plane counts little: SAME_BODY_WEIGHT.
     flat.show(np.ones((32, 32)), np.where(left, 1.0, 1.5))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), atol=0.05)
+
+
+# ---- coarse pixels ----
+
+
+@wp.func
+def count_visit(coarse: coarse_grid.CoarseGrid, visits: wp.array3d[int], index: int):
+    """Count a thread's coarse pixel in interleaved order."""
+    view, row, column = coarse_grid.interleaved_pixel(coarse, index)
+    if in_image(coarse.grid, row, column):
+        wp.atomic_add(visits, view, row, column, 1)
+
+
+count_visits, morton = probe(count_visit), probe(coarse_grid.morton_index)
+
+
+@given(width=st.integers(1, 150), height=st.integers(1, 100), size=st.integers(1, 5), views=st.integers(1, 3))
+def test_interleaved_order_visits_each_coarse_pixel_once(width, height, size, views):
+    coarse = build_coarse_grid(build_grid(width, height), size, 1)
+    assert (coarse.grid.width, coarse.grid.height) == (-(-width // size), -(-height // size))
+    visits = wp.zeros((views, coarse.grid.height, coarse.grid.width), dtype=wp.int32, device=default_device())
+    count_visits(coarse, visits, np.arange(views * interleaved_threads(coarse.grid.width, coarse.grid.height)))
+    assert (visits.numpy() == 1).all()
+
+
+@pytest.mark.parametrize("period", [2, 4, int(SEQUENCE_PERIOD)])
+def test_aligned_squares_hold_aligned_runs_of_morton_indices(device, period):
+    index = morton(period, *np.indices((3 * period, 2 * period)), device=device)
+    size = 1
+    while size <= period:
+        for row in range(0, len(index), size):
+            for column in range(0, 2 * period, size):
+                run = np.sort(index[row : row + size, column : column + size].reshape(-1))
+                assert run[0] % size**2 == 0
+                np.testing.assert_array_equal(run, run[0] + np.arange(size**2))
+        size *= 2
+    # Any square as wide as the period holds each index once, aligned or not.
+    for row, column in ((1, 0), (period // 2, 1), (period, period - 1)):
+        np.testing.assert_array_equal(np.sort(index[row : row + period, column : column + period].reshape(-1)), np.arange(period**2))
+
+
+# ---- lists of paths ----
+
+
+VIEWS, REGIONS, MAX_KNOWN, MAX_BITS = 2, 3, 255, 3
+REGION = int(REGION_PIXELS)
+THREADS = REGIONS * REGION
+
+
+@wp.func
+def append_if_known(lists: PathLists, view: int, index: int, known: int, bits: int):
+    """Append a coarse pixel, unless `known` is negative."""
+    if known >= 0:
+        append_pixel(lists, view, index, known, bits)
+
+
+append, read = probe(append_if_known), probe(listed_pixel)
+
+
+@pytest.mark.parametrize("listed", [0.0, 0.3, 1.0])
+def test_every_listed_pixel_is_read_once_with_its_history(device, listed):
+    rng = np.random.default_rng(3)
+    known = rng.choice([0, 1, 16, MAX_KNOWN], VIEWS * THREADS).astype(np.int32)
+    bits = np.where(known > 0, rng.integers(0, MAX_BITS + 1, known.size), 0).astype(np.int32)
+    known[rng.random(known.size) >= listed] = -1
+    known[:REGION], bits[:REGION] = MAX_KNOWN, MAX_BITS  # A full region, to the last bit of its entries.
+    lists = allocate_struct(PATH_LISTS, {"view": VIEWS, "region": REGIONS, "rank": REGION, "path_kind": 2}, device)
+    lists.count.zero_()
+    threads = np.arange(known.size)
+    append(lists, threads // THREADS, threads, known, bits, device=device)
+    found = np.stack(read(lists, threads, device=device), axis=1)
+    counts = known.reshape(VIEWS, REGIONS, REGION)
+    np.testing.assert_array_equal(lists.count.numpy()[..., int(FRESH)], (counts == 0).sum(axis=2))
+    np.testing.assert_array_equal(lists.count.numpy()[..., int(AGED)], (counts > 0).sum(axis=2))
+    taken = found[found[:, 0] >= 0]
+    np.testing.assert_array_equal(taken[:, 0] // REGION, np.flatnonzero(found[:, 0] >= 0) // REGION)
+    expected = np.flatnonzero(known >= 0)
+    ordered = taken[np.argsort(taken[:, 0])]
+    np.testing.assert_array_equal(ordered, np.stack((expected, known[expected], bits[expected]), axis=1))

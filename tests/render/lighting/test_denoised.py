@@ -1,4 +1,4 @@
-"""Denoised renderer: known amounts of light, and its error against the path-traced reference."""
+"""Modes of the renderer: known amounts of light, the same annotations, the path-traced reference, and the error of the denoised light."""
 
 from __future__ import annotations
 
@@ -10,48 +10,228 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.render.lighting.paths.tracing import BRDF_SAMPLING, LIGHT_SAMPLING
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import allocate_view_buffers
-from synpick_warp.stages.render.light_tables import precompute_environment
+from synpick_warp.stages.render import reference
+from synpick_warp.stages.render.denoised import history_sizes, scratch_sizes
+from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from tests.harness.brdf_probe import toward
-from tests.worlds import toy_scene
+from tests.harness.brdf_probe import evaluate, toward
+from tests.worlds.shapes import FLAT, HALF, UPRIGHT, WHITE, ball, box, camera, entry, even_light, lamp, sheet, sun, surface
 from tests.worlds.toy_scene import (
-    FLAT,
-    HALF,
-    UPRIGHT,
-    WHITE,
+    ANNOTATIONS,
+    RenderedViews,
     ToyScene,
+    assert_same,
     build_scene,
-    camera,
     clutter,
-    entry,
-    even_light,
-    lamp,
     psnr,
-    sheet,
+    render_objects,
     snapshot,
-    sun,
-    surface,
     with_render,
 )
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
+MODES = (FAST, REFERENCE, UNOCCLUDED)
+PAIR = [(ball(0.1, 3), surface(WHITE, 1.0, 0.0)), (box(0.1, 0.1, 0.1), surface(), (0.1, 0.0, 0.05, *UPRIGHT))]
+"""A mirroring ball and a white box."""
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+@pytest.mark.parametrize("roughness", [0.0, 0.25, 0.6, 1.0])
+def test_white_furnace(device, mode, metallic, roughness):
+    view = camera(128, 96, 500.0, (0.0, 0.0, 2.0))
+    white = (ball(0.1, 4), surface(WHITE, metallic, roughness))
+    picture = render_objects(device, white, lights=(even_light(2.0),), view=view, config=with_render(mode, samples=8))
+    np.testing.assert_allclose(picture.radiance[0, 0, 0], 2.0, rtol=1e-5)
+    np.testing.assert_allclose(picture.radiance[0][picture.instance[0] == 1].mean(axis=0), 2.0, rtol=0.01)
+
+
+@pytest.mark.parametrize("cosine", [1.0, 0.6, 0.25])
+@pytest.mark.parametrize(("mode", "degrees", "size"), [(REFERENCE, 6.0, 16), *((FAST, degrees, 64) for degrees in (2.0, 3.5, 6.0, 12.0))])
+def test_plane_under_a_lamp_has_the_analytic_irradiance(device, cosine, mode, degrees, size):
+    """A disc of angular radius a and radiance L that is entirely above the horizon: E = π L sin² a cos θ.
+
+    In mode fast, wide discs are several lamps, and the light of most of 12° stays in the map.
+    """
+    radius = np.radians(degrees)
+    light, view = lamp(cosine, radius, 3.0 / (np.pi * np.sin(radius) ** 2)), camera(size, size, 2000.0, (0.0, 0.0, 2.0))
+    config = with_render(mode, coarse_paths=32, samples=64)
+    picture = render_objects(device, (sheet(1.0, 1.0), surface(HALF)), lights=(light,), view=view, config=config)
+    value, _ = evaluate(measure_albedo(device), ((0.5,) * 3, 0.0, 1.0), toward(1.0), toward(cosine))
+    np.testing.assert_allclose(picture.radiance[0].mean(axis=(0, 1)), value[0] * 3.0, rtol=0.01 if mode == REFERENCE else 0.02)
+    # The BRDF is nearly Lambertian here: the specular lobe adds about what it takes from the diffuse one.
+    np.testing.assert_allclose(value[0] / cosine, 0.5 / np.pi, rtol=0.1)
+
+
+def test_annotations_are_those_of_all_modes(device):
+    view = camera(160, 120, 300.0, (0.0, 0.0, 1.0))
+    fast, reference, unoccluded = (render_objects(device, *clutter(), view=view, config=with_render(mode, samples=1)) for mode in MODES)
+    for other in (reference, unoccluded):
+        assert_same(fast, other, *ANNOTATIONS)
+        assert (fast.color != other.color).any()
+    assert psnr(unoccluded.radiance, fast.radiance) > 20.0
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_rendering_is_reproducible_and_finite(device, mode):
+    """The noise of paths depends on the seed."""
+    configs = [replace(with_render(mode, samples=4), bake=replace(Config().bake, seed=seed)) for seed in (1, 1, 2)]
+    first, second, other = (
+        render_objects(device, *PAIR, lights=(sun((0.3, 0.2, 0.8)),), view=VIEW, table=True, config=config, fixtures_visible=(1, 1, 1))
+        for config in configs
+    )
+    assert_same(first, second, "color", "radiance")
+    assert np.isfinite(first.radiance).all()
+    assert (first.radiance >= 0.0).all()
+    assert (first.radiance != other.radiance).any() == (mode != UNOCCLUDED)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("radiance", [0.0, 1e-6])
+def test_black_maps_render_finite_values_and_in_the_reference_black(device, mode, radiance):
+    picture = render_objects(device, *PAIR, lights=(even_light(radiance),), view=VIEW, table=True, config=with_render(mode, samples=4))
+    assert np.isfinite(picture.radiance).all()
+    assert mode != REFERENCE or picture.radiance.any() == (radiance > 0.0)
+
+
+# ---- unoccluded ----
+
+
+def test_walls_darken_a_floor_but_in_mode_unoccluded(device):
+    """The floor between two high walls has the radiance of an open one; in mode fast it is darker."""
+    floor = (sheet(0.6, 0.5), surface(HALF))
+    walls = [(box(0.02, 0.4, 0.3), surface((0.1,) * 3), (x, 0.0, 0.15, *UPRIGHT)) for x in (-0.1, 0.1)]
+    view = camera(64, 48, 600.0, (0.0, 0.0, 2.0))
+    pictures = [
+        render_objects(device, floor, *occluders, view=view, config=with_render(mode, coarse_paths=16))
+        for mode, occluders in ((UNOCCLUDED, walls), (UNOCCLUDED, ()), (FAST, walls))
+    ]
+    unoccluded, alone, fast = (picture.radiance[0][picture.instance[0] == 1].mean() for picture in pictures)
+    np.testing.assert_allclose(unoccluded, alone, rtol=1e-5)
+    assert fast < 0.8 * unoccluded
+
+
+def test_sunlight_and_shadows_are_those_of_the_reference(device):
+    """Under a lamp without sky, and one bounce: a box on a plane and its shadow."""
+    light = lamp(0.7, np.radians(1.5), 300.0)
+    objects = [(sheet(0.6, 0.5), surface(HALF)), (box(0.1, 0.1, 0.1), surface(HALF), (0.0, 0.0, 0.05, *UPRIGHT))]
+    pictures = [
+        render_objects(device, *objects, lights=(light,), view=VIEW, config=config)
+        for config in (with_render(UNOCCLUDED), with_render(REFERENCE, samples=64, bounces=1))
+    ]
+    unoccluded, reference = (picture.radiance[0] for picture in pictures)
+    on_surface = pictures[0].instance[0] > 0
+    lit, visible = np.median(reference[on_surface]), cv2.erode(on_surface.astype(np.uint8), np.ones((3, 3))) > 0
+    shadow = cv2.erode((visible & (reference.mean(axis=2) < 0.2 * lit)).astype(np.uint8), np.ones((3, 3))) > 0
+    assert shadow.sum() > 20
+    assert unoccluded[shadow].max() < 0.3 * lit  # Unoccluded light is at least 5 % of the mean of the map.
+    assert psnr(unoccluded, reference) > 43.0
+
+
+def test_no_memory_for_paths_and_histories():
+    unoccluded, fast = (with_render(mode).render for mode in (UNOCCLUDED, FAST))
+    of_unoccluded, of_fast = (scratch_sizes(render, 1920, 1080, 12) for render in (unoccluded, fast))
+    shadow_grid = {"shadow_row", "shadow_column", "edge_chunk", "chunk_pixel"}  # As wide as coarse pixels are in images of their own.
+    differing = {key for key, size in of_unoccluded.items() if size != of_fast[key]}
+    assert differing - shadow_grid == {"cell_row", "cell_column", "region"}
+    assert all(of_unoccluded[key] <= of_fast[key] for key in differing - {"chunk_pixel"})  # Fewer chunks, of more pixels.
+    assert of_unoccluded["cell_row"] == of_unoccluded["cell_column"] == of_unoccluded["region"] == 0
+    assert history_sizes(unoccluded, 1920, 1080, 12)["world_camera"] == 0
+    assert history_sizes(fast, 1920, 1080, 12)["world_camera"] == 12
+
+
+# ---- path-traced reference ----
+
+
+def trace_objects(device, *placed, samples=32, bounces=4, view=VIEW, **more):
+    return render_objects(device, *placed, view=view, config=with_render(REFERENCE, samples=samples, bounces=bounces), **more)
+
+
+def test_white_furnace_with_interreflection(device):
+    # Russian roulette is unbiased, and 32 bounces lose no light; one bounce does.
+    objects = [
+        (sheet(0.6, 0.4), surface()),
+        (box(0.1, 0.1, 0.1), surface(), (0.08, 0.0, 0.055, *UPRIGHT)),
+        (box(0.1, 0.1, 0.1), surface(WHITE, 1.0, 0.5), (-0.08, 0.0, 0.055, *UPRIGHT)),
+    ]
+    many, one = (trace_objects(device, *objects, bounces=bounces).radiance for bounces in (32, 1))
+    assert many.mean() == pytest.approx(1.0, abs=0.01)
+    assert one.mean() < 0.98
+
+
+def test_russian_roulette_is_unbiased(device, monkeypatch):
+    grey = surface(HALF)
+    walls = [(box(0.02, 0.3, 0.2), grey, (x, 0.0, 0.1, *UPRIGHT)) for x in (0.03, -0.03)]
+    view = camera(8, 24, 200.0, (0.0, 0.0, 2.0))
+    means = []
+    for roulette in (0, 2, 100):
+        monkeypatch.setattr(reference, "ROULETTE", roulette)
+        radiance = trace_objects(device, (sheet(0.3, 0.3), grey), *walls, samples=1024, bounces=16, view=view).radiance
+        # Between the walls, where light arrives after several bounces.
+        means.append(radiance[0, 4:20, 3:5].mean())
+    np.testing.assert_allclose(means, means[-1], rtol=0.02)
+    assert means[-1] < 0.3
+
+
+def test_sampling_strategies_have_the_same_mean(device, monkeypatch):
+    objects = [
+        (sheet(0.6, 0.4), surface((0.7, 0.6, 0.5), 0.0, 0.5)),
+        (ball(0.06, 3), surface((0.9, 0.8, 0.7), 1.0, 0.35), (0.05, 0.0, 0.06, *UPRIGHT)),
+        (box(0.1, 0.1, 0.1), surface((0.3, 0.5, 0.7)), (-0.1, 0.0, 0.05, *UPRIGHT)),
+    ]
+    radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, rows=64).radiance
+    lights = (EnvironmentMap("room", radiance),)
+    combined = trace_objects(device, *objects, lights=lights, samples=64, light_yaw=0.7).radiance[0]
+    noise = {}
+    for strategy in (LIGHT_SAMPLING, BRDF_SAMPLING):
+        monkeypatch.setattr(reference, "COMBINED", strategy)
+        alone = trace_objects(device, *objects, lights=lights, samples=128, light_yaw=0.7).radiance[0]
+        np.testing.assert_allclose(alone.mean(axis=(0, 1)), combined.mean(axis=(0, 1)), rtol=0.01)
+        noise[strategy] = np.abs(alone - combined).mean()
+    assert noise[LIGHT_SAMPLING] < noise[BRDF_SAMPLING]
+
+
+def test_a_mirror_reflects_a_box_above_it(device):
+    # A black box 0.5 m above the mirror and 0.2 m to the side: its image appears at 0.2 · 2 / 2.5 m, 16 px from the middle.
+    objects = [(sheet(1.0, 1.0), surface(WHITE, 1.0, 0.0)), (box(0.06, 0.06, 0.06), surface((0.0, 0.0, 0.0)), (0.2, 0.0, 0.5, *UPRIGHT))]
+    row = trace_objects(device, *objects).radiance[0, 24, :, 0]
+    assert row[48] < 0.15
+    np.testing.assert_allclose(row[16], 1.0, rtol=0.03)
+
+
+def test_no_light_leaks_through_a_surface(device):
+    # The lamp stands below the sheet's plane, but above that of its tilted interpolated normals.
+    tilted = sheet(0.6, 0.4)
+    tilted.normals[:] = toward(0.7)
+    lights = (lamp(-0.3, np.radians(8.0), 100.0),)
+    assert trace_objects(device, (tilted, surface()), lights=lights).radiance[0, 10:38, 10:54].max() == 0.0
+    assert trace_objects(device, (sheet(0.6, 0.4), surface()), lights=(lamp(0.3, np.radians(8.0), 100.0),)).radiance[0, 24, 32].min() > 0.1
+
+
+# ---- denoised light ----
+
+
 EVEN = even_light()
-render_objects = functools.partial(toy_scene.render_objects, view=VIEW)
+denoise_objects = functools.partial(render_objects, view=VIEW)
+
+
+def with_reference(device, *objects, settings: dict[str, int], **more) -> list[RenderedViews]:
+    """Objects by the denoised renderer and by the reference."""
+    return [denoise_objects(device, *objects, config=with_render(mode, samples=256, **settings), **more) for mode in (FAST, REFERENCE)]
 
 
 @pytest.mark.parametrize("table", [False, True])
 def test_grey_plane_under_a_uniform_map_equals_the_reference(device, table):
     plane = (sheet(0.6, 0.5), surface(HALF, 0.0, 0.7))
-    denoised, reference = (
-        render_objects(device, plane, table=table, config=with_render(mode, coarse_paths=16)).radiance.mean(axis=(0, 1, 2))
-        for mode in (FAST, REFERENCE)
-    )
+    pictures = with_reference(device, plane, table=table, settings={"coarse_paths": 16})
+    denoised, reference = (picture.radiance.mean(axis=(0, 1, 2)) for picture in pictures)
     np.testing.assert_allclose(denoised, reference, rtol=0.01)
     np.testing.assert_allclose(denoised, 0.5, rtol=0.1)
 
@@ -73,10 +253,10 @@ def test_tables_split_a_map_into_lamps_and_the_rest(degrees, lamps):
 def test_cluttered_scene_approaches_the_reference(device):
     view = camera(96, 72, 420.0, (0.0, 0.0, 1.5))
     lights = (EnvironmentMap("room", 0.4 * even_light(1.0, 64).radiance + lamp(0.8, np.radians(14.0), 8.0, rows=64).radiance),)
-    reference = render_objects(device, *clutter(), lights=lights, view=view, config=with_render(REFERENCE, samples=256)).radiance[0]
+    reference = denoise_objects(device, *clutter(), lights=lights, view=view, config=with_render(REFERENCE, samples=256)).radiance[0]
     quality = {}
     for paths in (1, 4, 16):
-        denoised = render_objects(device, *clutter(), lights=lights, view=view, config=with_render(coarse_paths=paths)).radiance[0]
+        denoised = denoise_objects(device, *clutter(), lights=lights, view=view, config=with_render(coarse_paths=paths)).radiance[0]
         quality[paths] = psnr(denoised, reference)
         if paths > 1:
             np.testing.assert_allclose(denoised.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.015)
@@ -108,7 +288,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
 @pytest.mark.parametrize("size", [(64, 48), (61, 35), (3, 5), (1, 1)])
 def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
     view = camera(*size, 4.0 * size[0], (0.0, 0.0, 2.0))
-    picture = render_objects(
+    picture = denoise_objects(
         device, *clutter(), lights=(sun((0.5, 0.2, 0.8)),), view=view, table=True, config=with_render(coarse_pixel=cell)
     )
     assert picture.radiance.shape[1:3] == size[::-1]
@@ -120,7 +300,7 @@ def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
 def test_wider_coarse_pixels_have_the_same_light(device, cell):
     view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
     fine, wide = (
-        render_objects(device, *clutter(), view=view, config=with_render(coarse_pixel=size, coarse_paths=8)).radiance[0]
+        denoise_objects(device, *clutter(), view=view, config=with_render(coarse_pixel=size, coarse_paths=8)).radiance[0]
         for size in (1, cell)
     )
     np.testing.assert_allclose(wide.mean(axis=(0, 1)), fine.mean(axis=(0, 1)), rtol=0.015)
@@ -132,7 +312,7 @@ def test_objects_smaller_than_a_coarse_pixel_are_lit(device, light):
     # 3 px in coarse pixels of 16 px, over background: the middle of none of them lies on it.
     small_sheet = (sheet(0.03, 0.03), surface(HALF), (0.055, 0.035, 0.0, *UPRIGHT))
     coarse, fine = (
-        render_objects(device, small_sheet, lights=(light,), config=with_render(coarse_pixel=size, coarse_paths=16)) for size in (16, 1)
+        denoise_objects(device, small_sheet, lights=(light,), config=with_render(coarse_pixel=size, coarse_paths=16)) for size in (16, 1)
     )
     visible = coarse.instance[0] == 1
     assert 4 <= visible.sum() <= 16
@@ -141,12 +321,12 @@ def test_objects_smaller_than_a_coarse_pixel_are_lit(device, light):
 
 def test_only_background_and_only_table(device):
     light = sun((0.3, 0.2, 0.8))
-    nothing, table = (render_objects(device, lights=(light,), table=table).radiance[0] for table in (False, True))
+    nothing, table = (denoise_objects(device, lights=(light,), table=table).radiance[0] for table in (False, True))
     np.testing.assert_allclose(nothing[0, 0], 0.3, rtol=1e-5)
-    assert (render_objects(device, lights=(light,)).instance == 0).all()
+    assert (denoise_objects(device, lights=(light,)).instance == 0).all()
     # The table is an open plane: uniform.
     assert (table.std(axis=(0, 1)) < 0.02 * table.mean(axis=(0, 1))).all()
-    reference = render_objects(device, lights=(light,), table=True, config=with_render(REFERENCE, samples=256)).radiance[0]
+    reference = denoise_objects(device, lights=(light,), table=True, config=with_render(REFERENCE, samples=256)).radiance[0]
     np.testing.assert_allclose(table.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.02)
 
 
@@ -156,18 +336,14 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     view = camera(160, 160, 400.0, (0.0, 0.0, 2.0))
     objects = [(sheet(2.0, 2.0), surface(HALF)), (sheet(0.06, 0.06), surface(HALF), (0.0, 0.0, 0.1, *UPRIGHT))]
     light = sun((1.0, 0.0, 1.0), rows=256, strength=6000.0)
-    tables = precompute_environment(light, None)
-    (only,) = tables.lamps
+    (only,) = precompute_environment(light, None).lamps
     direction = only.direction
-    lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=with_render(coarse_paths=16))
+    lit = denoise_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=with_render(coarse_paths=16))
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
     x, y = (columns + 0.5 - 80.0) / 200.0, -(rows + 0.5 - 80.0) / 200.0
-    offset = (
-        -0.1
-        / direction[2]
-        * np.array([np.cos(yaw) * direction[0] - np.sin(yaw) * direction[1], np.sin(yaw) * direction[0] + np.cos(yaw) * direction[1]])
-    )
+    turned = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]) @ direction[:2]
+    offset = -0.1 / direction[2] * turned
     # Signed distance inside the shadow's square [m]; the filter blurs the edge by 2 px to either side, the sun by less.
     inside = 0.03 - np.maximum(np.abs(x - offset[0]), np.abs(y - offset[1]))
     value = lit.radiance[0, ..., 0]
@@ -188,7 +364,7 @@ def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
     objects = [(sheet(2.0, 2.0), surface(HALF)), (sheet(0.4, 0.4), surface(WHITE), pose)]
     light = sun((1.0, 0.0, 1.0), rows=256, strength=6000.0)
     config = with_render(coarse_pixel=4, coarse_paths=4, antialias=False)
-    picture = render_objects(device, *objects, lights=(light,), view=view, config=config)
+    picture = denoise_objects(device, *objects, lights=(light,), view=view, config=config)
     ground, value = picture.instance[0] == 1, picture.radiance[0, ..., 0]
     strip = np.zeros_like(ground)
     for shift in (1, 2):
@@ -218,10 +394,7 @@ def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):
     ]
     objects = [(sheet(0.5, 0.5), surface(HALF), (0.0, 0.0, 0.0, *UPRIGHT)), *rim]
     view = camera(64, 48, 300.0, (0.0, 0.0, 2.0))
-    denoised, reference = (
-        render_objects(device, *objects, view=view, instances=5, config=with_render(mode, coarse_pixel=5, coarse_paths=16, samples=256))
-        for mode in (FAST, REFERENCE)
-    )
+    denoised, reference = with_reference(device, *objects, view=view, instances=5, settings={"coarse_pixel": 5, "coarse_paths": 16})
     floor = denoised.instance[0] == 1
     bright = [np.quantile(picture.radiance[0][floor].mean(axis=-1), 0.98) for picture in (denoised, reference)]
     assert bright[0] < 1.1 * bright[1]
@@ -236,8 +409,7 @@ def test_indirect_sunlight_equals_the_reference(device, metallic):
         for side, metal in ((-1, metallic), (1, 0.0))
     ]
     low_sun = (sun((-0.9, 0.0, 0.3), sky=0.002),)
-    configs = (with_render(coarse_paths=16, coarse_pixel=1), with_render(REFERENCE, samples=256))
-    denoised, reference = (render_objects(device, *slopes, lights=low_sun, config=config) for config in configs)
+    denoised, reference = with_reference(device, *slopes, lights=low_sun, settings={"coarse_pixel": 1, "coarse_paths": 16})
     for instance in (1, 2):
         inside = cv2.erode((denoised.instance[0] == instance).astype(np.uint8), np.ones((3, 3))) > 0
         means = [picture.radiance[0][inside].mean() for picture in (denoised, reference)]
@@ -251,7 +423,6 @@ def test_specular_highlight_of_a_small_lamp_equals_the_reference(device, metalli
     plate = (sheet(0.3, 0.2), surface((0.8, 0.8, 0.8), metallic, roughness))
     for cosine in (0.9, 0.99):
         light = (lamp(cosine, np.radians(2.0), 500.0, 0.01),)
-        configs = (with_render(coarse_paths=16, coarse_pixel=1), with_render(REFERENCE, samples=256))
-        denoised, reference = (render_objects(device, plate, lights=light, config=config) for config in configs)
+        denoised, reference = with_reference(device, plate, lights=light, settings={"coarse_pixel": 1, "coarse_paths": 16})
         inside = cv2.erode((denoised.instance[0] == 1).astype(np.uint8), np.ones((5, 5))) > 0
         assert denoised.radiance[0][inside].mean() == pytest.approx(reference.radiance[0][inside].mean(), rel=0.02)
