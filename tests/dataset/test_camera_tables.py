@@ -1,24 +1,25 @@
-"""A bake of cameras of three sizes, with matrix, field of view and lens, in every format, read back by other libraries;
-and of a lens as it is and rectified."""
+"""A bake of cameras of three sizes, with matrix, field of view and lens, in every format, read back by other libraries; of a lens as it is
+and rectified; and of cameras that have files of some images only: of every third frame, depth and masks without colour, or the reverse."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import av
-import cv2
 import numpy as np
 import pytest
-import trimesh
 import zarr
 
 import synpick_warp
 from synpick_warp.configs.schema import FORMATS
-from tests.builders import once, run
-from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, make_camera
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.pytorch import Views
+from synpick_warp.errors import DatasetError
+from tests.builders import boxes, failing_after, once, run
+from tests.harness.exporter_contract import digests
+from tests.online.test_stream import taken
+from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, check_same, check_valid, make_camera
 from tools.checks.dataset import check
 
 CAMERAS = (
@@ -34,7 +35,7 @@ CAMERAS = (
         distortion=[-0.12, 0.08, 0.0005, -0.0003, 0.01],
     ),
 )
-NAMES = ("left", "top", "right")
+TABLE_NAMES = ("left", "top", "right")
 SIZES = [(96, 72), (64, 48), (80, 60)]
 TOP = 32.0 / np.tan(np.radians(20.0))
 INTRINSICS = (82.5, 82.38, 49.14, 35.25), (TOP, TOP, 32.0, 24.0), (75.0, 74.5, 41.5, 28.75)
@@ -42,17 +43,18 @@ MATRICES = [np.array(camera_matrix(*numbers)) for numbers in INTRINSICS]
 DISTORTION = [None, None, [-0.12, 0.08, 0.0005, -0.0003, 0.01]]
 
 
-def bake(out, layout: str, formats: tuple[str, ...]) -> None:
+def bake_tables(out, layout: str, formats: tuple[str, ...]) -> None:
     bake_cell(out, cell_config(CAMERAS, **{"bake.formats": list(formats), "bop.layout": layout}))
 
 
 @pytest.fixture(scope="module", params=["classic", "multisensor"])
 def cell(tmp_path_factory, request):
     formats = tuple(name for name in FORMATS if name != "picks") if request.param == "classic" else ("bop", "usd")
-    return once(tmp_path_factory, f"cell-{request.param}", lambda out: bake(out, request.param, formats))[0]
+    return once(tmp_path_factory, f"cell-{request.param}", lambda out: bake_tables(out, request.param, formats))[0]
 
 
-def test_every_view_has_its_cameras_size_and_matrix(cell):
+def test_it_is_valid_and_every_view_has_its_cameras_size_and_matrix(cell):
+    check_valid(cell)
     data = synpick_warp.open(cell)
     assert [tuple(camera.resolution) for camera in data.cameras] == SIZES
     seen = set()
@@ -60,66 +62,17 @@ def test_every_view_has_its_cameras_size_and_matrix(cell):
         width, height = SIZES[view.camera]
         assert (view.rgb.shape, view.depth.shape) == ((height, width, 3), (height, width))
         np.testing.assert_array_equal(view.intrinsics, data.cameras[view.camera].matrix)
+        np.testing.assert_allclose(view.intrinsics, MATRICES[view.camera], rtol=1e-9)
         seen.add(view.camera)
     assert seen == {0, 1, 2}
 
 
-def test_it_is_whole_and_valid(cell):
-    for command in ("verify", "validate"):
-        ran = run(command, cell)
-        assert ran.code == 0, ran
-    assert "0 errors" in ran[1] + ran[2]
-
-
-def sensors(cell: Path) -> Iterator[tuple[int, Path, str]]:
-    """Camera, scene folder, and what follows the names of its files and folders."""
-    split = next(path for path in cell.iterdir() if (path / "000000").is_dir())
-    for index, name in enumerate(NAMES):
-        is_multi = (split / "000000" / f"rgb_{name}").is_dir()
-        yield index, split / ("000000" if is_multi else f"{index:06d}"), f"_{name}" if is_multi else ""
-
-
-def records(scene: Path, name: str, suffix: str) -> dict[str, Any]:
-    return json.loads((scene / f"{name}{suffix}.json").read_text())
-
-
-def test_json_and_opencv_find_exact_views_of_each_sensor(cell):
-    """Masks have the counts and boxes that are stated; models projected by OpenCV lie in the boxes; objects stand in one place for all."""
-    places: dict[tuple[str, int], list[np.ndarray]] = {}
-    checked = 0
-    for index, scene, suffix in sensors(cell):
-        (width, height), cameras = SIZES[index], records(scene, "scene_camera", suffix)
-        truth, infos = records(scene, "scene_gt", suffix), records(scene, "scene_gt_info", suffix)
-        for image, camera in cameras.items():
-            rgb, depth = (cv2.imread(str(scene / f"{kind}{suffix}" / f"{int(image):06d}.png"), -1) for kind in ("rgb", "depth"))
-            assert (rgb.shape, depth.shape, depth.dtype) == ((height, width, 3), (height, width), np.uint16)
-            np.testing.assert_allclose(np.reshape(camera["cam_K"], (3, 3)), MATRICES[index], rtol=1e-9)
-            assert camera.get("cam_dist") == DISTORTION[index]
-            to_camera = np.reshape(camera["cam_R_w2c"], (3, 3))
-            for number, (one, info) in enumerate(zip(truth[image], infos[image], strict=True)):
-                files = [scene / f"{kind}{suffix}" / f"{int(image):06d}_{number:06d}.png" for kind in ("mask", "mask_visib")]
-                whole, seen = (cv2.imread(str(file), -1) > 0 for file in files)
-                assert (whole.sum(), seen.sum()) == (info["px_count_all"], info["px_count_visib"])
-                assert (depth[whole] > 0).sum() == info["px_count_valid"]
-                if seen.any():
-                    x, y, w, h = cv2.boundingRect(seen.astype(np.uint8))
-                    assert [x, y, w - 1, h - 1] == info["bbox_visib"]  # BOP's boxes end at their last pixel.
-                rotation, place = np.reshape(one["cam_R_m2c"], (3, 3)), np.array(one["cam_t_m2c"])
-                world = to_camera.T @ (place - np.array(camera["cam_t_w2c"]))
-                places.setdefault((image, one["instance_id"]), []).append(world)
-                corners = trimesh.load(cell / "models" / f"obj_{one['obj_id']:06d}.ply").vertices
-                shown, _ = cv2.projectPoints(
-                    corners, cv2.Rodrigues(rotation)[0], place, MATRICES[index], np.array(DISTORTION[index] or [0.0] * 4)
-                )
-                low, high = shown[:, 0].min(axis=0), shown[:, 0].max(axis=0)
-                if (low > 1).all() and (high < (width - 1, height - 1)).all() and info["px_count_all"]:
-                    # Pixels belong to the mask whose centres are covered; the tips of corners cover none.
-                    first, last = np.array(info["bbox_obj"][:2]) + 0.5, np.array(info["bbox_obj"][:2]) + info["bbox_obj"][2:] + 0.5
-                    assert np.abs((first - low, last - high)).max() <= 1.5
-                    checked += 1
-    assert checked > 20
-    assert {len(found) for found in places.values()} == {len(NAMES)}
-    assert max(np.ptp(found, axis=0).max() for found in places.values()) < 1e-3  # [mm]
+@pytest.mark.parametrize("cell", ["classic"], indirect=True)
+def test_pictures_are_those_of_each_camera(cell):
+    """Masks, depth and boxes by rays in float64, from the models and the exported cameras; objects stand in one place for all."""
+    found = vars(check(cell, 12))
+    assert not [line for line in found.values() if not line.holds]
+    assert found["mask"].total > 1000
 
 
 @pytest.mark.parametrize("cell", ["classic"], indirect=True)
@@ -129,7 +82,7 @@ def test_zarr_and_lerobot_have_cameras_of_their_sizes(cell):
     np.testing.assert_allclose(cameras["matrix"][:], MATRICES, rtol=1e-12)
     assert cameras.attrs["distortion"] == [values and {"cam_dist_model": "pinhole", "cam_dist": values} for values in DISTORTION]
     features = json.loads(next(cell.rglob("meta/info.json")).read_text())["features"]
-    for name, (width, height) in zip(NAMES, SIZES, strict=True):
+    for name, (width, height) in zip(TABLE_NAMES, SIZES, strict=True):
         assert features[f"observation.images.{name}"]["shape"] == [height, width, 3]
         (video,) = cell.rglob(f"observation.images.{name}/**/*.mp4")
         with av.open(str(video)) as container:
@@ -151,3 +104,146 @@ def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rec
         lines = (tmp_path / "set" / card).read_text().splitlines()
         (first,) = (lines[index + 2] for index, line in enumerate(lines) if line.startswith("# "))
         assert first.startswith("**Pictures are rectified**" if rectified else "**Pictures are distorted** by the lens of bent:")
+
+
+# ---- files of some images only ----
+
+NAMES, EVERY = ("slow", "fast"), (3, 1)
+SPARSE = make_camera("slow", **SIDE, every=3, fov=40.0), make_camera("fast", fov=40.0)
+CHOSEN = (
+    make_camera("slow", **SIDE, every=3, modalities=["masks", "depth"], fov=40.0),
+    make_camera("fast", modalities=["color", "normals"], fov=40.0),
+)
+"""Depth and masks of one camera, colour and normals of the other."""
+KINDS = ({"depth", "mask", "mask_visib"}, {"rgb", "normals"})
+EPISODES = 2
+GIVEN = {"bake.episodes": EPISODES, "bake.worlds": 2}
+MANY = {"bake.formats": ["bop", "shards", "coco", "yolo", "usd", "zarr"]}
+LAYERS = {"bake.formats": ["bop", "shards", "zarr"], "render.layers": ["normals", "nocs"]}
+SENSORS = {"bop.layout": "multisensor", "bake.formats": ["bop", "zarr"]}
+SETS = {
+    "sparse": (SPARSE, MANY),
+    "sparse sensors": (SPARSE, MANY | SENSORS),
+    "modalities": (CHOSEN, LAYERS),
+    "modalities of sensors": (CHOSEN, LAYERS | SENSORS),
+}
+
+
+def bake(name: str, out: Path, shard: tuple[int, int] = (0, 1), **given: object) -> None:
+    cameras, settings = SETS[name]
+    bake_cell(out, cell_config(cameras, **GIVEN | settings | given), shard)
+
+
+@pytest.fixture
+def baked(request, tmp_path_factory) -> Path:
+    """A set by its name, made once."""
+    name = request.param
+    return once(tmp_path_factory, f"chosen-{name.replace(' ', '-')}", lambda out: bake(name, out))[0]
+
+
+def of(*names: str):
+    """Run a test on sets of these names."""
+    return pytest.mark.parametrize("baked", names, indirect=True)
+
+
+@of("sparse", "sparse sensors")
+def test_every_format_has_the_frames_of_each_camera(baked):
+    for episode, row in enumerate(map(json.loads, (baked / "episodes.jsonl").read_text().splitlines())):
+        assert row["frames"] > 4
+        for camera, every in enumerate(EVERY):
+            scene, frames = EPISODES * episode + camera, list(range(0, row["frames"], every))
+            if not (baked / "coco").exists():
+                sensor = json.loads((baked / f"train/{episode:06d}/scene_gt_{NAMES[camera]}.json").read_text())
+                assert sorted(map(int, sensor)) == frames
+                continue
+            assert sorted(map(int, json.loads((baked / f"train/{scene:06d}/scene_camera.json").read_text()))) == frames
+            for folder in (f"train/{scene:06d}/rgb", f"train/{scene:06d}/depth", f"coco/images/{scene:06d}"):
+                assert sorted(int(path.stem) for path in (baked / folder).iterdir()) == frames
+            assert len(list((baked / f"yolo/images/train/{scene:06d}").iterdir())) == len(frames)
+
+
+@of("modalities", "modalities of sensors")
+def test_each_camera_has_its_own_files(baked):
+    scenes = sorted(path for path in (baked / "train").iterdir() if path.is_dir())
+    folders = [{path.name for path in scene.iterdir() if path.is_dir()} for scene in scenes]
+    if len(folders) == 2 * EPISODES:
+        assert folders == [*KINDS] * EPISODES
+    else:
+        assert folders == [{f"{kind}_{name}" for name, kinds in zip(NAMES, KINDS, strict=True) for kind in kinds}] * EPISODES
+        assert "'slow': ['depth'], 'fast': ['rgb']" in (baked / "bop_dataset_params.py").read_text()
+    data = synpick_warp.open(baked)
+    deep, flat = data[0].view(3, 0), data[0].view(3, 1)
+    assert (deep.depth > 0).any()
+    assert deep.masks.shape[1:] == (72, 96)
+    assert flat.rgb.shape == (72, 96, 3)
+    assert np.abs(flat.layer("normals")).max() > 0.5
+    for view, name in ((deep, "rgb"), (flat, "depth"), (flat, "masks")):
+        with pytest.raises(DatasetError, match=r"there is no|has no"):
+            getattr(view, name)
+    assert deep.object_to_camera.shape == flat.object_to_camera.shape
+
+
+@pytest.mark.parametrize("command", ["verify", "validate", "stats", "report", "preview"])
+@of(*SETS)
+def test_commands_take_it(baked, command, tmp_path):
+    extra = {"report": ("--out", tmp_path / "page.html"), "preview": ("--out", tmp_path / "sheet.png")}
+    ran = run(command, baked, *extra.get(command, ()))
+    assert ran.code == 0, ran
+    assert command != "validate" or "0 errors" in ran.out, ran
+
+
+@of("sparse")
+def test_it_is_read_by_episode_and_frame(baked):
+    data = synpick_warp.open(baked)
+    episode = data[1]
+    views = [(view.camera, view.frame) for view in episode.views()]
+    assert views == [(camera, frame) for frame in range(len(episode)) for camera in (0, 1) if frame % EVERY[camera] == 0]
+    with pytest.raises(IndexError, match="no picture of camera 0 in frame 4; it has one every 3 frames"):
+        episode.view(4, 0)
+    track = episode.tracks[0]
+    assert np.isfinite(track.visibility[1]).all()
+    assert len(Views(baked, cameras=[0], stride=3)) == sum(len(data[each].frames(0)) for each in data)
+    with pytest.raises(DatasetError, match="camera 0 has a picture every 3 frames; give a stride of 3, or cameras without it"):
+        Views(baked)
+
+
+@pytest.mark.parametrize(
+    ("baked", "name", "to"), [("sparse", "sparse", "coco,shards"), ("modalities", "modalities", "shards")], indirect=["baked"]
+)
+def test_it_is_converted_to_the_same_files(baked, name, to, tmp_path):
+    bake(name, tmp_path / "set", **{"bake.formats": ["bop"]})
+    ran = run("convert", tmp_path / "set", "--to", to, "--out", tmp_path / "more")
+    assert ran.code == 0, ran
+    for folder in ("train_web", *(["coco"] if "coco" in to else [])):
+        assert digests(baked / folder) == digests(tmp_path / "more" / folder)
+
+
+@of("modalities")
+def test_interrupted_with_fewer_worlds_or_in_shares_it_has_the_same_bytes(baked, tmp_path):
+    with failing_after(1):
+        bake("modalities", tmp_path / "set", **{"bake.worlds": 1})
+    assert len(list((tmp_path / "set/manifest").glob("0*.json"))) == 1
+    bake("modalities", tmp_path / "set")
+    for part in range(2):
+        bake("modalities", tmp_path / str(part), (part, 2))
+    assert merge([tmp_path / "0", tmp_path / "1"], tmp_path / "merged").missing == []
+    for made in ("set", "merged"):
+        check_same(baked, tmp_path / made)
+
+
+@pytest.mark.parametrize(("baked", "name"), [("sparse", "sparse"), ("modalities", "modalities")], indirect=["baked"])
+def test_a_stream_has_the_images_of_each_camera(baked, name):
+    """What a camera lacks is not rendered; depth and masks, from which all follows, are there for all."""
+    cameras, settings = SETS[name]
+    with boxes():
+        views = taken(synpick_warp.stream(cell_config(cameras, **GIVEN | settings)))
+    data = synpick_warp.open(baked)
+    assert views.keys() == {(view.episode, view.camera, view.frame) for view in data.views()}
+    for (episode, camera, frame), made in views.items():
+        view = data[episode].view(frame, camera)
+        if cameras is CHOSEN:
+            assert {"color", "normals", "nocs"} & made.keys() == ({"color", "normals"} if camera else set())
+        if cameras is SPARSE or camera:
+            np.testing.assert_array_equal(made["color"], view.rgb)
+        else:
+            np.testing.assert_allclose(made["depth"] * 1e-4, view.depth, atol=1e-6)

@@ -17,9 +17,8 @@ import synpick_warp
 from synpick_warp.dataset.bop.foreign import measure_info
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
-from tests.builders import run
-from tests.validation.conftest import good  # noqa: F401
-from tests.validation.layouts import LAYOUTS, _rename_images, _strip, tless
+from tests.builders import mistake, run
+from tests.validation.conftest import LAYOUTS, _rename_images, _strip, good, tless  # noqa: F401
 
 EPISODES = {
     "tless": [1, 2, 3],
@@ -61,22 +60,15 @@ def test_scenes_are_episodes_and_sensors_are_cameras(folders, name):
 def test_what_is_read_is_what_was_baked(good, folders, name, first):  # noqa: F811
     """Pixels, masks and poses of the first image, which all layouts share."""
     mine, theirs = synpick_warp.open(good)[0].view(0), synpick_warp.open(folders[name])[first].view(0)
-    np.testing.assert_array_equal(mine.rgb, theirs.rgb)
-    np.testing.assert_array_equal(mine.masks, theirs.masks)
-    np.testing.assert_array_equal(mine.amodal_masks, theirs.amodal_masks)
-    np.testing.assert_array_equal(mine.object_to_camera, theirs.object_to_camera)
-    np.testing.assert_array_equal(mine.visibility, theirs.visibility)
-    assert (mine.intrinsics == theirs.intrinsics).all()
+    for name in ("rgb", "masks", "amodal_masks", "object_to_camera", "visibility", "intrinsics"):
+        np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
 
 
-def test_images_keep_their_ids(folders):
+def test_images_keep_their_ids_and_may_be_grey_tiff_files_without_truth(folders):
     episode = synpick_warp.open(folders["ycbv"])[49]
     assert list(episode.image_ids) == [1, 36]
     assert [view.image_id for view in episode.views()] == [1, 36]
     assert episode.view(-1).image_id == 36
-
-
-def test_grey_tiff_images_and_missing_truth(folders):
     data = synpick_warp.open(folders["itodd"])
     hidden = next(iter(data.split("test").views()))
     assert len(hidden) == 0
@@ -88,13 +80,11 @@ def test_grey_tiff_images_and_missing_truth(folders):
 
 def test_what_scene_gt_info_would_tell_is_measured_or_unknown(plain):
     told = [(view.visible_boxes, view.visibility) for view in synpick_warp.open(plain).views()]
-    for path in plain.glob("test/*/scene_gt_info.json"):
-        path.unlink()
+    remove(plain, "scene_gt_info.json")
     for (boxes, visibility), view in zip(told, synpick_warp.open(plain).views(), strict=True):
         np.testing.assert_array_equal(view.visible_boxes, boxes)
         np.testing.assert_allclose(view.visibility, visibility, atol=0.02)
-    for scene in plain.glob("test/*"):
-        shutil.rmtree(scene / "mask")
+    remove(plain, "mask")
     view = synpick_warp.open(plain)[0].view(0)
     assert np.isnan(view.visibility).all()
     np.testing.assert_array_equal(view.visible_boxes, told[0][0])
@@ -105,14 +95,8 @@ def test_measured_boxes_end_with_the_last_pixel():
     mask[2:4, 3:7] = True
     visible = mask & (np.arange(8) < 5)
     (entry,) = measure_info([visible], [mask])
-    assert entry == {
-        "bbox_obj": [3, 2, 3, 1],
-        "bbox_visib": [3, 2, 1, 1],
-        "px_count_all": 8,
-        "px_count_valid": 8,
-        "px_count_visib": 4,
-        "visib_fract": 0.5,
-    }
+    boxes = {"bbox_obj": [3, 2, 3, 1], "bbox_visib": [3, 2, 1, 1]}
+    assert entry == boxes | {"px_count_all": 8, "px_count_valid": 8, "px_count_visib": 4, "visib_fract": 0.5}
 
 
 def test_scenes_of_the_same_index_are_told_apart(good, tmp_path):  # noqa: F811
@@ -126,24 +110,25 @@ def test_scenes_of_the_same_index_are_told_apart(good, tmp_path):  # noqa: F811
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_statistics_and_report_of_any_layout(folders, name, tmp_path):
-    data = synpick_warp.open(folders[name])
-    views = sum(len(episode) * len(episode.cameras) for episode in data.values())
+def test_statistics_report_and_contact_sheet_of_any_layout(folders, name, tmp_path):
+    views = sum(len(episode) * len(episode.cameras) for episode in synpick_warp.open(folders[name]).values())
     code, out, _ = run("stats", folders[name], "--threads", 1)
     assert code == 0
     assert f"{views} views in " in out
     assert "missing: this data set is from another source" in out
-    assert run("report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1)[0] == 0
-
-
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_a_contact_sheet_of_any_layout(folders, name, tmp_path):
-    assert run("preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3)[0] == 0
+    assert run("report", folders[name], "--out", tmp_path / "page.html", "--views", 2, "--threads", 1).code == 0
+    assert run("preview", folders[name], "--out", tmp_path / "sheet.png", "--views", 3).code == 0
     assert cv2.imread(str(tmp_path / "sheet.png")).std() > 10
 
 
+def remove(plain: Path, *names: str) -> None:
+    """Remove files or folders of each scene."""
+    for path in [path for name in names for path in plain.glob(f"test/*/{name}")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
 def test_estimates_are_made_and_scored(plain, tmp_path):
-    """Without models a line says so; without masks, too."""
+    """Without models a line says so."""
     results = tmp_path / "refine_plain-test.csv"
     words = ("estimate", "--data", plain, "--method", "refine", "--every", 1, "--out", results, "--threads", 1)
     assert run(*words)[0] == 0
@@ -157,33 +142,22 @@ def test_estimates_are_made_and_scored(plain, tmp_path):
     assert run("eval", "--data", plain, "--results", results)[0] == 0
     shutil.rmtree(plain / "models_cad")
     shutil.rmtree(plain / "models_eval")
-    code, _, said = run("eval", "--data", plain, "--results", results)
-    assert code == 2
+    said = mistake("eval", "--data", plain, "--results", results)
     assert "has no models/models_info.json, which poses are evaluated with" in said
-    for scene in plain.glob("test/*"):
-        shutil.rmtree(scene / "mask_visib")
-    code, _, said = run(*words)
-    assert code == 2
-    assert "has no masks (mask_visib), which poses are estimated with" in said
-    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize(
-    ("file", "said"),
+    ("method", "missing", "said"),
     [
-        ("scene_gt.json", "has no ground truth (scene_gt.json), which poses are estimated with"),
-        ("depth", "has no depth images, which poses are estimated with"),
+        ("refine", ["scene_gt.json", "scene_gt_info.json"], "has no ground truth (scene_gt.json), which poses are estimated with"),
+        ("refine", ["depth"], "has no depth images, which poses are estimated with"),
+        ("refine", ["mask_visib"], "has no masks (mask_visib), which poses are estimated with"),
+        ("track", [], "has no instance_id in its ground truth, by which instances are tracked; use another method"),
     ],
 )
-def test_what_estimation_lacks_is_named(plain, tmp_path, file, said):
-    for scene in plain.glob("test/*"):
-        path = scene / file
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-        if file == "scene_gt.json":
-            (scene / "scene_gt_info.json").unlink()
-    code, _, line = run("estimate", "--data", plain, "--method", "refine", "--out", tmp_path / "out.csv", "--threads", 1)
-    assert code == 2
-    assert said in line
+def test_what_estimation_lacks_is_named(plain, tmp_path, method, missing, said):
+    remove(plain, *missing)
+    assert said in mistake("estimate", "--data", plain, "--method", method, "--out", tmp_path / "out.csv", "--threads", 1)
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -213,8 +187,7 @@ def test_names_of_images_may_be_written_otherwise(plain, change):
     ids=["rgb_and_gt", "depth"],
 )
 def test_a_set_with_a_single_kind_of_images(plain, tmp_path, missing):
-    for path in [path for name in missing for path in plain.glob(f"test/*/{name}")]:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    remove(plain, *missing)
     shutil.rmtree(plain / "models")
     assert len(list(synpick_warp.open(plain).views())) == 6
     for words in (("stats", "--threads", 1), ("preview", "--out", tmp_path / "sheet.png"), ("report", "--out", tmp_path / "page.html")):
@@ -222,23 +195,29 @@ def test_a_set_with_a_single_kind_of_images(plain, tmp_path, missing):
     assert cv2.imread(str(tmp_path / "sheet.png"))[20:300, :480].std() > 10
 
 
-def rows(view) -> dict:
-    return {"rgb": view.rgb, "depth": view.depth, "masks": view.masks, "poses": view.object_to_camera, "visibility": view.visibility}
+def check_same(theirs, ours) -> None:
+    """Two views have the same content."""
+    for name in ("rgb", "depth", "masks", "object_to_camera", "visibility"):
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name), err_msg=name)
+
+
+def convert(folder: Path, to: str, out: Path, *options: object, threads: int = 1) -> str:
+    """Convert a set; returns what the command prints."""
+    code, said, error = run("convert", folder, "--to", to, "--out", out, "--threads", threads, *options)
+    assert code == 0, error
+    return said
 
 
 @pytest.mark.parametrize(("name", "to"), [("tless", "shards"), ("imagewise", "bop")])
 def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
     out = tmp_path / "new" / "out"
-    code, said, _ = run("convert", folders[name], "--to", f"{to},coco", "--out", out, "--threads", 1)
-    assert code == 0
-    assert f"3 scenes converted to {to}, coco" in said
+    assert f"3 scenes converted to {to}, coco" in convert(folders[name], f"{to},coco", out)
     assert [path.name for path in out.parent.iterdir()] == ["out"]
     source, made = synpick_warp.open(folders[name]), synpick_warp.open(out)
     assert list(made) == list(source)
     for theirs, ours in zip(source.views(), made.views(), strict=True):
         assert (theirs.episode, theirs.image_id) == (ours.episode, ours.image_id)
-        for key, values in rows(theirs).items():
-            np.testing.assert_array_equal(values, rows(ours)[key], err_msg=key)
+        check_same(theirs, ours)
     (file,) = (out / "coco" / "annotations").iterdir()
     content = json.loads(file.read_text())
     assert len(content["images"]) == 6
@@ -248,13 +227,11 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
 
 
 def test_each_sensor_becomes_a_scene(folders, tmp_path):
-    assert run("convert", folders["multisensor"], "--to", "shards,coco,yolo", "--out", tmp_path / "out", "--threads", 1)[0] == 0
+    convert(folders["multisensor"], "shards,coco,yolo", tmp_path / "out")
     source, made = synpick_warp.open(folders["multisensor"]), synpick_warp.open(tmp_path / "out")
     assert list(made) == [0, 1, 2]
     for theirs in source.views():
-        ours = made[theirs.camera].view(theirs.frame)
-        for key, values in rows(theirs).items():
-            np.testing.assert_array_equal(values, rows(ours)[key], err_msg=key)
+        check_same(theirs, made[theirs.camera].view(theirs.frame))
     assert "those of scene s and its sensors " in (tmp_path / "out/dataset_info.md").read_text()
     assert run("validate", tmp_path / "out")[0] == 0
 
@@ -262,13 +239,10 @@ def test_each_sensor_becomes_a_scene(folders, tmp_path):
 def test_masks_are_rendered_where_a_set_has_none(plain, tmp_path):
     """Those of the bake, but for pixels on edges; the classes are those of the models, and what was made is noted."""
     expected = [(view.episode, view.image_id, mask) for view in synpick_warp.open(plain).views() for mask in view.masks if mask.any()]
-    for path in [*plain.glob("test/*/mask*"), *plain.glob("test/*/scene_gt_info.json")]:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    remove(plain, "mask*", "scene_gt_info.json")
     for folder in ("models", "models_eval"):
         shutil.copyfile(plain / folder / "obj_000003.ply", plain / folder / "obj_000009.ply")
-    code, said, _ = run("convert", plain, "--to", "coco,yolo", "--out", tmp_path / "out", "--threads", 2)
-    assert code == 0
-    assert "Masks are rendered from models and poses" in said
+    assert "Masks are rendered from models and poses" in convert(plain, "coco,yolo", tmp_path / "out", threads=2)
     content = json.loads((tmp_path / "out/coco/annotations/instances_test.json").read_text())
     assert len(content["annotations"]) == len(expected)
     for one, (_, _, mask) in zip(content["annotations"], expected, strict=True):
@@ -276,16 +250,14 @@ def test_masks_are_rendered_where_a_set_has_none(plain, tmp_path):
         assert np.count_nonzero(made != mask) <= 0.01 * mask.sum()
     assert "Masks are rendered from models and poses" in (tmp_path / "out/dataset_info.md").read_text()
     assert "nc: 3\n" in (tmp_path / "out/yolo/data.yaml").read_text(), "9 is in no image"
-    shutil.rmtree(plain / "models")
-    shutil.rmtree(plain / "models_eval")
-    code, _, said = run("convert", plain, "--to", "yolo", "--out", tmp_path / "none", "--threads", 1)
-    assert code == 2
+    for folder in ("models", "models_eval"):
+        shutil.rmtree(plain / folder)
+    said = mistake("convert", plain, "--to", "yolo", "--out", tmp_path / "none", "--threads", 1)
     assert "has no masks of visible parts (mask_visib), nor models and cameras to render them, which it needs" in said
 
 
 def test_a_split_is_converted(folders, tmp_path):
-    words = ("convert", folders["ycbv"], "--to", "shards", "--split", "test", "--out", tmp_path / "out", "--threads", 1)
-    assert run(*words)[0] == 0
+    convert(folders["ycbv"], "shards", tmp_path / "out", "--split", "test")
     assert [(view.episode, view.image_id) for view in synpick_warp.open(tmp_path / "out").views()] == [
         (scene, image) for scene in (48, 49, 50) for image in (1, 36)
     ]
@@ -295,7 +267,7 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path)
     shutil.copytree(folders["itodd"] / "val", tmp_path / "set" / "val")
     for scene in (tmp_path / "set/val").iterdir():
         _rename_images(scene, {0: 1, 1: 36})
-    assert run("convert", tmp_path / "set", "--to", "shards,coco", "--out", tmp_path / "out", "--threads", 1)[0] == 0
+    convert(tmp_path / "set", "shards,coco", tmp_path / "out")
     for theirs, ours in zip(synpick_warp.open(tmp_path / "set").views(), synpick_warp.open(tmp_path / "out").views(), strict=True):
         assert ours.image_id in (1, 36)
         np.testing.assert_array_equal(theirs.rgb, ours.rgb)
@@ -315,28 +287,15 @@ def test_images_of_other_kinds_are_encoded_and_keep_their_ids(folders, tmp_path)
     ],
 )
 def test_what_can_not_be_made_of_a_found_set_is_one_line(folders, tmp_path, name, to, said):
-    code, _, line = run("convert", folders[name], "--to", to, "--out", tmp_path / "out", "--threads", 1)
-    assert code == 2
-    assert re.search(said, line)
-    assert line.count("\n") == 1
+    assert re.search(said, mistake("convert", folders[name], "--to", to, "--out", tmp_path / "out", "--threads", 1))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_conversion_that_fails_leaves_nothing(plain, tmp_path):
     sorted(plain.glob("test/000002/depth/*"))[-1].write_bytes(b"")
     before = sorted(path.name for path in tmp_path.iterdir())
-    code, _, line = run("convert", plain, "--to", "shards", "--out", tmp_path / "out", "--threads", 1)
-    assert code == 2
-    assert "is not an image" in line
+    assert "is not an image" in mistake("convert", plain, "--to", "shards", "--out", tmp_path / "out", "--threads", 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-def test_tracking_needs_instance_ids(plain, tmp_path):
-    words = ("estimate", "--data", plain, "--method", "track", "--out", tmp_path / "out.csv", "--threads", 1)
-    code, _, said = run(*words)
-    assert code == 2
-    assert "has no instance_id in its ground truth, by which instances are tracked; use another method" in said
-    assert said.count("\n") == 1
 
 
 def test_shards_of_others_may_have_extended_headers(folders, tmp_path):
@@ -377,11 +336,12 @@ def test_other_cameras_than_pinholes_are_named(plain):
 
 
 def test_folders_that_are_no_data_set_say_so(tmp_path, plain):
-    with pytest.raises(DatasetError, match="is not a data set: it does not exist"):
-        synpick_warp.open(tmp_path / "gone")
-    with pytest.raises(DatasetError, match="is a split; name the data set, the folder above"):
-        synpick_warp.open(plain / "test")
-    with pytest.raises(DatasetError, match="is a scene; name the data set, two folders above"):
-        synpick_warp.open(plain / "test/000000")
+    for folder, said in (
+        (tmp_path / "gone", "is not a data set: it does not exist"),
+        (plain / "test", "is a split; name the data set, the folder above"),
+        (plain / "test/000000", "is a scene; name the data set, two folders above"),
+    ):
+        with pytest.raises(DatasetError, match=said):
+            synpick_warp.open(folder)
     with pytest.raises(DatasetError, match="has no settings: it is from another source"):
         _ = synpick_warp.open(plain).config

@@ -6,14 +6,12 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+import synpick_warp
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
-from synpick_warp.dataset.view import read_layer
-from synpick_warp.dataset.view_files import SceneFolder
+from synpick_warp.dataset.view import View
 from tests.builders import PICKING, STIRRING, bake_boxes, once
 from tests.harness.exporter_contract import digests
 
@@ -41,37 +39,13 @@ def split(tmp_path_factory) -> Path:
     return once(tmp_path_factory, "layers", baked)[0] / "train"
 
 
-class View:
-    """An image and its ground truth; lengths in metres."""
-
-    def __init__(self, scene: Path, frame: int) -> None:
-        self.scene, self.frame = scene, frame
-        self.camera = json.loads((scene / "scene_camera.json").read_text())[str(frame)]
-        self.truth = json.loads((scene / "scene_gt.json").read_text())[str(frame)]
-        image = cv2.imread(str(scene / "depth" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
-        self.depth = image * self.camera["depth_scale"] * 1e-3
-        self.matrix = np.reshape(self.camera["cam_K"], (3, 3))
-        self.centers = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1)
-        rays = np.concatenate((self.centers, np.ones((HEIGHT, WIDTH, 1))), axis=-1) @ np.linalg.inv(self.matrix).T
-        self.points = rays * self.depth[..., None]
-
-    def mask(self, index: int) -> np.ndarray:
-        return cv2.imread(str(self.scene / "mask_visib" / f"{self.frame:06d}_{index:06d}.png"), cv2.IMREAD_UNCHANGED) > 0
-
-    def pose(self, instance: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Model to camera."""
-        for record in self.truth:
-            if record["instance_id"] == instance:
-                return np.reshape(record["cam_R_m2c"], (3, 3)), 1e-3 * np.array(record["cam_t_m2c"])
-        return None
-
-    def layer(self, name: str) -> np.ndarray:
-        return read_layer(SceneFolder(self.scene), name, self.frame)
+CENTERS = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1)
 
 
-def views(split: Path) -> list[View]:
-    scenes = sorted(split.iterdir())
-    return [View(scene, frame) for scene in scenes for frame in range(len(json.loads((scene / "scene_gt.json").read_text())))]
+def surface(view: View) -> np.ndarray:
+    """Points that the pixels show, in the camera's frame (H, W, 3) [m]."""
+    rays = np.concatenate((CENTERS, np.ones((HEIGHT, WIDTH, 1))), axis=-1) @ np.linalg.inv(view.intrinsics).T
+    return rays * view.depth[..., None]
 
 
 def test_every_view_has_every_layer(split):
@@ -90,19 +64,16 @@ def check_motion(view: View, before: View) -> float:
 
     Returns the largest flow [px].
     """
-    flow, scene_flow = view.layer("flow"), view.layer("scene_flow")
-    most = 0.0
-    for index, record in enumerate(view.truth):
-        seen = view.mask(index)
-        then, now = before.pose(record["instance_id"]), view.pose(record["instance_id"])
-        assert then is not None
-        assert now is not None
-        own = (view.points[seen] - now[1]) @ now[0]
-        was = own @ then[0].T + then[1]
+    flow, scene_flow, points = view.layer("flow"), view.layer("scene_flow"), surface(view)
+    known, most = before.instance_ids.tolist(), 0.0
+    for instance, seen, now in zip(view.instance_ids.tolist(), view.masks, view.object_to_camera, strict=True):
+        then = before.object_to_camera[known.index(instance)]
+        own = (points[seen] - now[:3, 3]) @ now[:3, :3]
+        was = own @ then[:3, :3].T + then[:3, 3]
         # Half a step of the file, and what half a count of depth can turn and scale.
-        np.testing.assert_allclose(scene_flow[seen], was - view.points[seen], atol=1e-5 + 0.5 * DEPTH_STEP)
-        image = was @ view.matrix.T
-        expected = image[:, :2] / image[:, 2:] - view.centers[seen]
+        np.testing.assert_allclose(scene_flow[seen], was - points[seen], atol=1e-5 + 0.5 * DEPTH_STEP)
+        image = was @ view.intrinsics.T
+        expected = image[:, :2] / image[:, 2:] - CENTERS[seen]
         np.testing.assert_allclose(flow[seen], expected, atol=1 / 128 + 0.005)
         most = max(most, float(np.abs(expected).max(initial=0.0)))
     return most
@@ -116,17 +87,16 @@ def unknown(view: View) -> np.ndarray:
 
 
 def test_motion_is_that_of_the_poses(split):
-    most = []
-    for view in views(split):
+    data, most = synpick_warp.open(split.parent), []
+    for view in data.views():
         if view.frame == 0:
             assert np.isnan(view.layer("flow")).all()
             assert np.isnan(view.layer("scene_flow")).all()
             continue
-        most.append(check_motion(view, View(view.scene, view.frame - 1)))
+        most.append(check_motion(view, data[view.episode].view(view.frame - 1, view.camera)))
         assert not unknown(view).any()
-        rest = ~np.any([view.mask(index) for index in range(len(view.truth))], axis=0)
         # Table and tote stand.
-        assert (view.layer("flow")[rest] == 0.0).all(axis=-1).mean() > 0.5
+        assert (view.layer("flow")[~view.masks.any(axis=0)] == 0.0).all(axis=-1).mean() > 0.5
     assert sum(value > 0.1 for value in most) >= 10
     assert max(most) > 5.0
 
@@ -134,60 +104,47 @@ def test_motion_is_that_of_the_poses(split):
 def test_a_gripper_that_was_out_of_the_picture_has_no_motion(tmp_path):
     split = baked(tmp_path / "set", TINY | PICKING | {"bake.episodes": 1})
     chosen = {json.loads(line)["frame"] for line in (split.parent / "attempts.jsonl").read_text().splitlines()}
-    appeared = 0
-    for view in views(split):
+    data, appeared = synpick_warp.open(split.parent), 0
+    for view in data.views():
         if view.frame == 0:
             continue
-        check_motion(view, View(view.scene, view.frame - 1))
+        check_motion(view, data[view.episode].view(view.frame - 1, view.camera))
         # Worlds choose without gripper; it comes in the next image.
         if view.frame - 1 in chosen:
             appeared += unknown(view).any()
-            assert not unknown(view)[np.any([view.mask(index) for index in range(len(view.truth))], axis=0)].any()
+            assert not unknown(view)[view.masks.any(axis=0)].any()
         else:
             assert not unknown(view).any()
     assert appeared
 
 
 def test_classes_and_places_are_those_of_the_masks(split):
-    infos = json.loads((split.parent / "models" / "models_info.json").read_text())
-    for view in views(split)[::3]:
-        classes, nocs = view.layer("classes"), view.layer("nocs")
-        rest = np.ones((HEIGHT, WIDTH), bool)
-        for index, record in enumerate(view.truth):
-            seen = view.mask(index)
-            rest &= ~seen
-            assert (classes[seen] == record["obj_id"]).all()
-            info = infos[str(record["obj_id"])]
-            size = 1e-3 * np.array([info[f"size_{axis}"] for axis in "xyz"])
-            middle = 1e-3 * np.array([info[f"min_{axis}"] for axis in "xyz"]) + size / 2
-            rotation, translation = view.pose(record["instance_id"])
-            own = (view.points[seen] - translation) @ rotation
-            np.testing.assert_allclose(middle + np.linalg.norm(size) * (nocs[seen] - 0.5), own, atol=DEPTH_STEP)
+    data = synpick_warp.open(split.parent)
+    for view in list(data.views())[::3]:
+        classes, nocs, points = view.layer("classes"), view.layer("nocs"), surface(view)
+        for object_id, seen, pose in zip(view.object_ids.tolist(), view.masks, view.object_to_camera, strict=True):
+            assert (classes[seen] == object_id).all()
+            low, size = (1e-3 * np.array([data.models_info[object_id][f"{end}_{axis}"] for axis in "xyz"]) for end in ("min", "size"))
+            own = (points[seen] - pose[:3, 3]) @ pose[:3, :3]
+            np.testing.assert_allclose(low + size / 2 + np.linalg.norm(size) * (nocs[seen] - 0.5), own, atol=DEPTH_STEP)
+        rest = ~view.masks.any(axis=0)
         assert not classes[rest].any()
         assert not nocs[rest].any()
 
 
 def test_normals_and_albedo_cover_what_there_is(split):
-    for view in views(split)[::5]:
-        normals, albedo = view.layer("normals"), view.layer("albedo")
-        there = view.depth > 0
+    for view in list(synpick_warp.open(split.parent).views())[::5]:
+        normals, albedo, there = view.layer("normals"), view.layer("albedo"), view.depth > 0
         np.testing.assert_allclose(np.linalg.norm(normals[there], axis=-1), 1.0, atol=1e-4)
-        assert (np.einsum("ij,ij->i", normals[there], view.points[there]) < 0.0).mean() > 0.99
+        assert (np.einsum("ij,ij->i", normals[there], surface(view)[there]) < 0.0).mean() > 0.99
         assert not normals[~there].any()
-        for index in range(len(view.truth)):
-            # The boxes' material: 0.6, 0.5, 0.4.
-            assert np.abs(albedo[view.mask(index)].astype(int) - (153, 128, 102)).max(initial=0) <= 1
+        # The boxes' material: 0.6, 0.5, 0.4.
+        assert np.abs(albedo[view.masks.any(axis=0)].astype(int) - (153, 128, 102)).max(initial=0) <= 1
 
 
 def test_worlds_writers_and_batches_change_no_layer(split, tmp_path):
     other = baked(tmp_path / "other", TINY | {"bake.worlds": 2, "bake.writers": 2, "render.views_per_batch": 3})
     assert digests(other) == digests(split)
-
-
-def test_layers_have_checksums(split):
-    names = {name for episode in range(TINY["bake.episodes"]) for name in read_checksums(split.parent, episode_entry(episode))}
-    assert names == {f"{split.name}/{name}" for name in digests(split)}
-    assert {Path(name).parts[2] for name in names} >= set(LAYERS)
 
 
 def test_layers_change_nothing_else(split, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,14 @@ import pytest
 
 import synpick_warp
 from synpick_warp.apps.conversion.run import convert
-from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import picks as reader
 from synpick_warp.dataset.view import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files
 from synpick_warp.views.picks import COLUMNS, STATES, are_sorted, make_rows, sort_rows
+from tests.builders import run
 from tests.harness import scripted_bake
 from tests.harness.exporter_contract import export
 from tests.worlds.box_sets import write_pick_set, write_set
@@ -114,8 +113,10 @@ DAMAGE = {
     "order": (lambda table: table.take([1, 0, *range(2, 48)]), "column state, row 1 is 0; allowed: rows sorted by state, candidate and"),
     "twice": (lambda table: table.take([0, 0, *range(2, 48)]), "column state, row 1 is 0; allowed: .* none twice"),
     "empty": (lambda table: table.slice(0, 0), r"states.000002.parquet, column candidates, row 0 is 12; allowed: 0"),
-    "cut": (None, "000002.parquet cannot be read: "),
-    "missing": ("gone", "there is no file .*000002.parquet"),
+}
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "cut": (lambda place: place.write_bytes(place.read_bytes()[:-9]), "000002.parquet cannot be read: "),
+    "missing": (Path.unlink, "there is no file .*000002.parquet"),
 }
 
 
@@ -124,15 +125,10 @@ def copied(whole, tmp_path) -> Path:
     return Path(shutil.copytree(whole, tmp_path / "set"))
 
 
-@pytest.mark.parametrize("change", DAMAGE)
+@pytest.mark.parametrize("change", [*DAMAGE, *BROKEN])
 def test_damaged_tables_are_refused(copied, change):
-    place, (damage, message) = copied / FOLDER / "000002.parquet", DAMAGE[change]
-    if damage is None:
-        place.write_bytes(place.read_bytes()[:-9])
-    elif damage == "gone":
-        place.unlink()
-    else:
-        pq.write_table(damage(pq.read_table(place)), place)
+    place, (damage, message) = copied / FOLDER / "000002.parquet", (DAMAGE | BROKEN)[change]
+    damage(place) if change in BROKEN else pq.write_table(damage(pq.read_table(place)), place)
     data = synpick_warp.open(copied)
     with pytest.raises(DatasetError, match=message):
         data[2].picks  # noqa: B018
@@ -161,7 +157,11 @@ def test_each_column_has_its_domain(copied, place, columns):
             assert re.search(rf"is \[?{re.escape(str(rows[column.name][row].ravel()[0]))}", str(fault.value))
 
 
-def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
+def test_limits_missing_tables_and_a_data_set_of_picks_alone(whole, tmp_path, monkeypatch):
+    alone = export(PicksExporter, tmp_path / "alone", config(), (0, 2))
+    (alone / "config.toml").write_text(config_to_toml(config()))
+    (alone / "manifest.json").write_text("{}")
+    assert list(synpick_warp.open(alone)) == [0, 2]
     with pytest.raises(DatasetError, match=r"set has no picks; bake it with --formats picks"):
         synpick_warp.open(write_set(tmp_path / "set", BopExporter))[0].picks  # noqa: B018
     monkeypatch.setattr(reader, "MAX_ROWS", 5)
@@ -169,45 +169,36 @@ def test_limits_and_missing_tables(whole, tmp_path, monkeypatch):
         synpick_warp.open(whole)[0].picks  # noqa: B018
 
 
-def test_a_data_set_of_picks_alone_has_its_episodes(tmp_path):
-    folder = export(PicksExporter, tmp_path / "set", config(), (0, 2))
-    (folder / "config.toml").write_text(config_to_toml(config()))
-    (folder / "manifest.json").write_text("{}")
-    assert list(synpick_warp.open(folder)) == [0, 2]
-
-
 def test_order_of_rows():
     rows = sort_rows(make_rows(COLUMNS, pick_batch(0).trials))
-    assert are_sorted(rows).all()
-    assert are_sorted(rows[:1]).all()
-    assert are_sorted(rows[:0]).all()
+    assert all(are_sorted(rows[:count]).all() for count in (0, 1, None))
     assert are_sorted(rows[[1, 0, 2, 2]]).tolist() == [True, False, True, False]
+
+
+def picks_of(folder: Path) -> dict[str, tuple[str, bytes]]:
+    """Files of picks."""
+    return {name: content for name, content in scripted_bake.snapshot(folder).items() if "picks" in name}
 
 
 def test_a_bake_is_verified_joined_and_converted_with_its_picks(tmp_path):
     """Two shards of a bake are joined to its bytes; scenes that are made of shards have the same scene_picks.json."""
-    config = scripted_bake.settings(2, ("bop", "shards", "picks"))
-    config = replace(config, bop=replace(config.bop, split="train", color_format="png", masks=True, coco=False))
+    given = {"bop.split": "train", "bop.color_format": "png", "bop.masks": True, "bop.coco": False}
+    config = scripted_bake.settings(2, ("bop", "shards", "picks")).with_values(given)
     whole, parts = tmp_path / "whole", [tmp_path / f"part{index}" for index in range(2)]
     scripted_bake.bake(whole, config, picks=True)
     for index, part in enumerate(parts):
         scripted_bake.bake(part, config, (index, 2), picks=True)
-    assert main(["merge", *map(str, parts), f"--out={tmp_path / 'joined'}"]) == 0
-    assert main(["verify", str(tmp_path / "joined")]) == 0
-    joined = {name: content for name, content in scripted_bake.snapshot(tmp_path / "joined").items() if "picks" in name}
-    assert joined == {name: content for name, content in scripted_bake.snapshot(whole).items() if "picks" in name}
+    assert run("merge", *parts, "--out", tmp_path / "joined").code == 0
+    assert run("verify", tmp_path / "joined").code == 0
+    joined = picks_of(tmp_path / "joined")
+    assert joined == picks_of(whole)
     assert {"picks/000001.parquet", "picks/states/000001.parquet", "train/000003/scene_picks.json"} <= set(joined)
     (whole / "picks" / "000001.parquet").write_bytes(b"PAR1")
-    assert main(["verify", str(whole)]) == 1
+    assert run("verify", whole).code == 1
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("synpick_warp.scenes.cameras.make_cameras", lambda _: cameras(16, 12))
-        scripted_bake.bake(tmp_path / "shards", with_formats(config, "shards", "picks"), picks=True)
-        scripted_bake.bake(tmp_path / "bop", with_formats(config, "bop", "picks"), picks=True)
+        for name in ("shards", "bop"):
+            scripted_bake.bake(tmp_path / name, config.with_values({"bake.formats": (name, "picks")}), picks=True)
         convert(tmp_path / "shards", tmp_path / "scenes", ("bop",), 1, lambda *_: None)
     made, baked = (tmp_path / name / "train/000003/scene_picks.json" for name in ("scenes", "bop"))
     assert made.read_bytes() == baked.read_bytes()
-
-
-def with_formats(config: Config, *formats: str) -> Config:
-    """Settings with other formats."""
-    return replace(config, bake=replace(config.bake, formats=formats))

@@ -9,21 +9,23 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 import synpick_warp
-from synpick_warp.cli.main import EXIT_MISTAKE, main
+from synpick_warp.cli.main import EXIT_MISTAKE
 from synpick_warp.dataset.commit import writing
-from synpick_warp.dataset.commit.manifest import CONSTANTS, INDICES, committed_episodes, episode_entry, read_checksums
+from synpick_warp.dataset.commit.manifest import INDICES, committed_episodes
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
-from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
+from tests.builders import mistake, run
 from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
 from tests.harness.exporter_contract import digests
-from tests.harness.processes import children, kill_after, wait_for
+from tests.harness.processes import kill_after, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
 """Total number of kills at random times; a long run has 200."""
@@ -32,9 +34,15 @@ PARTS = 2
 WRITERS_KILLED = 0.25
 """Fraction of these kills that meet a writer."""
 EPISODES = TINY["bake.episodes"]
-PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
 """Files without a checksum: settings, manifest, and two for each entry."""
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[BakeServer]:
+    """The server of quick bakes, which loads all kernels once."""
+    with BakeServer() as server:
+        yield server
 
 
 @pytest.fixture(scope="module")
@@ -183,16 +191,6 @@ def test_a_data_set_of_splits_grows_at_its_end_only(server, splits, tmp_path):
     assert "splits.train.episodes is 2, but" in log.read_text()
 
 
-@pytest.mark.slow
-def test_parts_of_splits_are_merged(server, splits, tmp_path):
-    parts = [tmp_path / name for name in ("train", "test")]
-    for part in parts:
-        assert server.bake(part, config=splits, arguments=["--split", part.name], settings={"bake.formats": ["bop"]}) == 0
-    assert server.bake(tmp_path / "once", config=splits, settings={"bake.formats": ["bop"]}) == 0
-    assert merge(parts, tmp_path / "merged").missing == []
-    assert digests(tmp_path / "merged") == digests(tmp_path / "once")
-
-
 def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):
     log = tmp_path / "log"
     changed = {"physics.friction": 0.4, "bake.seed": 3, "bake.worlds": 1}
@@ -228,24 +226,29 @@ def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
     assert (merged.episodes, merged.missing) == (EPISODES, [])
     assert digests(tmp_path / "set") == expected
     assert verify(tmp_path / "set") == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
+    some = merge(parts[1:2], tmp_path / "some")
+    assert (some.episodes, some.missing) == (1, [0, 2, 3])
+    assert server.bake(tmp_path / "some") == 0
+    assert digests(tmp_path / "some") == expected
+
+
+SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
 
 
 @pytest.mark.slow
-def test_a_part_that_lacks_episodes_is_joined_and_goes_on(server, expected, tmp_path):
-    assert server.bake(tmp_path / "part", arguments=["--shard", "1/2"]) == 0
-    merged = merge([tmp_path / "part"], tmp_path / "set")
-    assert (merged.episodes, merged.missing) == (2, [0, 2])
-    assert server.bake(tmp_path / "set") == 0
-    assert digests(tmp_path / "set") == expected
-
-
-def test_parts_that_do_not_fit(server, whole, tmp_path):
-    assert server.bake(tmp_path / "other", settings={"bake.seed": 1, "bake.episodes": 1}) == 0
-    with pytest.raises(DatasetError, match=r"was made with other settings than .*: bake.seed is 1, there 0"):
-        merge([whole, tmp_path / "other"], tmp_path / "set")
-    with pytest.raises(DatasetError, match=r"has no manifest\.json"):
-        merge([whole, tmp_path], tmp_path / "set")
-    assert not (tmp_path / "set").exists()
+@pytest.mark.parametrize(
+    ("kind", "settings", "options"),
+    [
+        ("splits", {"bake.formats": ["bop"]}, (["--split", "train"], ["--split", "test"])),
+        ("sensors", SENSORS, (["--shard", "0/2"], ["--shard", "1/2"])),
+    ],
+)
+def test_parts_of_splits_and_of_several_sensors_are_merged(server, splits, tmp_path, kind, settings, options):
+    config, parts = splits if kind == "splits" else "smoke", [tmp_path / "first", tmp_path / "second"]
+    for part, arguments in zip([*parts, tmp_path / "once"], [*options, []], strict=True):
+        assert server.bake(part, config=config, arguments=arguments, settings=settings) == 0
+    assert merge(parts, tmp_path / "merged").missing == []
+    assert digests(tmp_path / "merged") == digests(tmp_path / "once")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
@@ -255,16 +258,9 @@ def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, numb
     wait_for(lambda: len(committed_episodes(out)) >= 1)
     os.kill(process, number)
     assert server.wait() == 128 + number
-    there = committed_episodes(out)
-    assert 1 <= len(there) < EPISODES
-    said = log.read_text()
-    assert "stopping after this tick" in said
-    assert f"interrupted: {len(there)} of {EPISODES} episodes are complete" in said
-    verdict = verify(out)
-    assert (verdict.problem, verdict.finished) == ("", False)
-    assert not (out / PARTIAL).exists()
-    assert server.bake(out) == 0
-    assert digests(out) == expected
+    assert "stopping after this tick" in log.read_text()
+    there = stays_whole(server, out, expected)
+    assert f"interrupted: {there} of {EPISODES} episodes are complete" in log.read_text()
 
 
 @pytest.mark.slow
@@ -280,51 +276,35 @@ def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
     assert digests(out) == expected
 
 
-# ---- the layout of several sensors ----
-
-SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
-
-
-@pytest.fixture(scope="module")
-def multisensor(server, tmp_path_factory) -> Path:
-    """An undisturbed bake."""
-    out = tmp_path_factory.mktemp("sensors") / "set"
-    assert server.bake(out, settings=SENSORS, warm=True) == 0
-    return out
-
-
 @pytest.mark.slow
-def test_scenes_are_whole_after_kills(server, multisensor, tmp_path):
+def test_scenes_of_several_sensors_are_whole_after_kills(server, tmp_path):
     """A scene brings the files of all cameras together by many renames, some of which a kill prevents."""
-    count = tmp_path / "count"
-    assert server.bake(tmp_path / "counted", settings=SENSORS, alone=True, count=str(count)) == 0
-    out = tmp_path / "set"
+    whole, out, count = tmp_path / "whole", tmp_path / "set", tmp_path / "count"
+    assert server.bake(whole, settings=SENSORS, alone=True, count=str(count)) == 0
     for share in (0.5, 0.3):
         assert server.bake(out, settings=SENSORS, alone=True, kill_at=round(share * int(count.read_text()))) == -signal.SIGKILL
     assert server.bake(out, settings=SENSORS) == 0
-    assert digests(out) == digests(multisensor)
-
-
-@pytest.mark.slow
-def test_parts_of_several_sensors_are_merged(server, multisensor, tmp_path):
-    parts = [tmp_path / str(part) for part in range(2)]
-    for part, folder in enumerate(parts):
-        assert server.bake(folder, settings=SENSORS, arguments=["--shard", f"{part}/2"]) == 0
-    assert merge(parts, tmp_path / "merged").missing == []
-    assert digests(tmp_path / "merged") == digests(multisensor)
+    assert digests(out) == digests(whole)
 
 
 # ---- when something fails ----
 
 
-@pytest.mark.slow
-def test_a_writer_that_is_killed(server, expected, tmp_path):
-    out, log = tmp_path / "set", tmp_path / "log"
-    process = server.start(out, log=str(log))
-    wait_for(lambda: len(committed_episodes(out)) >= 1)
-    (writer,) = children(process)
-    os.kill(writer, signal.SIGKILL)
-    goes_on_after(server, out, log, expected, "a writer process was ended by SIGKILL")
+def stays_whole(server: BakeServer, out: Path, expected: dict[str, str]) -> int:
+    """Whole episodes stay of a bake that was stopped, and the next goes on; returns their number."""
+    there = committed_episodes(out)
+    assert 1 <= len(there) < EPISODES
+    assert (verify(out).problem, verify(out).finished) == ("", False)
+    assert not (out / PARTIAL).exists()
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+    return len(there)
+
+
+def fails(server: BakeServer, log: Path, said: str) -> None:
+    """The bake that runs ends with exit code 2, and one line."""
+    assert server.wait() == 2
+    assert log.read_text().splitlines()[-1].startswith(f"synpick-warp: error: {said}")
 
 
 @pytest.mark.slow
@@ -333,8 +313,7 @@ def test_the_folder_is_removed(server, expected, tmp_path):
     server.start(out, log=str(log))
     wait_for(lambda: len(committed_episodes(out)) >= 1)
     out.rename(tmp_path / "moved")
-    assert server.wait() == 2
-    assert log.read_text().splitlines()[-1] == f"synpick-warp: error: {out} was removed while the bake wrote to it"
+    fails(server, log, f"{out} was removed while the bake wrote to it")
     assert not out.exists()
     assert server.bake(tmp_path / "moved") == 0
     assert digests(tmp_path / "moved") == expected
@@ -346,42 +325,8 @@ def test_a_file_that_cannot_be_written(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     assert server.bake(out, settings={"bake.episodes": 2}) == 0
     server.start(out, log=str(log), alone=True, most_bytes=10_000)
-    goes_on_after(server, out, log, expected, "cannot write ")
-
-
-@pytest.mark.slow
-def test_a_full_disk(server, whole, expected, small_disk):
-    """With room for half of the episodes, and a little more."""
-    constants, episodes = (
-        sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
-        for places in ([CONSTANTS], [episode_entry(number) for number in range(EPISODES)])
-    )
-    disk = small_disk(round((constants + 0.6 * episodes) / 1024))
-    out, log = disk / "set", disk.parent / "log"
-    server.start(out, log=str(log))
-    assert server.wait() == 2
-    said = log.read_text().splitlines()[-1]
-    assert said.startswith("synpick-warp: error: cannot write ")
-    assert "No space left on device" in said
-    there = committed_episodes(out)
-    assert 1 <= len(there) < EPISODES
-    assert verify(out).problem == ""
-    assert not (out / PARTIAL).exists()
-    subprocess.run(["mount", "-o", "remount,size=50m", disk], check=True)
-    assert server.bake(out) == 0
-    assert digests(out) == expected
-
-
-def goes_on_after(server: BakeServer, out: Path, log: Path, expected: dict[str, str], said: str) -> None:
-    """The bake that runs ends with one line and exit code 2; whole episodes stay, and the next goes on."""
-    assert server.wait() == 2
-    assert log.read_text().splitlines()[-1].startswith(f"synpick-warp: error: {said}")
-    there = committed_episodes(out)
-    assert 1 <= len(there) < EPISODES
-    assert verify(out).problem == ""
-    assert not (out / PARTIAL).exists()
-    assert server.bake(out) == 0
-    assert digests(out) == expected
+    fails(server, log, "cannot write ")
+    stays_whole(server, out, expected)
 
 
 # ---- verify ----
@@ -398,27 +343,24 @@ def test_an_undisturbed_data_set_is_as_it_was_written(whole, expected):
     assert listed.returncode == 0
 
 
-def test_what_is_wrong_or_missing_is_named(copied, capsys):
-    def said() -> str:
-        assert main(["verify", str(copied)]) == 1
-        return capsys.readouterr().out.strip()
+def test_what_is_wrong_or_missing_is_named(copied):
+    targets, picture = copied / "test_targets_bop19.json", copied / "train/000004/depth/000002.png"
+    model, settings, manifest = copied / "models/models_info.json", copied / "config.toml", copied / "manifest.json"
+    for change, said in (
+        (lambda: targets.write_bytes(targets.read_bytes()[:-1]), f"{targets} has changed since it was written: its checksum differs"),
+        (picture.unlink, f"{picture} is missing"),
+        (lambda: model.write_bytes(model.read_bytes() + b" "), f"{model} has changed since it was written: its checksum differs"),
+        (lambda: exchange(settings, "seed = 0", "seed = 1"), f"{settings} does not match the manifest: bake.seed is 1, there 0"),
+    ):
+        change()
+        code, out, _ = run("verify", copied)
+        assert (code, out.strip()) == (1, said)
+    exchange(manifest, '"friction": 0.5', '"friction": 0.6')
+    assert "do not match their checksum" in mistake("verify", copied)
 
-    targets = copied / "test_targets_bop19.json"
-    targets.write_bytes(targets.read_bytes()[:-1])
-    assert said() == f"{targets} has changed since it was written: its checksum differs"
-    picture = copied / "train/000004/depth/000002.png"
-    picture.unlink()
-    assert said() == f"{picture} is missing"
-    model = copied / "models/models_info.json"
-    model.write_bytes(model.read_bytes() + b" ")
-    assert said() == f"{model} has changed since it was written: its checksum differs"
-    settings = copied / "config.toml"
-    settings.write_text(settings.read_text().replace("seed = 0", "seed = 1"))
-    assert said() == f"{settings} does not match the manifest: bake.seed is 1, there 0"
-    manifest = copied / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"friction": 0.5', '"friction": 0.6'))
-    assert main(["verify", str(copied)]) == 2
-    assert "do not match their checksum" in capsys.readouterr().err
+
+def exchange(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(old, new))
 
 
 def test_an_episode_that_lost_a_file_is_made_again(server, copied, expected):

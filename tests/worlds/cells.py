@@ -11,7 +11,8 @@ from synpick_warp.configs.files.table_lists import read_rows
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import STIRRING, boxes
+from tests.builders import STIRRING, boxes, run
+from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import settings
 
 Point = Sequence[float]
@@ -43,3 +44,15 @@ def bake_cell(out: Path, config: Config, shard: tuple[int, int] = (0, 1)) -> Non
     """Bake boxes."""
     with boxes():
         run_bake(config, out, SilentProgress(), shard)
+
+
+def check_valid(folder: Path) -> None:
+    """A data set is whole, and `validate` finds no error in it."""
+    assert run("verify", folder).code == 0
+    ran = run("validate", folder)
+    assert (ran.code, "0 errors" in ran.out) == (0, True), ran
+
+
+def check_same(ours: Path, theirs: Path) -> None:
+    """Two data sets have the same bytes, but for their settings."""
+    assert {name for name, _ in digests(ours).items() ^ digests(theirs).items()} <= {"config.toml"}

@@ -101,15 +101,11 @@ def hostile_content(name: str, data: bytes, number: int) -> bytes | None:
 def use_set(folder: Path) -> None:
     """Read everything of a data set that `synpick_warp.open` gives; errors are SynpickErrors, or those of a missing key."""
     data = synpick_warp.open(folder)
-    parts: list[Callable[[], object]] = [
-        lambda: (len(data), repr(data), data.config),
-        lambda: (data.attributes, data.objects),
-        lambda: data.cameras,
-        lambda: data.models_info,
-        lambda: list(data.attempts),
-    ]
-    for part in parts:
-        attempted(part)
+    attempted(lambda: (len(data), repr(data), data.config))
+    attempted(lambda: (data.attributes, data.objects))
+    for name in ("cameras", "models_info"):
+        attempted(lambda name=name: getattr(data, name))
+    attempted(lambda: list(data.attempts))
     for index in attempted(lambda: list(data)) or []:
         use_episode(data, index)
 
@@ -124,12 +120,11 @@ def use_episode(data: DataSet, index: int) -> None:
     for group in (episode.ticks, episode.steps, episode.arrangement, episode.attempt_arrays):
         for name in attempted(lambda group=group: list(group)) or []:
             attempted(lambda name=name, group=group: group[name][...])
+    names = ("rgb", "depth", "masks", "amodal_masks", "layers", "intrinsics", "object_to_world", "object_ids", "instance_ids")
     for camera in (0, 2):
-        view = attempted(lambda camera=camera: episode.view(0, camera))
-        names = ("rgb", "depth", "masks", "amodal_masks", "layers", "intrinsics", "object_to_world", "object_ids", "instance_ids")
-        for name in (*names, "visibility", "boxes", "visible_boxes") if view is not None else ():
-            attempted(lambda name=name, view=view: getattr(view, name))
-        if view is not None:
+        if (view := attempted(lambda camera=camera: episode.view(0, camera))) is not None:
+            for name in (*names, "visibility", "boxes", "visible_boxes"):
+                attempted(lambda name=name, view=view: getattr(view, name))
             attempted(lambda view=view: [view.layer(name) for name in view.layers])
             attempted(lambda view=view: view.project(view.object_to_camera[:, :3, 3]))
 
@@ -146,92 +141,67 @@ def attempted(part: Callable[[], object]):
     return None
 
 
-def run_command(*arguments: object) -> int:
-    """Run a command: exit code 0 or 1, or 2 with one line."""
-    started = time.monotonic()
-    code, _, err = run(*arguments)
-    assert time.monotonic() - started < HANG, arguments
-    assert code in (0, 1, 2), arguments
-    assert (code == 2) == bool(err), (arguments, err)
+def run_command(sandbox: Sandbox, name: str, *options: object, out: str = "", to: str = "--out") -> int:
+    """Run a command on the set: exit code 0 or 1, or 2 with one line; with `out`, output is written there if and only if the code is 0."""
+    place, started = sandbox.scratch / (out or "none"), time.monotonic()
+    code, _, err = run(name, *options, *((to, place) if out else ()))
+    assert time.monotonic() - started < HANG, name
+    assert code in (0, 1, 2), name
+    assert (code == 2) == bool(err), (name, err)
     if code == 2:
         [line] = err.splitlines()
         assert line.startswith("synpick-warp: error: "), line
         assert line.isprintable()
+    assert (code == 0) == place.exists() or not out
+    shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
+    assert not list(sandbox.scratch.glob(".*"))
     return code
 
 
-def draw(sandbox: Sandbox) -> None:
-    """Run `preview` and `explain`; an image is written if and only if the code is 0."""
-    picture = sandbox.scratch / "picture.png"
-    for arguments in (("preview", sandbox.folder, "--views", 2), ("explain", sandbox.folder, "--episode", 0)):
-        code = run_command(*arguments, "--out", picture)
-        assert (code == 0) == picture.exists()
-        picture.unlink(missing_ok=True)
-    assert not list(sandbox.scratch.glob(".picture*"))
+def draw(sandbox: Sandbox) -> int:
+    """Run `preview` and `explain`."""
+    codes = run_command(sandbox, "preview", sandbox.folder, "--views", 2, out="sheet.png")
+    return codes + run_command(sandbox, "explain", sandbox.folder, "--episode", 0, out="explained.png")
 
 
-def check_and_merge(sandbox: Sandbox) -> None:
-    """Run `verify` and `merge`."""
-    run_command("verify", sandbox.folder)
-    run_command("merge", sandbox.folder, "--out", sandbox.scratch / "merged")
-    shutil.rmtree(sandbox.scratch / "merged", ignore_errors=True)
-
-
-def show_settings(sandbox: Sandbox) -> None:
-    """Run `config` on the set's settings."""
-    run_command("config", "--config", sandbox.folder / "config.toml")
-
-
-def evaluate(sandbox: Sandbox) -> None:
+def evaluate(sandbox: Sandbox) -> int:
     """Run `eval` on the set's own poses."""
-    table = sandbox.scratch / "table.txt"
-    code = run_command("eval", "--data", sandbox.folder, "--results", sandbox.results, "--filter", "ema", "--vertices", 20, "--out", table)
-    assert (code == 0) == table.exists()
-    table.unlink(missing_ok=True)
+    options = ("--results", sandbox.results, "--filter", "ema", "--vertices", 20)
+    return run_command(sandbox, "eval", "--data", sandbox.folder, *options, out="table.txt")
 
 
 def estimate(sandbox: Sandbox) -> int:
-    """Run `estimate`; returns the exit code."""
-    out = sandbox.scratch / "refine.csv"
     options = ("--method", "refine", "--every", 1, "--visib-min", 0, "--threads", 1)
-    code = run_command("estimate", "--data", sandbox.folder, *options, "--out", out)
-    assert (code == 0) == out.exists()
-    out.unlink(missing_ok=True)
-    return code
+    return run_command(sandbox, "estimate", "--data", sandbox.folder, *options, out="refine.csv")
 
 
 def count(sandbox: Sandbox) -> int:
-    """Run `stats`; tables are written if and only if the code is 0."""
-    tables = sandbox.scratch / "tables"
-    code = run_command("stats", sandbox.folder, "--csv", tables)
-    assert (code == 0) == tables.exists()
-    shutil.rmtree(tables, ignore_errors=True)
-    run_command("stats", sandbox.folder)
-    return code
+    run_command(sandbox, "stats", sandbox.folder)
+    return run_command(sandbox, "stats", sandbox.folder, out="tables", to="--csv")
 
 
-READERS = {
+def check_and_merge(sandbox: Sandbox) -> int:
+    run_command(sandbox, "merge", sandbox.folder, out="merged")
+    return run_command(sandbox, "verify", sandbox.folder)
+
+
+READERS: dict[str, Callable[[Sandbox], int | None]] = {
     "open": lambda sandbox: use_set(sandbox.folder),
     "draw": draw,
     "evaluate": evaluate,
     "estimate": estimate,
     "count": count,
     "check and merge": check_and_merge,
-    "config": show_settings,
+    "config": lambda sandbox: run_command(sandbox, "config", "--config", sandbox.folder / "config.toml"),
 }
 
 
 def test_the_set_itself_is_read_by_every_command(sandbox):
     assert len(sandbox.files) > 60
-    use_set(sandbox.folder)
     data = synpick_warp.open(sandbox.folder)
     assert [len(data[0].attempts), data[0].view(0).layers] == [2, ("classes", "flow")]
-    draw(sandbox)
-    evaluate(sandbox)
-    assert estimate(sandbox) == 0
-    assert count(sandbox) == 0
-    assert run_command("verify", sandbox.folder) == 0
-    show_settings(sandbox)
+    for read in READERS.values():
+        assert not read(sandbox)
 
 
 @pytest.mark.parametrize("reader", READERS)

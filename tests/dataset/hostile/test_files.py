@@ -1,49 +1,51 @@
-"""Hostile images, annotations and shards of a data set: each is a DatasetError of one line, before memory is filled."""
+"""Hostile images, annotations, shards and zarr arrays of a data set: each is a DatasetError of one line, before memory is filled.
+Compressed chunks inflate, chunks and sizes are larger than what is stored."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import os
+import shutil
 import struct
 import tarfile
 import zlib
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
+import msgspec
+import numcodecs.zstd
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
-from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.dataset import view_files
-from synpick_warp.dataset.annotations import MASK_SCHEMA, VIEW_SCHEMAS, Key, ModelInfo, check_json, read_checked
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE
+from synpick_warp.dataset.annotations import MASK_SCHEMA, VIEW_SCHEMAS, Key, ModelInfo, check_json
+from synpick_warp.dataset.commit.manifest import CONSTANTS, encode_manifest
+from synpick_warp.dataset.stored_array import ArrayMetadata, check_layout
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards.tar_files import key_lines
+from synpick_warp.exporters.trajectory.arrays import STEPS
 from synpick_warp.system.inputs.image_files import decode_image, image_size
 from synpick_warp.system.inputs.tar_files import list_members
-from tests.harness.exporter_contract import LENSES, export
+from tests.harness.exporter_contract import LENSES
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import places, replaced
-from tests.worlds.box_views import config
+from tests.worlds import trajectories
+from tests.worlds.box_sets import write_set
 
-SIZE, FRAMES = (LENSES[0].width, LENSES[0].height), 2
+SIZE = LENSES[0].width, LENSES[0].height
 
 
-def open_set(folder: Path, exporter: type) -> synpick_warp.DataSet:
-    """A data set of one episode of boxes."""
-    given_settings = config(("flow",), split="train", color_format="png")
-    export(exporter, folder, given_settings, (0,), 0, FRAMES)
-    (folder / CONFIG_FILE).write_text(config_to_toml(given_settings))
-    (folder / MANIFEST_FILE).write_text("{}")
-    (folder / ENTRIES).mkdir()
-    (folder / ENTRIES / "000000.json").write_text(json.dumps({"row": {"frames": FRAMES, "ending": "finished"}, "attempts": []}))
-    return synpick_warp.open(folder)
+def open_set(folder: Path, exporter: type = BopExporter) -> synpick_warp.DataSet:
+    """A data set of boxes."""
+    return synpick_warp.open(write_set(folder, exporter))
 
 
 # ---- images ----
@@ -56,21 +58,20 @@ def bomb(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"", "is not an image: neither PNG nor JPEG"),
-        (b"II*\x00" + bytes(100), "is not an image: neither PNG nor JPEG"),
-        (bomb(100_000, 100_000), "F has 100000 x 100000 pixels; allowed: up to 8192 x 8192"),
-        (bomb(0, 5), "F has 0 x 5 pixels"),
-        (bomb(2**31 + 1, 1), "F has 2147483649 x 1 pixels"),
-        (cv2.imencode(".jpg", np.zeros((7, 11)))[1].tobytes().replace(b"\0\7\0\13", b"\xff" * 4), "F has 65535 x 65535 pixels"),
-        (b"\xff\xd8\xff\xc0\x00\x11\x08\xff\xff\xff\xff\x03", "is not an image"),
-        (b"\xff\xd8" + b"\xff\xe0\x00\x02" * 10_000, "is not an image"),
-        (b"\xff\xd8" + b"\xff" * 100_000, "is not an image"),
-        (b"\x89PNG\r\n\x1a\n", "is not an image"),
-    ],
-)
+UNKNOWN = (b"", b"II*\x00" + bytes(100), b"\xff\xd8\xff\xc0\x00\x11\x08\xff\xff\xff\xff\x03", b"\xff\xd8" + b"\xff\xe0\x00\x02" * 10_000)
+UNKNOWN += (b"\xff\xd8" + b"\xff" * 100_000, b"\x89PNG\r\n\x1a\n")
+SIZES = {
+    "F has 100000 x 100000 pixels; allowed: up to 8192 x 8192": bomb(100_000, 100_000),
+    "F has 0 x 5 pixels": bomb(0, 5),
+    "F has 2147483649 x 1 pixels": bomb(2**31 + 1, 1),
+    "F has 65535 x 65535 pixels": cv2.imencode(".jpg", np.zeros((7, 11)))[1].tobytes().replace(b"\0\7\0\13", b"\xff" * 4),
+}
+
+
+IMAGES = [*((data, "is not an image: neither PNG nor JPEG") for data in UNKNOWN), *((data, said) for said, data in SIZES.items())]
+
+
+@pytest.mark.parametrize(("data", "said"), IMAGES)
 def test_the_size_of_an_image_is_checked_before_it_is_decoded(data, said):
     with pytest.raises(DatasetError, match=said):
         decode_image(data, "F", DatasetError)
@@ -96,11 +97,8 @@ def test_a_changed_image_is_decoded_or_named(data):
     try:
         assert max(decode_image(bytes(content), "F", DatasetError).shape) <= 8192
     except DatasetError as error:
-        message = str(error)
-    else:
-        message = "F"
-    assert message.startswith("F")
-    assert message.isprintable()
+        assert str(error).startswith("F")  # noqa: PT017
+        assert str(error).isprintable()  # noqa: PT017
 
 
 def encoded(*shape: int, dtype: type = np.uint8) -> bytes:
@@ -117,23 +115,19 @@ def encoded(*shape: int, dtype: type = np.uint8) -> bytes:
         ("mask/000000_000001.png", encoded(9, 9), "amodal_masks", "mask/000000_000001.png has 9 x 9 pixels"),
         ("mask_visib/000000_000000.png", encoded(*SIZE[::-1], 3), "masks", "mask_visib/000000_000000.png has 3 channels"),
         ("flow/000000.png", encoded(*SIZE[::-1]), "flow", "flow of image 0 in .* has 1 channels"),
+        ("rgb/000000.png", b"no image", "rgb", r"000000\.png is not an image"),
+        ("rgb/000000.png", None, "rgb", r"000000\.png is not a regular file"),
     ],
 )
 def test_an_image_that_does_not_fit_its_camera_is_named(tmp_path, name, content, part, said):
-    data = open_set(tmp_path / "set", BopExporter)
-    (data.folder / "train" / "000000" / name).write_bytes(content)
+    """Without content: a pipe, for which nobody waits."""
+    data = open_set(tmp_path / "set")
+    file = data.folder / "train" / "000000" / name
+    file.unlink()
+    os.mkfifo(file) if content is None else file.write_bytes(content)
     view = data[0].view(0)
     with pytest.raises(DatasetError, match=said):
         _ = view.layer(part) if part == "flow" else getattr(view, part)
-
-
-def test_a_pipe_in_place_of_an_image_does_not_hang(tmp_path):
-    data = open_set(tmp_path / "set", BopExporter)
-    path = data.folder / "train" / "000000" / "rgb" / "000000.png"
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(DatasetError, match=r"000000\.png is not a regular file"):
-        _ = data[0].view(0).rgb
 
 
 # ---- annotations ----
@@ -154,22 +148,13 @@ def test_a_pipe_in_place_of_an_image_does_not_hang(tmp_path):
     ],
 )
 def test_a_wrong_annotation_is_named_with_file_and_place(tmp_path, name, place, value, said):
-    data = open_set(tmp_path / "set", BopExporter)
+    data = open_set(tmp_path / "set")
     path = data.folder / "train" / "000000" / f"scene_{name}.json"
     path.write_text(json.dumps(replaced(json.loads(path.read_text()), (str(place[0]), *place[1:]), value)))
     view = data[0].view(0)
     with pytest.raises(DatasetError, match=said) as caught:
         _ = view.boxes, view.object_to_world
     assert str(caught.value).isprintable()
-
-
-def test_annotations_of_a_scene_are_checked_once(tmp_path, monkeypatch):
-    episode = open_set(tmp_path / "set", BopExporter)[0]
-    read: list[Path] = []
-    monkeypatch.setattr(view_files, "read_checked", lambda path, schema: read.append(path) or read_checked(path, schema))
-    for frame in (0, 1, 0):
-        assert len(episode.view(frame)) > 0
-    assert len(read) == 3
 
 
 DOCUMENTS = {
@@ -203,9 +188,9 @@ def test_changed_annotations_are_of_the_schema_or_named(name, spot, value):
     except ValueError:
         assert value == {}
         return
+    lengths = {"cam_K": 9, "cam_R_m2c": 9, "cam_t_m2c": 3, "bbox_obj": 4, "bbox_visib": 4}
     for record in [entry] if name == "camera" else entry:
-        lists = {"cam_K": 9, "cam_R_m2c": 9, "cam_t_m2c": 3, "bbox_obj": 4, "bbox_visib": 4}
-        assert all(len(record[key]) == length and np.isfinite(record[key]).all() for key, length in lists.items() if key in record)
+        assert all(len(record[key]) == length and np.isfinite(record[key]).all() for key, length in lengths.items() if key in record)
 
 
 # ---- shards ----
@@ -232,26 +217,25 @@ def lying(size: int) -> bytes:
     return member("000000_000000.gt.json", size).tobuf(tarfile.GNU_FORMAT)
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (tar((member("a", type=tarfile.SYMTYPE, linkname="/etc/passwd"), b"")), "has a member at byte 0 that is not a regular file"),
-        (tar((member("a", type=tarfile.LNKTYPE, linkname="b"), b"")), "not a regular file"),
-        (tar((member("a", type=tarfile.CHRTYPE), b"")), "not a regular file"),
-        (tar((member("a", type=tarfile.GNUTYPE_SPARSE), b"")), "not a regular file"),
-        (tar((member("ü" * 200), b""), form=tarfile.PAX_FORMAT), "not a regular file"),
-        (lying(2**60), "the member at byte 0 has 1073741824 GiB"),
-        (lying(10), "the member at byte 0 has 10 bytes"),
-        (lying(10)[:300], "truncated header"),
-        (b"x" * 512, "is damaged: "),
-        (tar((member("a", 5), b"12345"))[:514], "the member at byte 0 has 5 bytes"),
-    ],
-)
+ODD = ((tarfile.SYMTYPE, "/etc/passwd"), (tarfile.LNKTYPE, "b"), (tarfile.CHRTYPE, ""), (tarfile.GNUTYPE_SPARSE, ""))
+SHARDS = [(tar((member("a", type=kind, linkname=target), b"")), "has a member at byte 0 that is not a regular") for kind, target in ODD]
+SHARDS += [
+    (tar((member("ü" * 200), b""), form=tarfile.PAX_FORMAT), "not a regular file"),
+    ((member("pax", 13, type=tarfile.XHDTYPE).tobuf() + b"12 path=abcd\n".ljust(512, b"\0")) * 5000, "not a regular file"),
+    (lying(2**60), "the member at byte 0 has 1073741824 GiB"),
+    (lying(10), "the member at byte 0 has 10 bytes"),
+    (lying(10)[:300], "truncated header"),
+    (b"x" * 512, "is damaged: "),
+    (tar((member("a", 5), b"12345"))[:514], "the member at byte 0 has 5 bytes"),
+]
+
+
+@pytest.mark.parametrize(("content", "said"), SHARDS)
 def test_a_hostile_shard_is_named(tmp_path, content, said):
     path = tmp_path / "shard-000000.tar"
     path.write_bytes(content)
     with pytest.raises(DatasetError, match=said) as caught:
-        list_members(path)
+        key_lines(path)
     assert str(caught.value).isprintable()
 
 
@@ -299,3 +283,196 @@ def test_run_lengths_that_do_not_fill_the_image_are_named(tmp_path, masks, said)
     path.write_bytes(tar((member("000000_000000.mask.json", len(data)), data)))
     with pytest.raises(DatasetError, match=said):
         SceneShards([path], 0, SIZE).masks("mask", 0, 1)
+
+
+# ---- zarr arrays ----
+
+HUGE = 2**26
+BLOCK = 2**17
+"""Largest block of a Zstandard frame [bytes]."""
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    return trajectories.write_set(tmp_path_factory.mktemp("arrays") / "set", trajectories.config(), (0,), 3)
+
+
+@pytest.fixture
+def store(written, tmp_path) -> Path:
+    return Path(shutil.copytree(written, tmp_path / "set"))
+
+
+def repeated_byte(size: int, header: bytes = b"\x00\x58") -> bytes:
+    """Zstandard frame of `size` equal bytes in 4 bytes a block; `header`: descriptor, window, and content size if it is to state one."""
+    counts = [BLOCK] * (size // BLOCK) + [size % BLOCK] * (size % BLOCK > 0)
+    blocks = (((count << 3) | 2 | (index == len(counts) - 1)).to_bytes(3, "little") + b"A" for index, count in enumerate(counts))
+    return b"\x28\xb5\x2f\xfd" + header + b"".join(blocks)
+
+
+FRAMES = {
+    "stated": (numcodecs.zstd.compress(bytes(2**26), 3), "holds 67,108,864 bytes instead of"),
+    "not stated": (repeated_byte(HUGE), "too small"),
+    "stated wrongly": (b"SIZE", "too small"),
+    "stated, impossible": (repeated_byte(8, b"\xc0\x58" + struct.pack("<Q", 2**62)), "holds 4,611,686,018,427,387,904 bytes"),
+    "too short": (numcodecs.zstd.compress(bytes(8), 3), "holds 8 bytes instead of"),
+    "too short, not stated": (repeated_byte(8), "expected to decompress"),
+    "none": (b"no frame", "invalid"),
+}
+
+
+@pytest.mark.parametrize("sharded", [False, True])
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_chunk_that_holds_more_or_less_than_its_place_is_not_decompressed(store, name, sharded):
+    array = store / "trajectory.zarr/episodes/000000/steps/pose"
+    metadata = json.loads((array / "zarr.json").read_text())
+    shard = metadata["codecs"][0]["configuration"]
+    shard["index_codecs"] = shard["index_codecs"][:1]
+    shard["chunk_shape"] = metadata["chunk_grid"]["configuration"]["chunk_shape"] = metadata["shape"]
+    frame, said = FRAMES[name]
+    if frame == b"SIZE":
+        frame = repeated_byte(HUGE, b"\xc0\x58" + struct.pack("<Q", 4 * int(np.prod(metadata["shape"]))))
+    if not sharded:
+        metadata["codecs"] = shard["codecs"]
+    (array / "zarr.json").write_text(json.dumps(metadata))
+    index = struct.pack("<QQ", 0, len(frame)) if sharded else b""
+    (array / "c.0.0.0").write_bytes(frame + index)
+    with pytest.raises(DatasetError, match=said):
+        _ = synpick_warp.open(store)[0].steps["pose"][...]
+
+
+def layout(shape: list[int], *chunks: list[int], dtype: str = "float32") -> ArrayMetadata:
+    """Metadata of an array with these chunk shapes, from the files down."""
+    codecs: list[dict] = [{"name": "bytes"}, {"name": "zstd"}]
+    for chunk in reversed(chunks[1:]):
+        codecs = [{"name": "sharding_indexed", "configuration": {"chunk_shape": chunk, "codecs": codecs}}]
+    grid = {"name": "regular", "configuration": {"chunk_shape": chunks[0]}}
+    content = {"zarr_format": 3, "node_type": "array", "shape": shape, "data_type": dtype, "chunk_grid": grid, "codecs": codecs}
+    return msgspec.convert(content, ArrayMetadata)
+
+
+MOVED = [99, 24, 7]
+LAYOUTS = [
+    (layout(MOVED, [33792, 24, 7], [528, 24, 7]), 400, "larger than its 99 x 24 x 7"),
+    (layout(MOVED, [528, 24, 7], [528, 24, 7]), 400, ""),
+    (layout(MOVED, [4_096_000, 24, 7], [4_096_000, 24, 7]), 400, ""),
+    (layout(MOVED, [4_096_001, 24, 7]), 400, "larger than its"),
+    (layout(MOVED, [99, 24, 8]), 400, "larger than its"),
+    (layout(MOVED, [99, 24]), 400, "chunks of another shape"),
+    (layout(MOVED, [1, 24, 7]), 400, ""),
+    (layout(MOVED, MOVED, [1, 1, 1]), 400, "16,632 chunks for 99 rows"),
+    (layout([99, 252, 7], [99, 252, 7]), 400, "252 as instance"),
+    (layout([990_000, 24, 7], [528, 24, 7]), 400, "990,000 steps, more than the 400 bytes of their times"),
+    (layout([990_000, 24, 7], [528, 24, 7]), 200_000, ""),
+    # Arrays of others have no specification.
+    (layout([1000, 100], [1000, 100]), None, ""),
+    (layout([100_000_000], [1000]), None, "states 100,000,000 as dimension 0"),
+]
+
+
+@pytest.mark.parametrize(("metadata", "times", "said"), LAYOUTS)
+def test_a_layout_fits_the_shape_and_what_is_stored(tmp_path, metadata, times, said):
+    for name in ("pose", "time"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "time" / "c.0").write_bytes(bytes(times or 0))
+    sizes = {"step": metadata.shape[0], "tick": 30_000} if times else {}
+    with pytest.raises(DatasetError, match=said) if said else nullcontext():
+        assert check_layout(tmp_path / "pose", metadata, STEPS.arrays["pose"] if times else None, sizes) < 2**33
+
+
+def test_a_chunk_file_is_no_larger_than_its_chunk(store):
+    """A file with a hole of gigabytes would be read whole."""
+    [chunk] = (store / "trajectory.zarr/objects/mass").glob("c.*")
+    with chunk.open("r+b") as stream:
+        stream.truncate(2**33)
+    with pytest.raises(DatasetError, match=r"c\.0 is larger than"):
+        _ = synpick_warp.open(store).objects
+
+
+def change(path: Path, place: tuple[object, ...], value: object) -> None:
+    path.write_text(json.dumps(replaced(json.loads(path.read_text()), place, value)))
+
+
+POSE = "steps/pose"
+METADATA = [
+    (POSE, ("shape", 0), 10**12, "is float32 of shape .*; expected: float32 of shape 12 x instance x 7"),
+    (POSE, ("shape",), [12], "is float32 of shape 12; expected"),
+    (POSE, ("shape", 1), 2**39, "more than its .* can hold"),
+    (POSE, ("data_type",), "float64", "is float64 of shape .*; expected: float32"),
+    (POSE, ("data_type",), "null_terminated_bytes", "invalid enum value"),
+    (POSE, ("codecs", 0, "name"), "pickle", "invalid enum value 'pickle'"),
+    (POSE, ("codecs", 0, "configuration", "chunk_shape", 0), 7, "cannot be read: "),
+    (POSE, ("codecs", 0, "configuration"), None, "cannot be read: "),
+    (POSE, ("chunk_grid", "configuration", "chunk_shape", 0), 0, "expected int >= 1"),
+    (POSE, ("fill_value",), "x", "cannot be read: "),
+    (POSE, ("chunk_grid", "configuration", "chunk_shape", 1), 2**33, "larger than its"),
+    (POSE, ("chunk_grid", "configuration", "chunk_shape", 0), 2**33, "larger than its"),
+    (POSE, ("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "larger than its"),
+    (POSE, ("codecs", 0, "configuration", "chunk_shape"), [2, 2], "chunks of another shape"),
+    (POSE, ("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "invalid enum value 'pickle'"),
+    (POSE, ("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "invalid enum value 'zstd'"),
+    ("attempts/record", ("shape", 0), 2**30, "states"),
+    ("attempts/frame", ("shape", 0), 2**30, "states"),
+    ("attempts/peak_force", ("shape", 1), 2**30, "states"),
+    ("ticks/pose", ("shape", 1), 2**30, "states"),
+]
+
+
+@pytest.mark.parametrize(("array", "place", "value", "said"), METADATA)
+def test_metadata_of_an_array_that_do_not_fit_are_named(store, array, place, value, said):
+    change(store / "trajectory.zarr/episodes/000000" / array / "zarr.json", place, value)
+    (group, name), episode = array.split("/"), synpick_warp.open(store)[0]
+    with pytest.raises(DatasetError, match=said) as caught:
+        _ = {"steps": episode.steps, "ticks": episode.ticks, "attempts": episode.attempt_arrays}[group][name][...]
+    assert str(caught.value).isprintable()
+
+
+def test_a_damaged_chunk_is_named_and_a_wrong_index_is_an_index_error(store):
+    array = store / "trajectory.zarr/episodes/000000/steps/pose"
+    [chunk] = [path for path in array.iterdir() if path.name != "zarr.json"]
+    steps = synpick_warp.open(store)[0].steps
+    with pytest.raises(IndexError):
+        _ = steps["pose"][10**6]
+    chunk.write_bytes(chunk.read_bytes()[:50])
+    for read in (lambda pose: pose[...], lambda pose: pose[0, 0], np.asarray, lambda pose: pose.oindex[[0]]):
+        with pytest.raises(DatasetError, match=r"the array .*/steps/pose cannot be read: .*; restore the file"):
+            read(steps["pose"])
+    chunk.unlink()
+    os.mkfifo(chunk)
+    with pytest.raises(DatasetError, match="is not a regular file"):
+        _ = steps["pose"]
+
+
+def test_a_chunk_that_the_manifest_lists_must_be_there(store):
+    """Zarr reads a missing chunk as NaN or 0."""
+    (store / "manifest").mkdir(exist_ok=True)
+    array = store / "trajectory.zarr/objects/mass"
+    lines = "".join(f"{'0' * 64}  {path.relative_to(store)}\n" for path in sorted(array.iterdir()))
+    write_entry(store, lines)
+    assert len(synpick_warp.open(store).objects) > 0
+    (array / "c.0").unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*objects/mass/c\.0, which the manifest lists"):
+        _ = synpick_warp.open(store).objects
+    write_entry(store, f"{'0' * 64}  trajectory.zarr/../../outside\n")
+    with pytest.raises(DatasetError, match=r"constants\.sha256, line 1, names the file"):
+        _ = synpick_warp.open(store).objects
+
+
+def write_entry(store: Path, lines: str) -> None:
+    """Write the manifest entry of the constants."""
+    content = {"files": lines.count("\n"), "checksum": hashlib.sha256(lines.encode()).hexdigest(), "bytes": 0}
+    (store / f"{CONSTANTS}.sha256").write_text(lines)
+    (store / f"{CONSTANTS}.json").write_bytes(encode_manifest(content))
+
+
+def test_tables_whose_lengths_differ_are_named(store):
+    wrong = {"expected: .* of shape 1": ["one"], r"zarr\.json is damaged: expected array, got int - at \$\.names": 3}
+    for said, names in wrong.items():
+        change(store / "trajectory.zarr/objects/zarr.json", ("attributes", "names"), names)
+        with pytest.raises(DatasetError, match=said):
+            _ = synpick_warp.open(store).objects
+
+
+def test_folders_with_other_names_are_no_episodes(store):
+    for name in ("12abc", "0", "000²", "notes"):
+        (store / "trajectory.zarr" / "episodes" / name).mkdir()
+    assert list(synpick_warp.open(store)) == [0]

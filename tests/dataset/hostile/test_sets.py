@@ -1,4 +1,5 @@
-"""Hostile data sets: edited, damaged or made by somebody else; resume, verify and merge neither read, write nor remove outside of them."""
+"""Hostile data sets: edited, damaged or made by somebody else; resume, verify and merge neither read, write nor remove outside of them. By
+known faults, and by fuzz: any record, checksum list, scene or shard ends in one line."""
 
 from __future__ import annotations
 
@@ -8,25 +9,48 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
 
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums
+from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums, read_entry
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
-from synpick_warp.errors import DatasetError, OutputError, SynpickError
+from synpick_warp.errors import OutputError, SynpickError
+from synpick_warp.exporters.bop.shards.tar_files import list_keys
+from synpick_warp.exporters.bop.shared import targets
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
-from synpick_warp.exporters.writing.checksums import checksum, parse_checksums
 from synpick_warp.exporters.writing.files import check_output_folder
-from tests.harness.scripted_bake import bake, make_victim, small_settings, snapshot
+from synpick_warp.factory.episodes import BakeSummary
+from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import LEAVES, WHOLE, hostile_contents, places, replaced
+from tests.harness.scripted_bake import ATTEMPT, bake, make_victim, small_settings, snapshot
 
-pytestmark = pytest.mark.usefixtures("inline")
 CONFIG = small_settings()
 SECONDS = 5.0
 """Longest time of a command on a hostile data set."""
+COMMANDS: dict[str, Callable[[Path, Path], object]] = {
+    "verify": lambda data_set, _: verify(data_set),
+    "merge": lambda data_set, out: merge([data_set], out),
+    "bake": lambda data_set, _: bake(data_set, CONFIG),
+}
+RECORDS = (
+    "manifest.json",
+    *(f"manifest/{name}.{kind}" for name in ("constants", "000000", "000001", "joined") for kind in ("json", "sha256")),
+)
+
+
+@pytest.fixture(scope="module")
+def ready(tmp_path_factory) -> Path:
+    """A finished data set."""
+    bake(out := tmp_path_factory.mktemp("ready") / "set", CONFIG)
+    return out
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +76,12 @@ def relist(data_set: Path, entry: str, lines: str) -> None:
     path.write_text(json.dumps(content) + "\n")
 
 
+def uncommit(data_set: Path, episode: int) -> None:
+    """Remove an episode's entry and list, so that a resumed bake makes it again."""
+    for suffix in (".json", ".sha256"):
+        (data_set / f"{episode_entry(episode)}{suffix}").unlink()
+
+
 def refused(command: Callable[[], object], said: str = "") -> None:
     """The command ends at once with an error of one line."""
     started = time.monotonic()
@@ -61,13 +91,24 @@ def refused(command: Callable[[], object], said: str = "") -> None:
     assert str(caught.value).isprintable()
 
 
+@contextmanager
+def fine_or_one_line(case: str = "", advice: str = "") -> Iterator[list[Exception]]:
+    """What is within succeeds, or ends with an error of one line that has this advice; collects the error."""
+    errors: list[Exception] = []
+    try:
+        yield errors
+    except SynpickError as error:
+        errors.append(error)
+        assert str(error).isprintable(), case  # noqa: PT017
+        assert advice in str(error), case  # noqa: PT017
+
+
 # ---- removal ----
 
 
 def test_an_edited_list_of_indices_removes_nothing_outside_of_the_set(copied, ready):
     before = snapshot(copied.parent / "victim")
-    for suffix in (".json", ".sha256"):
-        (copied / "manifest" / f"000001{suffix}").unlink()
+    uncommit(copied, 1)
     relist(copied, "joined", f"{64 * '0'}  ../victim\n")
     bake(copied, CONFIG)
     assert snapshot(copied.parent / "victim") == before
@@ -80,8 +121,7 @@ def test_an_edited_list_of_constants_removes_nothing_that_the_program_did_not_wr
     out = tmp_path / "set"
     bake(out, CONFIG, stop_after=1)
     (out / "notes.txt").write_text("mine")
-    for suffix in (".json", ".sha256"):
-        (out / "manifest" / f"000000{suffix}").unlink()
+    uncommit(out, 0)
     relist(out, "constants", f"{64 * '0'}  {name}\n")
     before = snapshot(victim)
     bake(out, CONFIG, stop_after=0)
@@ -108,12 +148,13 @@ def test_a_link_in_place_of_a_new_file_is_not_followed(copied):
     assert (copied.parent / "victim" / "thesis.txt").read_text() == "ten years"
 
 
-def test_hidden_files_in_the_output_folder_are_never_touched(tmp_path):
+def test_a_bake_without_an_episode_removes_what_it_wrote_and_no_hidden_file(tmp_path):
     (tmp_path / ".git" / "empty").mkdir(parents=True)
     (tmp_path / ".git" / "HEAD").write_text("ref")
     before = snapshot(tmp_path)
-    bake(tmp_path, CONFIG, stop_after=0)
-    assert snapshot(tmp_path) == before
+    for out in (tmp_path, tmp_path / "new" / "set"):
+        bake(out, CONFIG, stop_after=0)
+        assert snapshot(tmp_path) == before
 
 
 def test_a_staging_folder_without_a_manifest_is_refused(tmp_path):
@@ -130,19 +171,13 @@ def test_files_and_empty_folders_of_the_user_in_a_data_set_stay(tmp_path):
     bake(out, CONFIG, stop_after=1)
     (out / "mine" / "empty").mkdir(parents=True)
     (out / "train" / "notes").mkdir()
-    for suffix in (".json", ".sha256"):
-        (out / "manifest" / f"000000{suffix}").unlink()
+    uncommit(out, 0)
     bake(out, CONFIG, stop_after=0)
     assert (out / "mine" / "empty").is_dir()
     assert (out / "train" / "notes").is_dir()
     bake(out, CONFIG)
     assert verify(out).finished
     assert (out / "mine" / "empty").is_dir()
-
-
-def test_a_bake_without_an_episode_removes_all_that_it_wrote(tmp_path):
-    bake(tmp_path / "new" / "set", CONFIG, stop_after=0)
-    assert not (tmp_path / "new").exists()
 
 
 def test_the_names_that_formats_declare_are_those_that_they_write(ready):
@@ -186,8 +221,7 @@ def test_the_advice_about_a_truncated_record_works(copied, ready):
     path = copied / f"{episode_entry(1)}.json"
     path.write_bytes(path.read_bytes()[:40])
     refused(lambda: bake(copied, CONFIG), r"remove manifest/000001\.json and manifest/000001\.sha256, and resume the bake")
-    path.unlink()
-    path.with_suffix(".sha256").unlink()
+    uncommit(copied, 1)
     bake(copied, CONFIG)
     assert snapshot(copied) == snapshot(ready)
 
@@ -196,8 +230,8 @@ def test_the_advice_about_a_truncated_record_works(copied, ready):
 def test_a_changed_seed_in_the_manifest_is_refused(copied, seed):
     path = copied / "manifest.json"
     path.write_text(json.dumps(json.loads(path.read_bytes()) | {"seed": seed}, indent=2) + "\n")
-    for command in (lambda: verify(copied), lambda: bake(copied, CONFIG), lambda: merge([copied], copied.parent / "merged")):
-        refused(command, "seed")
+    for command in COMMANDS.values():
+        refused(lambda command=command: command(copied, copied.parent / "merged"), "seed")
 
 
 def test_a_planned_number_of_episodes_that_is_absurd_does_not_hang(copied, ready):
@@ -207,50 +241,6 @@ def test_a_planned_number_of_episodes_that_is_absurd_does_not_hang(copied, ready
     (copied / "manifest" / "000001.json").unlink()
     bake(copied, CONFIG)
     assert snapshot(copied) == snapshot(ready)
-
-
-# ---- checksum lists ----
-
-
-@pytest.mark.parametrize("line", ["x", f"{64 * '0'} *train", f"{64 * 'g'}  a", f"{63 * '0'}  a", f"{64 * '0'}  ", f"{64 * '0'}  a\n", "\n"])
-def test_lines_that_are_no_digest_and_name(tmp_path, line):
-    with pytest.raises(DatasetError, match=r"LIST, line \d, is damaged: it is not a SHA-256 and a name; ADVICE"):
-        parse_checksums(f"{64 * '1'}  b\n{line}\n".encode(), tmp_path, Path("LIST"), "ADVICE")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../x",
-        "/x",
-        "a/../../x",
-        "out/x",
-        "a/..",
-        ".",
-        "a//b",
-        "a/./b",
-        "b",
-        "manifest.json",
-        "manifest/000000.json",
-        ".partial/x",
-        "a\x1bb",
-    ],
-)
-def test_names_that_no_list_has(tmp_path, name):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "out").symlink_to(tmp_path)
-    with pytest.raises(DatasetError, match="LIST, line 2,"):
-        parse_checksums(f"{64 * '1'}  b\n{64 * '0'}  {name}\n".encode(), tmp_path / "in", Path("LIST"), "ADVICE")
-
-
-def test_files_that_are_links_have_no_checksum(tmp_path):
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "link").symlink_to("file")
-    assert checksum(tmp_path / "file") == hashlib.sha256(b"x").hexdigest()
-    with pytest.raises(OSError, match="it is a symbolic link"):
-        checksum(tmp_path / "link")
-    with pytest.raises(OSError, match="it is not a regular file"):
-        checksum(tmp_path)
 
 
 # ---- merge ----
@@ -311,13 +301,145 @@ def test_merged_parts_are_what_one_bake_writes(parts, ready, tmp_path):
     assert snapshot(tmp_path / "merged") == snapshot(ready)
 
 
-# ---- lists over scenes ----
+# ---- fuzz ----
 
 
-def test_foreign_names_among_scenes_and_shards_are_no_scenes(copied, ready):
-    (copied / "manifest" / "joined.json").unlink()
-    for folder, name in (("train", "notes"), ("train_web", "shard-x.tar")):
-        (copied / folder / name).mkdir()
-    bake(copied, CONFIG)
-    for name in ("test_targets_bop19.json", "train_web/key_to_shard.json"):
-        assert (copied / name).read_bytes() == (ready / name).read_bytes()
+@examples(max_examples=fuzz_examples(100), deadline=None)
+@given(st.data())
+def test_damaged_scenes_are_one_line_or_targets(ready, tmp_path_factory, data):
+    scene = tmp_path_factory.mktemp("scene") / "000000"
+    scene.mkdir()
+    places = str(scene.parent / targets.BOP19), str(scene.parent / targets.BOP24)
+    for place in places:
+        Path(place).mkdir()
+    for name in ("scene_gt.json", "scene_gt_info.json"):
+        shutil.copy(ready / "train" / "000000" / name, scene)
+    path = scene / data.draw(st.sampled_from(["scene_gt.json", "scene_gt_info.json"]))
+    path.write_bytes(draw_hostile(data, path.read_bytes()))
+    with fine_or_one_line():
+        targets.write_scene_targets(scene, places, 0.1)
+
+
+@examples(max_examples=fuzz_examples(100), deadline=None)
+@given(st.data())
+def test_damaged_shards_are_one_line_or_keys(ready, tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("shard")
+    content = bytearray((ready / "train_web" / "shard-000000.tar").read_bytes()[:20_000])
+    for _ in range(data.draw(st.integers(0, 8))):
+        content[512 * data.draw(st.integers(0, 2)) + data.draw(st.integers(0, 511))] = data.draw(st.integers(0, 255))
+    shard = folder / "shard-000000.tar"
+    shard.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    (folder / "keys").mkdir()
+    with fine_or_one_line():
+        list_keys(shard, folder / "keys")
+
+
+def draw_hostile(data: st.DataObject, content: bytes) -> bytes:
+    """A hostile replacement of a JSON file, or of a checksum list."""
+    if data.draw(st.booleans()) or not content.startswith(b"{"):
+        whole = [*WHOLE.values(), content[: data.draw(st.integers(0, len(content)))]]
+        return data.draw(st.sampled_from(whole))
+    document = json.loads(content)
+    place = data.draw(st.sampled_from(list(places(document))))
+    return json.dumps(replaced(document, place, data.draw(st.sampled_from([*LEAVES, float("nan")])))).encode()
+
+
+def fix_digests(data_set: Path) -> None:
+    """Let entries fit their lists again, and the manifest its settings, where they are readable: somebody edits with care."""
+    unreadable = suppress(ValueError, KeyError, TypeError, RecursionError, OSError)
+    path = data_set / "manifest.json"
+    with unreadable:
+        content = json.loads(path.read_bytes())
+        settings_ = json.dumps(content["settings"], sort_keys=True).encode()
+        path.write_text(json.dumps(content | {"settings_checksum": hashlib.sha256(settings_).hexdigest()}))
+    for entry in (data_set / "manifest").glob("*.json"):
+        with unreadable:
+            content = json.loads(entry.read_bytes())
+            digest = hashlib.sha256(entry.with_suffix(".sha256").read_bytes()).hexdigest()
+            entry.write_text(json.dumps(content | {"checksum": digest}))
+
+
+@examples(max_examples=fuzz_examples(50), deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.data())
+@pytest.mark.slow
+def test_resume_verify_and_merge_of_hostile_sets_end_in_one_line_and_stay_inside(ready, tmp_path_factory, data):
+    root = tmp_path_factory.mktemp("hostile")
+    victim = make_victim(root)
+    data_set = root / "set"
+    shutil.copytree(ready, data_set)
+    for name in data.draw(st.lists(st.sampled_from(RECORDS), min_size=1, max_size=2, unique=True)):
+        path = data_set / name
+        kind = data.draw(st.sampled_from(["replace", "replace", "remove", "link", "names"]))
+        if kind == "replace":
+            path.write_bytes(draw_hostile(data, path.read_bytes()))
+        elif kind == "names" and name.endswith(".sha256"):
+            names = ["../victim", "../victim/thesis.txt", "/etc/hostname", "train/../../victim", "train", "train/000000", "out/victim", "."]
+            line = f"{64 * '0'}  {data.draw(st.sampled_from(names))}\n"
+            path.write_text(line + (path.read_text() if data.draw(st.booleans()) else ""))
+        else:
+            path.unlink()
+            if kind == "link":
+                path.symlink_to(victim / "thesis.txt")
+    if data.draw(st.booleans()):
+        (data_set / "out").symlink_to("..")
+    if data.draw(st.booleans()):
+        fix_digests(data_set)
+    before, outside = snapshot(victim), sorted(os.listdir(root))
+    for command in ("verify", "merge", "bake", "verify"):
+        started = time.monotonic()
+        with fine_or_one_line():
+            COMMANDS[command](data_set, root / "merged")
+        assert time.monotonic() - started < 10 * SECONDS
+    assert snapshot(victim) == before
+    assert sorted(set(os.listdir(root)) - {"merged"}) == outside
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="module")
+def entry(ready) -> bytes:
+    return (ready / f"{episode_entry(0)}.json").read_bytes()
+
+
+def test_every_hostile_copy_of_a_record_is_refused_in_one_line_or_valid(entry, tmp_path):
+    (tmp_path / "manifest").mkdir()
+    path = tmp_path / f"{episode_entry(0)}.json"
+    refusals: list[Exception] = []
+    for description, content in hostile_contents(entry):
+        path.write_bytes(content)
+        with fine_or_one_line(description, "; remove manifest/000000.json and manifest/000000.sha256, and resume") as errors:
+            check_entry(tmp_path)
+        refusals += errors
+    assert len(refusals) > 500
+
+
+@examples(max_examples=fuzz_examples(200), deadline=None)
+@given(st.data())
+def test_attempts_of_any_content_are_refused_in_one_line_or_valid(entry, tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp() / "attempts"
+    (folder / "manifest").mkdir(parents=True, exist_ok=True)
+    attempt = ATTEMPT | {"episode": 0}
+    json_values = st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda children: st.lists(children, max_size=3) | st.dictionaries(st.text(max_size=5), children, max_size=3),
+        max_leaves=6,
+    )
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.sampled_from(list(places(attempt))))
+        value = data.draw(st.sampled_from(LEAVES) | json_values)
+        try:
+            attempt = replaced(attempt, place, value)
+        except (KeyError, IndexError, TypeError):
+            continue  # An earlier value took the place away.
+    content = json.loads(entry) | {"attempts": [attempt]}
+    (folder / f"{episode_entry(0)}.json").write_text(json.dumps(content))
+    with fine_or_one_line():
+        check_entry(folder)
+
+
+def check_entry(folder: Path) -> None:
+    """Read an entry as a resumed bake does."""
+    content = read_entry(folder, episode_entry(0))
+    assert content is not None
+    BakeSummary().take_record(content)
+    for row in ({**content["row"], "checksum": content["checksum"]}, *content["attempts"]):
+        assert json.loads(json.dumps(row, allow_nan=False)) == row
