@@ -1,22 +1,27 @@
-"""BOP writer: data sets written by the real pool from views of boxes, read back with OpenCV and json."""
+"""BOP writer: data sets written by the real pool from views of boxes, read back with OpenCV and json. Multisensor layout: one scene per
+episode whose files equal those of the classic layout. Of both, bop_dataset_params.py, run on a stand-in for the toolkit's module."""
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import json
 import os
-import re
+import runpy
 import shutil
 import signal
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import ClassVar
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
+import synpick_warp
+from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.configs.cell.sensors import Effects
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, OutputError
@@ -28,13 +33,11 @@ from synpick_warp.exporters.writing.files import open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
-from tests.exporters.writing.test_rle import decode
-from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
-from tests.twins.masks import masks_of_batch
-from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, poses
+from tests.harness.exporter_contract import FRAMES, ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
+from tests.worlds import box_views
+from tests.worlds.box_sets import EPISODES, write_set
+from tests.worlds.box_views import SIZES, batches, cameras, catalog, config, poses
 
-EPISODES = (0, 2)
-FRAMES = 3
 LENSES = cameras()
 VIEW = next(batches(1, (0,), 1, LENSES))
 
@@ -68,51 +71,23 @@ def split(dataset) -> Path:
     return dataset / "train_pbr"
 
 
+FOLDERS = {"rgb", "depth", "mask", "mask_visib"}
+RECORDS = {"scene_camera.json", "scene_gt.json", "scene_gt_info.json"}
+
+
 def test_folder_tree_is_exactly_bops(dataset, split):
-    assert {path.name for path in dataset.iterdir()} == {
-        "bop_dataset_params.py",
-        "camera.json",
-        "dataset_info.md",
-        "models",
-        "models_eval",
-        "test_targets_bop19.json",
-        "test_targets_bop24.json",
-        "train_pbr",
-    }
+    targets = {"test_targets_bop19.json", "test_targets_bop24.json"}
+    names = {"bop_dataset_params.py", "camera.json", "dataset_info.md", "models", "models_eval", "train_pbr"}
+    assert {path.name for path in dataset.iterdir()} == names | targets
     assert {path.name for path in split.iterdir()} == {f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)}
+    frames = [f"{frame:06d}" for frame in range(FRAMES)]
+    masks = {f"{name}_{index:06d}.png" for name in frames for index in range(3)}
+    files = {"rgb": {f"{name}.jpg" for name in frames}, "depth": {f"{name}.png" for name in frames}, "mask": masks, "mask_visib": masks}
     for scene in split.iterdir():
-        assert {path.name for path in scene.iterdir()} == {
-            "rgb",
-            "depth",
-            "mask",
-            "mask_visib",
-            "scene_camera.json",
-            "scene_gt.json",
-            "scene_gt_info.json",
-            "scene_gt_coco.json",
-        }
-        names = [f"{frame:06d}" for frame in range(FRAMES)]
-        masks = {f"{name}_{index:06d}.png" for name in names for index in range(3)}
-        assert {path.name for path in (scene / "rgb").iterdir()} == {f"{name}.jpg" for name in names}
-        assert {path.name for path in (scene / "depth").iterdir()} == {f"{name}.png" for name in names}
-        assert {path.name for path in (scene / "mask").iterdir()} == masks
-        assert {path.name for path in (scene / "mask_visib").iterdir()} == masks
-
-
-def test_images_and_masks_read_back(split):
-    for batch, scene, frame in rows():
-        depth = cv2.imread(str(split / scene / "depth" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
-        assert depth.dtype == np.uint16
-        np.testing.assert_array_equal(depth, batch.depth[0])
-        color = cv2.imread(str(split / scene / "rgb" / f"{frame:06d}.jpg"))[..., ::-1]
-        assert np.median(np.abs(color.astype(int) - batch.color[0])) <= 3
-        for index, instance in enumerate(np.flatnonzero(OBJECT_IDS >= 0)):
-            name = f"{frame:06d}_{index:06d}.png"
-            amodal = cv2.imread(str(split / scene / "mask" / name), cv2.IMREAD_UNCHANGED)
-            visible = cv2.imread(str(split / scene / "mask_visib" / name), cv2.IMREAD_UNCHANGED)
-            assert amodal.dtype == visible.dtype == np.uint8
-            np.testing.assert_array_equal(amodal, np.where(masks_of_batch(batch)[instance], 255, 0))
-            np.testing.assert_array_equal(visible, np.where(batch.instance[0] == 1 + instance, 255, 0))
+        assert {path.name for path in scene.iterdir()} == FOLDERS | RECORDS | {"scene_gt_coco.json"}
+        assert {name: {path.name for path in (scene / name).iterdir()} for name in FOLDERS} == files
+    record = {"width": 96, "height": 72, "fx": 288.0, "fy": 288.0, "cx": 48.0, "cy": 36.0, "depth_scale": 0.1}
+    assert load(dataset / "camera.json") == record
 
 
 def test_cameras_and_model_to_camera_poses_in_millimetres(split):
@@ -138,52 +113,6 @@ def test_cameras_and_model_to_camera_poses_in_millimetres(split):
             np.testing.assert_allclose(transformed, expected, rtol=0, atol=1e-9)
 
 
-def test_counts_and_boxes(split):
-    for batch, scene, frame in rows():
-        infos = load(split / scene / "scene_gt_info.json")[str(frame)]
-        assert len(infos) == 3
-        for info, instance in zip(infos, np.flatnonzero(OBJECT_IDS >= 0), strict=True):
-            total, valid, visible = batch.pixels[0, instance].tolist()
-            assert (info["px_count_all"], info["px_count_valid"], info["px_count_visib"]) == (total, valid, visible)
-            assert info["visib_fract"] == visible / total
-            ys, xs = np.nonzero(batch.instance[0] == 1 + instance)
-            if visible:
-                assert info["bbox_visib"] == [xs.min(), ys.min(), np.ptp(xs), np.ptp(ys)]
-                x_min, y_min, x_max, y_max = batch.boxes[0, instance, 0].tolist()
-                assert info["bbox_obj"] == [x_min, y_min, x_max - x_min, y_max - y_min]
-            else:
-                assert info["bbox_visib"] == info["bbox_obj"] == [-1, -1, -1, -1]
-
-
-def test_views_cover_clipped_and_occluded_objects(split):
-    """One object is clipped by the left border, another is partly hidden."""
-    infos = [info for scene in split.iterdir() for view in load(scene / "scene_gt_info.json").values() for info in view]
-    assert any(info["bbox_obj"][0] < 0 and info["px_count_visib"] for info in infos)
-    assert any(0 < info["visib_fract"] < 0.9 and info["bbox_obj"][0] >= 0 for info in infos)
-
-
-def test_coco_masks_and_boxes(split):
-    for scene in split.iterdir():
-        coco = load(scene / "scene_gt_coco.json")
-        assert coco["categories"] == [{"id": obj_id, "name": f"box {obj_id}", "supercategory": "synpick"} for obj_id in SIZES]
-        assert [image["file_name"] for image in coco["images"]] == [f"rgb/{frame:06d}.jpg" for frame in range(FRAMES)]
-        assert [annotation["id"] for annotation in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
-        expected = []
-        for frame, infos in load(scene / "scene_gt_info.json").items():
-            for index, (info, record) in enumerate(zip(infos, load(scene / "scene_gt.json")[frame], strict=True)):
-                name = f"{int(frame):06d}_{index:06d}.png"
-                amodal, visible = (cv2.imread(str(scene / one / name), cv2.IMREAD_UNCHANGED) > 0 for one in ("mask", "mask_visib"))
-                if visible.any():
-                    expected.append((int(frame), record["obj_id"], amodal, visible, info))
-        assert len(expected) == len(coco["annotations"])
-        for annotation, (frame, obj_id, amodal, visible, info) in zip(coco["annotations"], expected, strict=True):
-            assert (annotation["image_id"], annotation["category_id"], annotation["area"]) == (frame, obj_id, visible.sum())
-            ys, xs = np.nonzero(amodal)
-            assert annotation["bbox"] == [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
-            assert annotation["ignore"] == (info["visib_fract"] < 0.1)
-            np.testing.assert_array_equal(decode(annotation["segmentation"]["counts"], *annotation["segmentation"]["size"]), visible)
-
-
 def test_targets_count_visible_instances(dataset, split):
     detect, localize = (load(dataset / f"test_targets_bop{year}.json") for year in (24, 19))
     views = [(int(scene.name), frame) for scene in sorted(split.iterdir()) for frame in range(FRAMES)]
@@ -200,20 +129,12 @@ def test_targets_count_visible_instances(dataset, split):
     assert {target["inst_count"] for target in localize} == {1, 2}
 
 
-def test_camera_file(dataset):
-    record = {"width": 96, "height": 72, "fx": 288.0, "fy": 288.0, "cx": 48.0, "cy": 36.0, "depth_scale": 0.1}
-    assert load(dataset / "camera.json") == record
-
-
 @pytest.mark.parametrize("folder", ["models", "models_eval"])
 def test_models_are_toolkit_compatible_ply_in_millimetres(dataset, folder):
     infos = load(dataset / folder / "models_info.json")
     for obj_id, size in SIZES.items():
-        path = dataset / folder / f"obj_{obj_id:06d}.ply"
-        np.testing.assert_allclose(trimesh.load(path, process=False).extents, 1000 * np.array(size), rtol=1e-6)
-        header = path.read_bytes().split(b"end_header")[0].decode()
-        assert set(re.findall(r"property (?:list )?(\w+)", header)) <= {"float", "uchar", "int", "uint"}
-        assert [infos[str(obj_id)][f"size_{axis}"] for axis in "xyz"] == pytest.approx(1000 * np.array(size))
+        mesh = trimesh.load(dataset / folder / f"obj_{obj_id:06d}.ply", process=False)
+        np.testing.assert_allclose(mesh.extents, 1000 * np.array(size), rtol=1e-6)
         assert infos[str(obj_id)]["diameter"] == pytest.approx(1000 * np.linalg.norm(size))
     assert infos["7"]["symmetries_discrete"] == [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]]
     assert infos["7"]["symmetries_continuous"] == [{"axis": [0, 0, 1], "offset": [1, 0, 0]}]
@@ -242,36 +163,27 @@ def test_active_effects_are_recorded_and_jpeg_quality_is_per_view(tmp_path):
 
 def test_png_colour_without_masks_and_coco(tmp_path):
     out = make(tmp_path / "set", episodes=(0,), split="test", color_format="png", masks=False, coco=False)
-    batch = VIEW
-    np.testing.assert_array_equal(cv2.imread(str(out / "test/000000/rgb/000000.png"))[..., ::-1], batch.color[0])
-    names = {path.name for path in (out / "test/000000").iterdir()}
-    assert names == {"rgb", "depth", "scene_camera.json", "scene_gt.json", "scene_gt_info.json"}
+    np.testing.assert_array_equal(cv2.imread(str(out / "test/000000/rgb/000000.png"))[..., ::-1], VIEW.color[0])
+    assert {path.name for path in (out / "test/000000").iterdir()} == {"rgb", "depth"} | RECORDS
 
 
-def test_an_episode_without_end_is_not_committed(tmp_path):
-    with exporting(BopExporter, tmp_path / "set", config()) as exporter:
+def test_a_set_without_episodes_has_empty_targets(tmp_path):
+    with exporting(BopExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
-        for batch in batches(5, (1,), 2, LENSES):
-            exporter.write_views(batch)
         finish(exporter)
-    assert list((tmp_path / "set/train_pbr").iterdir()) == []
-    assert load(tmp_path / "set/test_targets_bop19.json") == load(tmp_path / "set/test_targets_bop24.json") == []
+    assert [load(tmp_path / f"test_targets_bop{year}.json") for year in (19, 24)] == [[], []]
 
 
-def kill_a_writer(out: Path) -> None:
-    with exporting(BopExporter, out, config(), 2) as exporter:
+def test_a_killed_writer_is_reported_and_committed_scenes_stay(tmp_path):
+    with exporting(BopExporter, tmp_path, config(), 2) as exporter:
         exporter.write_constants()
         pool = export_context(exporter).pool
         feed(exporter, (0,))
         pool.wait()
         os.kill(pool.pids()[0], signal.SIGKILL)
-        for _ in range(100):
-            feed(exporter, (1,))
-
-
-def test_a_killed_writer_is_reported_and_committed_scenes_stay(tmp_path):
-    with pytest.raises(OutputError, match="a writer process was ended by SIGKILL"):
-        kill_a_writer(tmp_path)
+        with pytest.raises(OutputError, match="a writer process was ended by SIGKILL"):
+            _ = [feed(exporter, (1,)) for _ in range(100)]
+        pool.abort()
     assert sorted(path.name for path in (tmp_path / "train_pbr").iterdir()) == ["000000", "000001", "000002"]
     gc.collect()  # CPython 3.12.1 crashed here while errors of failed sends kept views of a BytesIO.
 
@@ -300,31 +212,24 @@ def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
         assert not (place / ANNOTATIONS).exists()
 
 
-def catalog_from_file(path: Path) -> Catalog:
-    entry = catalog().entries[0]
-    return Catalog((type(entry)(**{**entry.__dict__, "source": path}),))
-
-
 def test_bop_models_are_copied_byte_for_byte(tmp_path):
-    source = tmp_path / "source"
+    source, entry = tmp_path / "source", catalog().entries[0]
     source.mkdir()
-    model = encode_model(catalog().entries[0]).replace(b"TextureFile obj_000003.png", b"TextureFile label.png")
+    model, label = encode_model(entry).replace(b"TextureFile obj_000003.png", b"TextureFile label.png"), encode_png(entry.material.texture)
     (source / "obj_000003.ply").write_bytes(model)
-    info = {"diameter": 197.98, "min_x": -80.0, "note": "kept"}
-    (source / "models_info.json").write_text(json.dumps({"3": info}))
+    info = {"3": {"diameter": 197.98, "min_x": -80.0, "note": "kept"}}
+    (source / "models_info.json").write_text(json.dumps(info))
+    entry = replace(entry, source=source / "obj_000003.ply")
     with pytest.raises(CatalogError, match=r"refers to 'label\.png', but there is no file"):
-        write_models(tmp_path / "without", catalog_from_file(source / "obj_000003.ply"))
+        write_models(tmp_path / "without", Catalog((entry,)))
     # Read without its texture, which was missing: a copy would name it.
-    plain = catalog_from_file(source / "obj_000003.ply").entries[0]
-    plain = dataclasses.replace(plain, material=dataclasses.replace(plain.material, texture=None))
-    write_models(tmp_path / "plain", Catalog((plain,)))
+    write_models(tmp_path / "plain", Catalog((replace(entry, material=replace(entry.material, texture=None)),)))
     assert b"TextureFile" not in (tmp_path / "plain" / "obj_000003.ply").read_bytes()
-    label = encode_png(catalog().entries[0].material.texture)
     (source / "label.png").write_bytes(label)
-    write_models(tmp_path / "models", catalog_from_file(source / "obj_000003.ply"))
+    write_models(tmp_path / "models", Catalog((entry,)))
     assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
     assert (tmp_path / "models/label.png").read_bytes() == label
-    assert load(tmp_path / "models/models_info.json") == {"3": info}
+    assert load(tmp_path / "models/models_info.json") == info
 
 
 class TestContract(ExporterContract):
@@ -333,3 +238,112 @@ class TestContract(ExporterContract):
     @classmethod
     def config(cls) -> Config:
         return config(("flow", "classes"))
+
+
+class TestMultisensorContract(ExporterContract):
+    exporter_class: ClassVar = BopExporter
+
+    @classmethod
+    def config(cls) -> Config:
+        return box_views.config(layout="multisensor")
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory) -> tuple[Path, Path]:
+    place = tmp_path_factory.mktemp("sensors")
+    return write_set(place / "multi", BopExporter, layout="multisensor"), write_set(place / "classic", BopExporter)
+
+
+def test_files_are_those_of_the_classic_layout(folders):
+    multi, classic = folders
+    assert sorted(path.name for path in (multi / "train").iterdir()) == [f"{episode:06d}" for episode in EPISODES]
+    for episode in EPISODES:
+        scene = multi / "train" / f"{episode:06d}"
+        names = {path.name for path in scene.iterdir()}
+        for camera in range(3):
+            other = classic / "train" / f"{3 * episode + camera:06d}"
+            for path in filter(Path.is_file, other.rglob("*")):
+                first, *rest = path.relative_to(other).parts
+                twin = scene.joinpath(f"{Path(first).stem}_cam{camera}{Path(first).suffix}", *rest)
+                names.discard(twin.relative_to(scene).parts[0])
+                content = path.read_bytes()
+                if path.name == "scene_gt_coco.json":
+                    content = content.replace(b'"rgb/', b'"rgb_cam%d/' % camera)
+                assert twin.read_bytes() == content, twin
+        assert names == set()
+
+
+def test_targets_name_images_of_the_first_sensor_and_of_all(folders):
+    multi, classic = folders
+    lists = {year: json.loads((multi / f"test_targets_{year}.json").read_text()) for year in ("bop19", "bop24", "multiview_bop25")}
+    images = [(episode, frame) for episode in EPISODES for frame in range(FRAMES)]
+    assert [(target["scene_id"], target["im_id"]) for target in lists["bop24"]] == images
+    expected = [{"im_id": [[f"cam{camera}", frame] for camera in range(3)], "scene_id": episode} for episode, frame in images]
+    assert lists["multiview_bop25"] == expected
+    known = json.loads((classic / "test_targets_bop19.json").read_text())
+    first = [target | {"scene_id": target["scene_id"] // 3} for target in known if target["scene_id"] % 3 == 0]
+    assert lists["bop19"] == first
+
+
+def test_it_opens_by_episode_and_validation_finds_the_same_in_both_layouts(folders):
+    assert [list(synpick_warp.open(folder)) for folder in folders] == [list(EPISODES)] * 2
+    multi, classic = (
+        {found.rule for found in validate(folder, ValidationOptions(sample=0, images=False), Summary())} for folder in folders
+    )
+    assert multi <= classic
+
+
+@pytest.fixture
+def toolkit(monkeypatch) -> ModuleType:
+    """A stand-in for bop_toolkit_lib.dataset_params."""
+
+    def unknown(datasets_path: str, name: str, *rest: object, **more: object) -> dict[str, object]:
+        raise ValueError(f"Unknown BOP dataset ({name}).")
+
+    package, module = ModuleType("bop_toolkit_lib"), ModuleType("bop_toolkit_lib.dataset_params")
+    for name in ("get_split_params", "get_model_params", "get_camera_params"):
+        setattr(module, name, unknown)
+    module.inout = SimpleNamespace(load_cam_params=lambda path: {"im_size": json.loads(Path(path).read_text())["width"]})
+    package.dataset_params = module
+    monkeypatch.setitem(sys.modules, "bop_toolkit_lib", package)
+    monkeypatch.setitem(sys.modules, "bop_toolkit_lib.dataset_params", module)
+    return module
+
+
+@pytest.mark.parametrize("layout", ["classic", "multisensor"])
+def test_paths_of_the_entry_exist(toolkit, tmp_path, layout):
+    folder = write_set(tmp_path / "synpick", BopExporter, layout=layout)
+    runpy.run_path(str(folder / "bop_dataset_params.py"))
+    split = toolkit.get_split_params(str(tmp_path), "synpick", "train", split_type=None)
+    classic = layout == "classic"
+    assert split["scene_ids"] == ([3 * episode + camera for episode in EPISODES for camera in range(3)] if classic else list(EPISODES))
+    assert split["eval_sensor"] == (None if classic else "cam0")
+    assert split["im_size"] == ((96, 72) if classic else {"": (96, 72), "cam0": (96, 72), "cam1": (96, 72), "cam2": (96, 72)})
+    templates = {name: path for name, path in split.items() if name.endswith("_tpath")}
+    assert len(templates) == (9 if classic else 3 * 2 * 7)
+    for scene in split["scene_ids"]:
+        for name, path in templates.items():
+            if name != "gray_tpath":
+                assert os.path.isfile(path.format(scene_id=scene, im_id=FRAMES - 1, gt_id=2)), path
+    keys = {"scene_gt_tpath", "rgb_tpath"} if classic else {"scene_gt_rgb_cam1_tpath", "mask_visib_depth_cam2_tpath", "depth_cam0_tpath"}
+    assert keys <= set(templates)
+
+
+def test_models_cameras_and_other_data_sets(toolkit, tmp_path):
+    folder = make(tmp_path / "synpick", episodes=(0,))
+    runpy.run_path(str(folder / "bop_dataset_params.py"))
+    models = toolkit.get_model_params(str(tmp_path), "synpick", "eval")
+    assert (models["obj_ids"], models["symmetric_obj_ids"]) == ([3, 7], [7])
+    assert all(os.path.isfile(models["model_tpath"].format(obj_id=obj_id)) for obj_id in models["obj_ids"])
+    assert toolkit.get_split_params(str(tmp_path), "synpick", "train", "pbr")["rgb_tpath"].endswith(".jpg")
+    assert toolkit.get_camera_params(str(tmp_path), "synpick")["im_size"] == 96
+    with pytest.raises(ValueError, match=r"Unknown BOP dataset \(lm\)"):
+        toolkit.get_split_params(str(tmp_path), "lm", "test")
+    with pytest.raises(ValueError, match="synpick has no split test; splits: train_pbr"):
+        toolkit.get_split_params(str(tmp_path), "synpick", "test")
+    notes = (folder / "dataset_info.md").read_text()
+    for text in ("run_path('$BOP_PATH/synpick/bop_dataset_params.py')", "METHOD_synpick-train-pbr.csv", "on a copy", "EGL_PLATFORM"):
+        assert text in notes
+    shutil.move(folder, tmp_path / "my-set")
+    with pytest.raises(ValueError, match="rename"):
+        runpy.run_path(str(tmp_path / "my-set" / "bop_dataset_params.py"))

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import io
-import json
-import tarfile
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pyarrow.parquet as parquet
 import pytest
 import zarr
-from pycocotools import mask as coco_mask
-from pycocotools.coco import COCO
 
+import synpick_warp
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.configs.schema import Arrangement
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
-from synpick_warp.exporters.lerobot.exporter import LerobotExporter
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.system.hardware.device import pick_device
@@ -71,16 +63,17 @@ def bop(batch, tmp_path_factory) -> Path:
 
 
 def test_masks_and_counts_of_files_are_those_of_the_renderer(bop, batch, masks):
-    for view, expected in enumerate(masks):
-        scene = bop / "train_pbr" / f"{view:06d}"
-        for name, images in (("mask", expected), ("mask_visib", batch.instance[view] == 1 + np.arange(COUNT)[:, None, None])):
-            read = [cv2.imread(str(scene / name / f"000000_{index:06d}.png"), cv2.IMREAD_UNCHANGED) for index in range(COUNT)]
-            np.testing.assert_array_equal(np.array(read) == 255, images)
-        info = json.loads((scene / "scene_gt_info.json").read_text())["0"]
-        assert [row["px_count_visib"] for row in info] == [(batch.instance[view] == 1 + index).sum() for index in range(COUNT)]
-        inside = np.array([row["px_count_all"] for row in info]) - expected.sum(axis=(1, 2))
-        assert (inside >= 0).all()
-        assert (inside == 0).sum() > COUNT // 10
+    """In scenes and in shards; without a manifest, each camera's scene is an episode."""
+    for folder in (bop, write(ShardsExporter, bop.parent / "shards", batch)):
+        for camera, expected in enumerate(masks):
+            view = synpick_warp.open(folder)[camera].view(0)
+            np.testing.assert_array_equal(view.amodal_masks, expected)
+            np.testing.assert_array_equal(view.masks, batch.instance[camera] == 1 + np.arange(COUNT)[:, None, None])
+            infos = view.records.gt_info
+            assert [info["px_count_visib"] for info in infos] == view.masks.sum(axis=(1, 2)).tolist()
+            beyond = np.array([info["px_count_all"] for info in infos]) - expected.sum(axis=(1, 2))
+            assert (beyond >= 0).all()
+            assert (beyond == 0).sum() > COUNT // 10
     assert len(np.unique(batch.instance)) > 60
 
 
@@ -95,32 +88,6 @@ def test_an_independent_check_in_float64_finds_nothing(bop):
 def test_files_are_the_same_from_lists_and_from_words(kind, batch, tmp_path):
     words = dataclasses.replace(batch, boundaries=None, boundary_count=None, runs=None, run_count=None)
     assert digests(write(kind, tmp_path / "lists", batch)) == digests(write(kind, tmp_path / "words", words))
-
-
-@pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
-def test_pycocotools_reads_what_is_visible(batch, tmp_path):
-    out = write(CocoExporter, tmp_path / "set", batch)
-    with contextlib.redirect_stdout(io.StringIO()):
-        read = COCO(out / "coco" / "annotations" / "instances_train_pbr.json")
-    assert len(read.imgs) == len(batch)
-    for index, image in read.imgs.items():
-        rows, ids = read.loadAnns(read.getAnnIds(imgIds=index)), batch.instance[image["camera"]]
-        assert [row["instance_id"] for row in rows] == [one for one in range(COUNT) if (ids == 1 + one).any()]
-        for row in rows:
-            np.testing.assert_array_equal(read.annToMask(row), ids == 1 + row["instance_id"])
-
-
-@pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
-def test_run_lengths_of_shards_are_the_masks(batch, masks, tmp_path):
-    split = write(ShardsExporter, tmp_path / "set", batch) / "train_pbr_web"
-    for view, expected in enumerate(masks):
-        with tarfile.open(split / f"shard-{view:06d}.tar") as shard:
-            content = next(shard.extractfile(member).read() for member in shard.getmembers() if member.name.endswith(".mask.json"))
-        records = json.loads(content)
-        assert list(map(int, records)) == list(range(COUNT))
-        for index, record in records.items():
-            decoded = coco_mask.decode(coco_mask.frPyObjects(record, *record["size"]))
-            np.testing.assert_array_equal(decoded, expected[int(index)])
 
 
 def read_zarr(out: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -141,12 +108,3 @@ def test_stores_of_trajectories_have_every_body(batch, tmp_path, kind, read):
     present, poses = read(write(kind, tmp_path / "set", batch))
     assert present.tolist() == list(range(COUNT))
     np.testing.assert_allclose(poses, [pose_matrix(pose) for pose in batch.pose[0, :COUNT]], atol=1e-6)
-
-
-def test_lerobot_has_gripper_and_pictures_without_instances(batch, tmp_path):
-    root = write(LerobotExporter, tmp_path / "set", batch) / "lerobot"
-    features = json.loads((root / "meta" / "info.json").read_text())["features"]
-    numbers = {name: one["shape"] for name, one in features.items() if one["dtype"] != "video"}
-    assert max(map(max, numbers.values())) == len(parquet.read_table(root / "data").to_pylist()[0]["observation.state"]) == 9
-    assert len(features) - len(numbers) == len(LENSES)
-    assert not [name for name in features if "mask" in name or "instance" in name]

@@ -1,10 +1,15 @@
-"""Webdataset shards written by the real pool from views of boxes, read back with webdataset, tarfile, OpenCV and pycocotools."""
+"""Webdataset shards written by the real pool from views of boxes, read back with webdataset, tarfile, OpenCV and pycocotools. Their card,
+as Hugging Face's `datasets` reads it, offline and in a process of its own; size categories; licence."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
+import os
+import subprocess
+import sys
 import tarfile
 from pathlib import Path
 
@@ -14,13 +19,14 @@ import pytest
 from pycocotools import mask as coco
 from webdataset import tariterators
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.schema import Config, Split
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import tar_files
+from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
-from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, finish, without_objects
-from tests.twins.masks import masks_of_batch
+from tests.harness.exporter_contract import ExporterContract, export, export_context, exporting, finish, without_objects
 from tests.worlds.box_views import batches, cameras, config, ends
 
 EPISODES = (0, 2)
@@ -69,22 +75,6 @@ def test_one_shard_per_scene_and_bops_common_files(dataset, split):
     assert {path.name for path in dataset.iterdir()} == names
 
 
-def test_webdataset_reads_back_the_views(split):
-    views = samples(split)
-    assert list(views) == [f"{scene:06d}_{frame:06d}" for scene in SCENES for frame in range(FRAMES)]
-    for batch in batches(1, EPISODES, FRAMES, LENSES):
-        view = views[f"{3 * int(batch.episode[0]) + int(batch.camera[0]):06d}_{int(batch.frame[0]):06d}"]
-        assert {name for name in view if not name.startswith("__")} == set(ENTRIES)
-        np.testing.assert_array_equal(decode(view["depth.png"]), batch.depth[0])
-        assert np.median(np.abs(decode(view["rgb.jpg"])[..., ::-1].astype(int) - batch.color[0])) <= 3
-        truth = json.loads(view["gt.json"])
-        assert [record["instance_id"] for record in truth] == [0, 2, 3]
-        for index, record in enumerate(truth):
-            instance = record["instance_id"]
-            for name, expected in (("mask", masks_of_batch(batch)[instance]), ("mask_visib", batch.instance[0] == 1 + instance)):
-                np.testing.assert_array_equal(toolkit_mask(json.loads(view[f"{name}.json"])[str(index)]), expected)
-
-
 def toolkit_mask(record: dict) -> np.ndarray:
     """Decode like bop_toolkit_lib.pycoco_utils.rle_to_binary_mask: column-major runs that alternate between False and True."""
     counts = record["counts"]
@@ -92,10 +82,14 @@ def toolkit_mask(record: dict) -> np.ndarray:
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
-def test_views_equal_those_of_the_bop_format(split, tmp_path):
+def test_views_that_webdataset_reads_equal_those_of_the_bop_format(split, tmp_path):
     folders = export(BopExporter, tmp_path / "set", config(), EPISODES) / "train_pbr"
-    for key, view in samples(split).items():
+    views = samples(split)
+    assert list(views) == [f"{scene:06d}_{frame:06d}" for scene in SCENES for frame in range(FRAMES)]
+    assert list(views) == list(json.loads((split / "key_to_shard.json").read_text()))
+    for key, view in views.items():
         scene, frame = key.split("_")
+        assert {name for name in view if not name.startswith("__")} == set(ENTRIES)
         assert view["rgb.jpg"] == (folders / scene / "rgb" / f"{frame}.jpg").read_bytes()
         assert view["depth.png"] == (folders / scene / "depth" / f"{frame}.png").read_bytes()
         for name in ("camera", "gt", "gt_info"):
@@ -108,6 +102,7 @@ def test_views_equal_those_of_the_bop_format(split, tmp_path):
             for index, record in masks.items():
                 file = cv2.imread(str(folders / scene / kind / f"{frame}_{int(index):06d}.png"), cv2.IMREAD_UNCHANGED)
                 compressed = coco.frPyObjects(record, *record["size"])
+                np.testing.assert_array_equal(255 * toolkit_mask(record), file)
                 np.testing.assert_array_equal(255 * coco.decode(compressed), file)
                 if kind == "mask_visib" and infos[int(index)]["px_count_visib"]:
                     x, y, width, height = coco.toBbox(compressed)
@@ -124,15 +119,6 @@ def test_layers_equal_those_of_the_bop_format(tmp_path):
         assert [name for name in view if not name.startswith("__")] == [*ENTRIES, "flow.png", "classes.png"]
         for name in LAYERS:
             assert view[f"{name}.png"] == (folders / scene / name / f"{frame}.png").read_bytes()
-
-
-def test_key_index_leads_to_shards(split):
-    keys = json.loads((split / "key_to_shard.json").read_text())
-    assert list(keys) == list(samples(split))
-    for key, index in keys.items():
-        with tarfile.open(split / f"shard-{index:06d}.tar") as shard:
-            for entry in ENTRIES:
-                assert shard.extractfile(f"{key}.{entry}").read()
 
 
 def test_tar_files_are_reproducible_and_well_formed(split):
@@ -183,26 +169,115 @@ def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
         names = [f"train_pbr_web/shard-{number:06d}.tar" for number in (6, 7, 8, 1_000_006, 1_000_007, 1_000_008)]
         assert sorted(names) == [str(path) for path in exporter.files(2)]
     split = out / "train_pbr_web"
-    keys = json.loads((split / "key_to_shard.json").read_text())
-    assert keys["000006_000001"] == 6
-    assert keys["000006_000002"] == 1_000_006
-    assert len(keys) == 3 * FRAMES
-    views = samples(split)
-    for key, view in samples(dataset / "train_pbr_web").items():
-        if key in views:
-            assert all(view[entry] == views[key][entry] for entry in ENTRIES)
+    keys, views = json.loads((split / "key_to_shard.json").read_text()), samples(split)
+    assert (keys["000006_000001"], keys["000006_000002"]) == (6, 1_000_006)
+    assert sorted(keys) == sorted(views)
     assert len(views) == 3 * FRAMES
+    for key, index in keys.items():
+        with tarfile.open(split / f"shard-{index:06d}.tar") as shard:
+            assert all(shard.extractfile(f"{key}.{entry}").read() == views[key][entry] for entry in ENTRIES)
+    whole = samples(dataset / "train_pbr_web")
+    assert all(whole[key][entry] == views[key][entry] for key in keys for entry in ENTRIES)
 
 
-def test_an_empty_data_set_has_an_empty_key_index(tmp_path):
-    with exporting(ShardsExporter, tmp_path, config()) as exporter:
-        exporter.write_constants()
-        assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json"), Path("README.md")]
-    assert json.loads((tmp_path / "train_pbr_web/key_to_shard.json").read_text()) == {}
-    assert set(digests(tmp_path / "train_pbr_web")) == {"key_to_shard.json"}
-
-
-def test_files_shared_with_the_bop_format_are_listed_once(tmp_path):
+def test_an_empty_data_set_has_an_empty_key_index_and_files_shared_with_the_bop_format_once(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         constants = Exporters((BopExporter, ShardsExporter), export_context(exporter)).write_constants()
+        assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json"), Path("README.md")]
+    assert {path.name: json.loads(path.read_text()) for path in (tmp_path / "train_pbr_web").iterdir()} == {"key_to_shard.json": {}}
     assert sorted(map(str, constants)) == ["bop_dataset_params.py", "camera.json", "dataset_info.md", "models", "models_eval"]
+
+
+# ---- the card of shards ----
+
+SPLITS = (Split("train", 2, 0, "pick", "train_pbr"), Split("test", 1, 2, "pick", "test_pbr"), Split("val", 5, 9, "pick", "val_pbr"))
+"""The last one has not been baked."""
+CONTENT = CardContent((SplitContent("train", "train_pbr_web", 18, 6, 1234567),), True, ".jpg", True, 24, LAYERS, ("blur",))
+READ = """
+import datasets, json, sys
+import numpy as np
+
+datasets.disable_progress_bars()
+answers = []
+sets = (datasets.load_dataset(**arguments, cache_dir=sys.argv[2]) for arguments in json.loads(sys.argv[1]))
+for split, views in (item for each in sets for item in each.items()):
+    views = sorted(views, key=lambda view: view["__key__"])
+    answers.append({
+        "split": split,
+        "keys": [view["__key__"] for view in views],
+        "direction": [view["camera.json"]["light"]["direction"] for view in views],
+        "masks": [[index for index, mask in view["mask_visib.json"].items() if mask] for view in views],
+        "depth": np.asarray(views[-1]["depth.png"]).astype(int).tolist(),
+        "instances": [[row["instance_id"] for row in view["gt.json"]] for view in views],
+        "sizes": [view["rgb.jpg"].size for view in views],
+    })
+print(json.dumps(answers))
+"""
+
+
+@pytest.fixture(scope="module")
+def two_splits(tmp_path_factory) -> Path:
+    """Two splits of an episode each: the first has no sun, the second does."""
+    settings = dataclasses.replace(config(LAYERS), splits=SPLITS)
+    return export(ShardsExporter, tmp_path_factory.mktemp("card") / "set", settings, (0, 2))
+
+
+def load(cache: Path, *arguments: dict[str, str]) -> list[dict]:
+    """Each split of what `datasets.load_dataset` gives for each of these arguments."""
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "HF_HOME": str(cache)}
+    command = (sys.executable, "-c", READ, json.dumps(arguments), str(cache))
+    return json.loads(subprocess.run(command, env=environment, capture_output=True, check=True, text=True).stdout)
+
+
+def test_datasets_reads_all_views_through_the_card(two_splits, tmp_path):
+    pytest.importorskip("datasets")
+    train, test, by_files = load(
+        tmp_path,
+        {"path": str(two_splits)},
+        {"path": "webdataset", "data_dir": str(two_splits / "train_pbr_web"), "data_files": "*.tar"},
+    )
+    assert (two_splits / CARD_FILE).read_text().isascii()
+    keys = [f"{scene:06d}_{frame:06d}" for scene in (0, 1, 2, 6, 7, 8) for frame in range(3)]
+    assert (train["split"], test["split"]) == ("train", "test")
+    assert (train["keys"], test["keys"], by_files["keys"]) == (keys[:9], keys[9:], keys[:9])
+    assert train["direction"] == 9 * [None]
+    assert test["direction"] == 9 * [[0.0, 0.6, 0.8]]
+    for split in (train, test):
+        assert split["instances"] == 9 * [[0, 2, 3]]
+        assert split["masks"] == 9 * [["0", "1", "2"]]
+        assert split["sizes"] == 9 * [[96, 72]]
+    *_, last = batches(1, (2,), 3, cameras())
+    assert test["depth"] == last.depth[0].tolist()
+
+
+def test_card_describes_split_sizes_and_licence():
+    text = make_card(CONTENT)
+    assert text.startswith("---\nlicense: mit\n")
+    assert "  - split: train\n    path: train_pbr_web/shard-*.tar\n" in text
+    assert "18 views in 6 webdataset shards of 1,234,567 bytes" in text
+    assert text.count('- name: "blur"') == 1
+    splits = (CONTENT.splits[0], SplitContent("validation", "val_web", 2, 1, 10), SplitContent("test", "test_web", 0, 0, 0))
+    others = make_card(dataclasses.replace(CONTENT, splits=splits, embedded=False, masks=False))
+    assert "license: unknown\n" in others
+    assert "set `license`" in others
+    assert "  - split: train\n    path: train_pbr_web/shard-*.tar\n  - split: validation\n    path: val_web/shard-*.tar\n" in others
+    assert "20 views in 7 webdataset shards of 1,234,577 bytes" in others
+    assert "| train | train_pbr_web | 18 | 6 | 1,234,567 |\n| validation | val_web | 2 | 1 | 10 |\n" in others
+    assert "test_web" not in others
+    assert "mask" not in others.partition("\n---\n")[0].replace("mask_", "")
+
+
+CATEGORIES = {0: "n<1K", 999: "n<1K", 1000: "1K<n<10K", 99_999: "10K<n<100K", 100_000: "100K<n<1M", 1_000_000: "1M<n<10M"}
+CATEGORIES |= {10**11: "100B<n<1T", 10**12: "n>1T", 10**15: "n>1T"}
+
+
+def test_size_categories_are_those_of_the_hub():
+    assert {views: size_category(views) for views in CATEGORIES} == CATEGORIES
+
+
+def test_splits_are_named_as_on_the_hub():
+    taken = Split("validation", 1, 20, "pick", "val_b_pbr")
+    for given, names in (({}, ("train",)), ({"bop.split": "val_pbr"}, ("validation",))):
+        assert hub_splits(DataLayout.of(Config().with_values(given))) == names
+    for splits, names in ((SPLITS, ("train", "test", "validation")), ((*SPLITS, taken), ("train", "test", "val", "validation"))):
+        assert hub_splits(DataLayout.of(dataclasses.replace(Config(), splits=splits))) == names

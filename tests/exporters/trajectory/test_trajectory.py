@@ -1,8 +1,13 @@
-"""Zarr store: exporter contract, and its content as read by plain zarr, compared with the batches that were written."""
+"""Zarr store: exporter contract, and its content as read by plain zarr, compared with the batches that were written. Of a bake, recorded
+trajectories obey the laws of motion, and bytes depend neither on worlds nor on the lead of physics."""
 
 from __future__ import annotations
 
 import json
+import runpy
+import shutil
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +16,20 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import synpick_warp
 from synpick_warp.codes import Outcome
+from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.trajectory import arrays as tables
 from synpick_warp.exporters.trajectory.episode import make_attempt_arrays
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, spool_bytes
 from synpick_warp.exporters.trajectory.store import chunk_layout
+from synpick_warp.stages import ticks as stage_ticks
+from synpick_warp.stages.stream import FrameStream
+from tests.builders import PICKING, bake_boxes, boxes, once
 from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
-from tests.worlds import box_views, trajectories
+from tests.harness.memory_tables import device_arrays
+from tests.worlds import box_views, small_worlds, trajectories
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
 
 EPISODES = (0, 4)
@@ -63,26 +74,21 @@ def written_batches(episode: int) -> list:
 
 
 @pytest.mark.parametrize("episode", EPISODES)
-def test_ticks_equal_the_batches(store, episode):
-    group, batches = store[f"{tables.EPISODES}/{episode:06d}/ticks"], written_batches(episode)
-    assert set(group.array_keys()) == set(tables.TICKS.arrays)
-    for name in tables.TICKS.arrays:
-        memory = np.concatenate([batch.tick.get(name, getattr(batch, name, None)) for batch in batches])
-        memory = memory[tuple(slice(INSTANCES if dim == "instance" else None) for dim in tables.TICKS.arrays[name].dims)]
-        if name == "pose":
-            memory[group["object_id"][:] < 0] = np.nan
-        np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
-
-
-@pytest.mark.parametrize("episode", EPISODES)
-def test_steps_equal_the_batches(store, episode):
-    group, batches = store[f"{tables.EPISODES}/{episode:06d}/steps"], written_batches(episode)
-    assert set(group.array_keys()) == set(tables.STEPS.arrays)
-    for name in set(tables.STEPS.arrays) - {"time"}:
-        memory = np.concatenate([batch.steps[name][0] for batch in batches])
-        if tables.STEPS.arrays[name].dims[1:2] == ("instance",):
-            memory = memory[:, :INSTANCES]
-        np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
+@pytest.mark.parametrize(("group", "schema"), [("ticks", tables.TICKS), ("steps", tables.STEPS)])
+def test_arrays_equal_the_batches(store, episode, group, schema):
+    stored, batches = store[f"{tables.EPISODES}/{episode:06d}/{group}"], written_batches(episode)
+    assert set(stored.array_keys()) == set(schema.arrays)
+    for name, spec in schema.arrays.items():
+        if group == "ticks":
+            memory = np.concatenate([batch.tick.get(name, getattr(batch, name, None)) for batch in batches])
+        elif name == "time":
+            continue  # See below.
+        else:
+            memory = np.concatenate([batch.steps[name][0] for batch in batches])
+        memory = memory[tuple(slice(INSTANCES if dim == "instance" else None) for dim in spec.dims)]
+        if (group, name) == ("ticks", "pose"):
+            memory[stored["object_id"][:] < 0] = np.nan
+        np.testing.assert_array_equal(stored[name][:], memory, err_msg=name)
 
 
 @pytest.mark.slow(minutes=1)
@@ -107,7 +113,11 @@ def test_more_episodes_than_a_task_takes_are_written_as_one_by_one(tmp_path):
     assert written([episodes]) == written([(episode,) for episode in episodes])
 
 
-def test_step_times_are_ends_of_steps(store):
+def test_step_times_are_ends_of_steps_and_the_store_is_sharded_and_compressed_by_zstd(store):
+    pose = store[f"{tables.EPISODES}/000000/steps/pose"]
+    assert (pose.chunks, pose.shards) == ((2 * STEP_COUNT, INSTANCES, 7), (6 * STEP_COUNT, INSTANCES, 7))
+    assert [codec.to_dict()["name"] for codec in pose.compressors] == ["zstd"]
+    assert pose.metadata.zarr_format == 3
     episode = store[f"{tables.EPISODES}/000004"]
     step, time = store.attrs["step"], episode["steps/time"][:]
     assert len(time) == FRAMES * STEP_COUNT
@@ -121,17 +131,8 @@ def test_episode_attributes_and_arrangement(store):
     light = attributes.pop("light")
     assert {name: light[name] for name in ("map", "yaw", "exposure")} == {"map": 0, "yaw": 2.0, "exposure": 0.25}
     assert light["units"] == {"yaw": "rad", "exposure": "EV"}
-    assert attributes == {
-        "episode": 4,
-        "arrangement": 1,
-        "frames": FRAMES,
-        "ending": "emptied",
-        "sentence": "no object is left in the tote",
-        "seed": 0,
-        "mode": "pick",
-        "picked": 2,
-        "redrops": 4,
-    }
+    known = {"episode": 4, "arrangement": 1, "frames": FRAMES, "ending": "emptied", "sentence": "no object is left in the tote"}
+    assert attributes == known | {"seed": 0, "mode": "pick", "picked": 2, "redrops": 4}
     np.testing.assert_array_equal(episode["arrangement/object_id"][:], box_views.OBJECT_IDS[:INSTANCES])
     np.testing.assert_array_equal(episode["arrangement/mass"][:], [0.3, np.nan, 0.3, 0.3])
     drops = written_batches(4)[0].tick["drop_pose"][0, :INSTANCES]
@@ -140,6 +141,8 @@ def test_episode_attributes_and_arrangement(store):
 
 
 def test_attempts_as_columns(store):
+    made = make_attempt_arrays([ATTEMPT], 4)
+    assert {name: values.dtype.str for name, values in made.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
     attempts = store[f"{tables.EPISODES}/000000/attempts"]
     columns = {name: attempts[name][:].tolist() for name in attempts.array_keys()}
     lines = [json.loads(line) for line in bytes(columns.pop("record")).splitlines()]
@@ -154,35 +157,17 @@ def test_attempts_as_columns(store):
     np.testing.assert_array_equal(columns["peak_force"], [[0.0, 3.25], [np.nan, np.nan]])
 
 
-def test_an_episode_without_attempts_has_empty_columns(tmp_path):
+def test_an_episode_without_attempts_or_instances_has_empty_columns(tmp_path):
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
-        for batch in ticks((0,), 1):
-            exporter.write_ticks(batch)
-        (end,) = box_views.ends((0,), 1)
-        exporter.end_episode(end, lambda: None)
-        exporter._context.pool.wait()
-    attempts = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000" / "attempts", mode="r")
-    assert {array.shape[0] for array in arrays(attempts).values()} == {0}
-    assert set(attempts.array_keys()) == set(tables.ATTEMPTS.arrays)
-
-
-def test_columns_of_attempts_have_the_schemas_types():
-    columns = make_attempt_arrays([ATTEMPT], 4)
-    assert {name: values.dtype.str for name, values in columns.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
-
-
-def test_objects_and_cameras(store):
-    entries, lenses = box_views.catalog().entries, box_views.cameras()
-    objects, cameras = store["objects"], store["cameras"]
-    assert objects.attrs["names"] == [entry.name for entry in entries]
-    assert objects["object_id"][:].tolist() == [entry.obj_id for entry in entries]
-    np.testing.assert_array_equal(objects["mass"][:], [entry.mass for entry in entries])
-    np.testing.assert_array_equal(objects["inertia"][:], [entry.inertia for entry in entries])
-    np.testing.assert_array_equal(cameras["matrix"][:], [lens.matrix for lens in lenses])
-    np.testing.assert_array_equal(cameras["rotation"][:], [lens.rotation for lens in lenses])
-    np.testing.assert_array_equal(cameras["translation"][:], [lens.translation for lens in lenses])
-    assert cameras["resolution"][:].tolist() == [[lens.width, lens.height] for lens in lenses]
+        (batch,) = ticks((0,), 1)
+        batch.object_id.fill(-1)
+        exporter.write_ticks(batch)
+        exporter.end_episode(box_views.ends((0,), 1)[0], lambda: None)
+    episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
+    assert {array.shape[0] for array in arrays(episode["attempts"]).values()} == {0}
+    assert set(episode["attempts"].array_keys()) == set(tables.ATTEMPTS.arrays)
+    assert (episode["steps/pose"].shape, episode["steps/setpoint"].shape) == ((STEP_COUNT, 0, 7), (STEP_COUNT, 3))
 
 
 def test_every_array_has_unit_description_and_dimension_names(store):
@@ -218,13 +203,6 @@ def test_equally_named_dimensions_have_equal_sizes(store):
         assert {name: len(sizes) for name, sizes in extents.items()} == dict.fromkeys(extents, 1)
 
 
-def test_the_store_is_sharded_and_compressed_by_zstd(store):
-    pose = store[f"{tables.EPISODES}/000000/steps/pose"]
-    assert (pose.chunks, pose.shards) == ((2 * STEP_COUNT, INSTANCES, 7), (6 * STEP_COUNT, INSTANCES, 7))
-    assert [codec.to_dict()["name"] for codec in pose.compressors] == ["zstd"]
-    assert pose.metadata.zarr_format == 3
-
-
 def test_bytes_do_not_depend_on_processes_or_order(tmp_path, folder):
     assert digests(write_set(tmp_path, config(), EPISODES[::-1], FRAMES, processes=2)) == digests(folder)
 
@@ -236,19 +214,16 @@ def test_without_recorded_steps_there_is_no_group_of_steps(tmp_path):
     assert spool_bytes(INSTANCES, STEP_COUNT, False) < spool_bytes(INSTANCES, STEP_COUNT, True) / 3
 
 
-def test_missing_frames_are_an_error(tmp_path):
+def test_missing_frames_and_an_array_missing_from_the_schema_are_errors(tmp_path):
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter:
         for batch in ticks((0,), 2):
             exporter.write_ticks(batch)
         with pytest.raises(ValueError, match="ended with 3 frames, but 2 came"):
             exporter.end_episode(ends((0,), 3)[0], lambda: None)
-
-
-def test_an_array_missing_from_the_schema_is_an_error(tmp_path):
-    (batch,) = ticks((0,), 1)
-    batch.steps["magic"] = batch.steps["setpoint"]
-    with exporting(TrajectoryExporter, tmp_path, config()) as exporter, pytest.raises(ValueError, match="magic"):
-        exporter.write_ticks(batch)
+        (other,) = ticks((1,), 1)
+        other.steps["magic"] = other.steps["setpoint"]
+        with pytest.raises(ValueError, match="magic"):
+            exporter.write_ticks(other)
 
 
 @given(ticks=st.integers(0, 5000), chunk=st.integers(1, 64), chunks=st.integers(1, 64), rows=st.integers(1, 40))
@@ -261,13 +236,102 @@ def test_shards_hold_whole_chunks_of_whole_ticks_and_no_more_than_needed(ticks, 
     assert shard - rows_per_chunk < max(1, ticks * rows)
 
 
-def test_an_episode_without_instances_has_empty_dimensions(tmp_path):
-    (batch,) = ticks((0,), 1)
-    batch.object_id.fill(-1)
-    with exporting(TrajectoryExporter, tmp_path, config()) as exporter:
-        exporter.write_constants()
-        exporter.write_ticks(batch)
-        exporter.end_episode(box_views.ends((0,), 1)[0], lambda: None)
-    episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
-    assert episode["steps/pose"].shape == (STEP_COUNT, 0, 7)
-    assert episode["steps/setpoint"].shape == (STEP_COUNT, 3)
+# ---- bakes ----
+
+TOOL = "tools.checks.trajectory"
+MIXED = PICKING | {
+    "bake.formats": ["zarr"],
+    "bake.mode": "mixed",
+    "bake.episodes": 3,
+    "cameras.resolution": [32, 18],
+    "physics.iterations": 8,
+}
+"""Settings of a mixed bake that takes some seconds and includes an episode of picking."""
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Config:
+    return small_worlds.settings(**MIXED)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory) -> Path:
+    """A finished bake of boxes; beside it the same with another number of worlds, and with physics ahead."""
+
+    def make(folder: Path) -> None:
+        with boxes() as patch:
+            # No format needs images.
+            patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
+            bake_boxes(folder, MIXED)
+            patch.setattr(stage_ticks, "queue_lead", lambda *_: 5)
+            bake_boxes(folder.with_name("again"), MIXED | {"bake.worlds": 3})
+
+    return once(tmp_path_factory, "mixed", make)[0]
+
+
+def check(monkeypatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", [TOOL, *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(TOOL, run_name="__main__")
+    return ended.value.code
+
+
+def test_the_laws_of_motion_hold_whatever_the_number_of_worlds_and_the_lead_of_physics(out, tmp_path, monkeypatch, capsys):
+    assert digests(out / "trajectory.zarr") == digests(out.with_name("again") / "trajectory.zarr")
+    assert check(monkeypatch, out) == 0
+    assert "VIOLATED" not in capsys.readouterr().out
+    assert check(monkeypatch, tmp_path) == 2
+    assert "has no trajectories" in capsys.readouterr().err
+    assert check(monkeypatch, tmp_path, "--episodes", 0) == 2
+
+
+@pytest.mark.parametrize(
+    ("array", "what"),
+    [
+        ("steps/velocity", "change of momentum"),
+        ("steps/contact_force", "contacts of all objects against their weight"),
+        ("steps/pose", "last step against frame"),
+        ("steps/setpoint", "gripper: force against its law"),
+        ("steps/seal_force", "peak force of a tick"),
+        ("ticks/pose", "speed, by displacement over a tick"),
+        ("ticks/pose", "poses that are not finite"),
+    ],
+)
+def test_corrupted_arrays_violate_the_laws_of_motion(out, tmp_path, monkeypatch, capsys, array, what):
+    picking = next(episode for episode in synpick_warp.open(out).values() if episode.attributes["mode"] != "move")
+    shutil.copytree(out, tmp_path / "set")
+    one = zarr.open_array(tmp_path / "set" / f"trajectory.zarr/episodes/{picking.number:06d}" / array, mode="r+")
+    values = 1.2 * one[:]
+    values[1::2] += 0.02 if array.startswith("steps") else 0.5
+    if array.startswith("ticks"):
+        values[0] = np.nan
+    one[:] = values
+    assert check(monkeypatch, tmp_path / "set") == 1
+    assert any("VIOLATED" in line and what in line for line in capsys.readouterr().out.splitlines())
+
+
+def test_what_is_opened_is_what_was_baked(out, mixed):
+    data = synpick_warp.open(out)
+    assert data.config == mixed
+    lines = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    for row, episode in zip(lines, data.values(), strict=True):
+        known = {name: value for name, value in row.items() if name != "checksum"}
+        assert {name: episode.attributes[name] for name in known} == known
+    attempts = [json.loads(line) for line in (out / "attempts.jsonl").read_text().splitlines()]
+    assert [attempt for episode in data.values() for attempt in episode.attempts] == attempts
+    assert any(attempt["outcome"] == "target_picked" for attempt in attempts)
+    for row, episode in zip(lines, data.values(), strict=True):
+        there = episode.ticks["object_id"][:] >= 0
+        assert (there[0].sum(), there[-1].sum()) == (row["objects"], row["left"])
+        assert episode.steps["time"].shape == (16 * row["frames"],)
+        obj_ids = episode.arrangement["object_id"][:]
+        np.testing.assert_allclose(episode.arrangement["mass"][:], [data.objects[obj_id - 1].mass for obj_id in obj_ids])
+
+
+def test_the_memory_table_counts_recorded_arrays(mixed):
+    """One record; none for formats that ask for none."""
+    mixed = replace(mixed, bake=replace(mixed.bake, device="cpu"))  # A GPU gets at least eight worlds.
+    rows = [row for row in device_arrays(mixed) if row[0] == "StepArrays.pose"]
+    assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)]
+    without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
+    assert not any(row[0].startswith("StepArrays") for row in device_arrays(without))

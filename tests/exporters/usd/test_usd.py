@@ -103,35 +103,23 @@ def test_a_writer_has_no_thread_beside_its_own(tmp_path, monkeypatch):
 
 def test_one_file_per_episode_and_shared_assets(folder):
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-    assert names == {
-        "000000.usdc",
-        "000004.usdc",
-        *(f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")),
-        "assets/textures/obj_000002.png",
-        "assets/lights/light_000.exr",
-        "assets/lights/light_001.exr",
-    }
+    assets = {f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")}
+    assets |= {"assets/textures/obj_000002.png", *(f"assets/lights/light_00{index}.exr" for index in range(2))}
+    assert names == assets | {"000000.usdc", "000004.usdc"}
     assert (folder / "000000.usdc").stat().st_size < 60_000
 
 
 def test_references_are_relative_and_resolve(folder):
     referenced = set()
     for path in layers(folder):
-        for asset in Sdf.Layer.FindOrOpen(str(path)).GetExternalAssetDependencies():
-            assert Path(asset).is_relative_to(folder)
-        text = Sdf.Layer.FindOrOpen(str(path)).ExportToString()
-        assert str(folder) not in text
-        _, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
+        layer = Sdf.Layer.FindOrOpen(str(path))
+        assert all(Path(asset).is_relative_to(folder) for asset in layer.GetExternalAssetDependencies())
+        assert str(folder) not in layer.ExportToString()
+        layers_used, assets, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
         assert missing == []
-        layers_used, assets, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
         referenced |= {Path(layer.realPath) for layer in layers_used} | {Path(asset) for asset in assets}
     # The environment map that no episode uses is not referenced.
     assert {path.resolve() for path in folder.rglob("*") if path.is_file()} - referenced == {folder / "assets/lights/light_000.exr"}
-
-
-def test_validators_find_nothing(folder):
-    for path in layers(folder):
-        assert list(validation_errors(path)) == []
 
 
 def validation_errors(path: Path) -> Iterator[str]:
@@ -142,7 +130,8 @@ def validation_errors(path: Path) -> Iterator[str]:
         yield f"{error.GetName()}: {error.GetMessage()}"
 
 
-def test_validators_find_a_broken_reference(tmp_path):
+def test_validators_find_nothing_but_a_broken_reference(folder, tmp_path):
+    assert [error for path in layers(folder) for error in validation_errors(path)] == []
     stage = Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
     UsdGeom.Xform.Define(stage, "/Root").GetPrim().GetReferences().AddReference("./nowhere.usdc")
     stage.Save()
@@ -197,7 +186,7 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
     assert reader.GetInput("varname").Get() == "st"
 
 
-def test_every_visible_mesh_has_a_material_and_every_collider_friction(folder, config):
+def test_every_visible_mesh_has_a_material_every_collider_friction_and_the_dome_its_map(folder, config):
     stage = Usd.Stage.Open(str(folder / "000000.usdc"))
     visible = solid = 0
     for prim in stage.Traverse():
@@ -212,6 +201,8 @@ def test_every_visible_mesh_has_a_material_and_every_collider_friction(folder, c
         elif prim.IsA(UsdGeom.Gprim):
             visible += 1
             assert binding.ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+    dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
+    assert (dome.GetPrim().GetDisplayName(), dome.GetTextureFileAttr().Get().path) == ("mixed_lamps", "./assets/lights/light_001.exr")
     # Table, tote, finger, cup and three objects; a box, nine pieces, two, and four of the objects of which one has two.
     assert (visible, solid) == (7, 1 + 9 + 2 + 4)
 
@@ -224,13 +215,6 @@ def test_a_table_that_is_not_rendered_only_collides(tmp_path):
     box = UsdGeom.Boundable(table.GetPrimAtPath("Collision/box"))
     bounds = UsdGeom.BBoxCache(0, [UsdGeom.Tokens.guide]).ComputeWorldBound(box.GetPrim()).ComputeAlignedRange()
     np.testing.assert_allclose(bounds.GetMax(), (10.0, 10.0, -0.0045), atol=1e-6)
-
-
-def test_dome_light_has_name_and_file_of_its_map(folder):
-    stage = Usd.Stage.Open(str(folder / "000000.usdc"))
-    dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
-    assert dome.GetPrim().GetDisplayName() == "mixed_lamps"
-    assert dome.GetTextureFileAttr().Get().path == "./assets/lights/light_001.exr"
 
 
 @pytest.mark.parametrize(

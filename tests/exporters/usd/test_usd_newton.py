@@ -28,9 +28,8 @@ def read(tmp_path_factory) -> newton.ModelBuilder:
     folder = usd_sets.write_set(tmp_path_factory.mktemp("newton") / "set", CONFIG, CATALOG)
     builder = newton.ModelBuilder()
     info = builder.add_usd(str(folder / "000000.usdc"))
-    assert info["up_axis"] == newton.Axis.Z
-    assert (info["mass_unit"], info["linear_unit"]) == (1.0, 1.0)
-    assert info["duration"] == usd_sets.FRAMES - 1
+    known = {"up_axis": newton.Axis.Z, "mass_unit": 1.0, "linear_unit": 1.0, "duration": usd_sets.FRAMES - 1}
+    assert {name: info[name] for name in known} == known
     return builder
 
 
@@ -89,7 +88,7 @@ def assert_same_pose(pose: np.ndarray, expected: np.ndarray) -> None:
     assert abs(pose[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_collision_shapes_have_the_same_vertices(read):
+def test_collision_shapes_have_the_same_vertices_and_the_table_is_a_box(read):
     expected = {body_of(read, f"Objects/instance_{instance:02d}"): entry_of(instance).pieces for instance in PRESENT}
     expected[body_of(read, "Gripper/Finger")] = (finger_collider(CONFIG.gripper),)
     expected[body_of(read, "Gripper/Cup")] = (cup_collider(CONFIG.gripper),)
@@ -99,13 +98,10 @@ def test_collision_shapes_have_the_same_vertices(read):
         assert len(shapes) == len(pieces)
         for shape, piece in zip(shapes, pieces, strict=True):
             np.testing.assert_allclose(points(read, shape), sort(piece.vertices), atol=1e-6)
-
-
-def test_the_table_is_a_box(read):
-    (box,) = (shape for shape in range(read.shape_count) if read.shape_type[shape] == newton.GeoType.BOX)
-    assert read.shape_body[box] == -1
-    np.testing.assert_allclose(read.shape_scale[box], TABLE_SIZE)
-    np.testing.assert_allclose(np.array(read.shape_transform[box])[:3], [0, 0, -CONFIG.tote.wall - TABLE_SIZE[2]], atol=1e-6)
+    (table,) = (shape for shape in range(read.shape_count) if read.shape_type[shape] == newton.GeoType.BOX)
+    assert read.shape_body[table] == -1
+    np.testing.assert_allclose(read.shape_scale[table], TABLE_SIZE)
+    np.testing.assert_allclose(np.array(read.shape_transform[table])[:3], [0, 0, -CONFIG.tote.wall - TABLE_SIZE[2]], atol=1e-6)
 
 
 def test_shapes_have_friction_and_contact_gap(read):
@@ -126,7 +122,7 @@ def test_visible_meshes_do_not_collide(read):
     assert dict(shown) == {-1: 2} | dict.fromkeys(range(read.body_count), 1)
 
 
-def test_the_simulated_model_has_the_same_shapes(read, device):
+def test_the_simulated_model_has_the_same_shapes_and_the_one_that_was_read_can_be_simulated(read, device):
     """Compared without its guide walls, which are disabled at the first frame."""
     built = build.build_model(usd_sets.settings(bake__worlds=1, arrangement__max_objects=4), CATALOG, device)
     model, layout = built.model, built.layout
@@ -136,8 +132,4 @@ def test_the_simulated_model_has_the_same_shapes(read, device):
     assert len(still) == len(colliders(read, -1))
     mass = model.body_mass.numpy()[: build.GRIPPER_BODIES]
     np.testing.assert_allclose(mass, [read.body_mass[body_of(read, f"Gripper/{name}")] for name in ("Finger", "Cup")])
-
-
-def test_the_model_can_be_simulated(read, device):
-    model = read.finalize(device=device)
-    np.testing.assert_allclose(model.gravity.numpy()[0], [0, 0, -CONFIG.physics.gravity], rtol=1e-6)
+    np.testing.assert_allclose(read.finalize(device=device).gravity.numpy()[0], [0, 0, -CONFIG.physics.gravity], rtol=1e-6)

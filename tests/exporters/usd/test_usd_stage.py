@@ -30,22 +30,14 @@ TICKS = usd_sets.episode_ticks(0)
 ROWS = 64
 
 
-def spool_ticks(folder, ticks=TICKS) -> np.ndarray:
-    """The ticks as a writer process reads them."""
-    spool = TickSpool(folder / "ticks", ticks[0].object_id.shape[1])
-    for batch in ticks:
-        spool.add(tick_rows(batch)[0])
-    spool.flush()
-    return read_ticks(spool.path, spool.instances)
+NAMES = {1: "one", 2: "two", 3: "three"}
 
 
 def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap, ...] = skies()[:2]) -> Usd.Stage:
     """Open the stage of an episode, without its assets."""
     stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
-    metadata = EpisodeMetadata(0, 0, len(rows), "emptied")
-    layer = make_episode_layer(
-        rows, metadata, UsdSettings(15.0, 9.81, ("tote",), cameras, stage_lights, {1: "one", 2: "two", 3: "three"}, {})
-    )
+    settings = UsdSettings(15.0, 9.81, ("tote",), cameras, stage_lights, NAMES, {})
+    layer = make_episode_layer(rows, EpisodeMetadata(0, 0, len(rows), "emptied"), settings)
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):
             each.referenceList.ClearEdits()
@@ -56,7 +48,12 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory) -> np.ndarray:
-    return spool_ticks(tmp_path_factory.mktemp("ticks"))
+    """The ticks as a writer process reads them."""
+    spool = TickSpool(tmp_path_factory.mktemp("ticks") / "ticks", TICKS[0].object_id.shape[1])
+    for batch in TICKS:
+        spool.add(tick_rows(batch)[0])
+    spool.flush()
+    return read_ticks(spool.path, spool.instances)
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +84,7 @@ def test_object_poses_and_visibility_at_every_tick(stage, instance):
         assert (UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited) == present
         if present:
             np.testing.assert_allclose(world_matrix(prim, frame), matrix(batch.pose[0, instance]), atol=5e-7)
+    np.testing.assert_allclose(world_matrix(prim, Usd.TimeCode.Default()), matrix(TICKS[0].pose[0, instance]), atol=5e-7)
 
 
 @pytest.mark.parametrize("index", range(3))
@@ -100,11 +98,17 @@ def test_fixture_poses_and_visibility_at_every_tick(stage, index):
     np.testing.assert_allclose(world_matrix(prim, Usd.TimeCode.Default()), matrix(TICKS[0].fixture_pose[0, index]), atol=5e-7)
 
 
-def test_visibility_changes_at_the_tick_and_not_before(stage):
+def test_visibility_changes_at_the_tick_and_resting_prims_have_no_samples(stage):
+    """Quaternions are continuous."""
     prim = UsdGeom.Imageable(stage.GetPrimAtPath(f"/Episode/Objects/instance_{usd_sets.PICKED:02d}"))
     assert prim.ComputeVisibility(usd_sets.PICKED_FRAME - 0.01) == UsdGeom.Tokens.inherited
     assert prim.ComputeVisibility(usd_sets.PICKED_FRAME) == UsdGeom.Tokens.invisible
     assert prim.GetVisibilityAttr().GetTimeSamples() == [0.0, usd_sets.PICKED_FRAME]
+    assert not UsdGeom.Xformable(stage.GetPrimAtPath("/Episode/Objects/instance_03")).TransformMightBeTimeVarying()
+    orient = stage.GetPrimAtPath("/Episode/Objects/instance_00").GetAttribute("xformOp:orient")
+    assert orient.GetTimeSamples() == list(range(usd_sets.FRAMES))
+    values = [np.array([q.GetReal(), *q.GetImaginary()]) for q in map(orient.Get, range(usd_sets.FRAMES))]
+    assert all(first @ second > 0.9 for first, second in pairwise(values))
 
 
 GONE = {
@@ -116,34 +120,13 @@ GONE = {
 
 @pytest.mark.parametrize(("path", "span"), GONE.items())
 def test_what_is_not_in_the_scene_is_beyond_the_far_plane_for_readers_without_visibility(stage, path, span):
+    """It leaves and returns within a moment before the frame: until then it stays where it was, so that nobody sees it fly past."""
     prim = stage.GetPrimAtPath(path)
     for frame in range(usd_sets.FRAMES):
         distance = np.linalg.norm(world_matrix(prim, frame)[:3, 3])
         assert distance > 2 * CLIPPING[1] if not span[0] <= frame < span[1] else distance < CLIPPING[1]
-
-
-@pytest.mark.parametrize(("path", "span"), GONE.items())
-def test_it_leaves_and_returns_within_a_moment_before_the_frame(stage, path, span):
-    """Between two frames it stays where it was, so that nobody sees it fly past."""
-    prim = stage.GetPrimAtPath(path)
-    for frame in span:
-        if frame:
-            np.testing.assert_array_equal(world_matrix(prim, frame - 0.01)[:3, 3], world_matrix(prim, frame - 1)[:3, 3])
-
-
-def test_default_values_are_the_first_frame(stage):
-    for instance in (0, 2, 3):
-        prim = stage.GetPrimAtPath(f"/Episode/Objects/instance_{instance:02d}")
-        np.testing.assert_allclose(world_matrix(prim, Usd.TimeCode.Default()), matrix(TICKS[0].pose[0, instance]), atol=5e-7)
-
-
-def test_resting_prims_have_no_samples_and_quaternions_are_continuous(stage):
-    resting = UsdGeom.Xformable(stage.GetPrimAtPath("/Episode/Objects/instance_03"))
-    assert not resting.TransformMightBeTimeVarying()
-    orient = stage.GetPrimAtPath("/Episode/Objects/instance_00").GetAttribute("xformOp:orient")
-    assert orient.GetTimeSamples() == list(range(usd_sets.FRAMES))
-    values = [np.array([q.GetReal(), *q.GetImaginary()]) for q in map(orient.Get, range(usd_sets.FRAMES))]
-    assert all(first @ second > 0.9 for first, second in pairwise(values))
+    for frame in filter(None, span):
+        np.testing.assert_array_equal(world_matrix(prim, frame - 0.01)[:3, 3], world_matrix(prim, frame - 1)[:3, 3])
 
 
 def test_instances_have_all_ids_and_labels(stage):
@@ -154,31 +137,22 @@ def test_instances_have_all_ids_and_labels(stage):
         assert list(UsdSemantics.LabelsAPI(prim, "instance").GetLabelsAttr().Get()) == [str(instance)]
         primvars = UsdGeom.PrimvarsAPI(prim)
         assert [primvars.GetPrimvar(name).Get() for name in ("instance_id", "obj_id")] == [instance, obj_id]
-        assert prim.GetDisplayName() == {3: "three", 1: "one", 2: "two"}[obj_id]
+        assert prim.GetDisplayName() == NAMES[obj_id]
 
 
 SKEW = Camera(640, 400, np.array([[900.0, 0, 301.5], [0, 850.0, 222.25], [0, 0, 1]]), LENSES[1].rotation, np.array([0.1, -0.2, 1.5]))
 
 
-@given(
-    st.integers(0, 3),
-    st.tuples(*[st.floats(-0.4, 0.4)] * 3),
-)
-def test_usd_cameras_project_like_ours(tmp_path_factory, index, point):
-    lenses = (*LENSES, SKEW)
-    stage = _cameras_stage(tmp_path_factory, lenses)
-    camera = lenses[index]
+@pytest.fixture(scope="module")
+def skewed(rows) -> Usd.Stage:
+    return open_episode(rows, (*LENSES, SKEW))
+
+
+@given(st.integers(0, 3), st.tuples(*[st.floats(-0.4, 0.4)] * 3))
+def test_usd_cameras_project_like_ours(skewed, index, point):
+    camera = (*LENSES, SKEW)[index]
     x, y, z = camera.matrix @ (camera.rotation @ point + camera.translation)
-    np.testing.assert_allclose(project(stage, index, camera, np.array(point)), (x / z, y / z), atol=1e-3)
-
-
-STAGES: list[Usd.Stage] = []
-
-
-def _cameras_stage(tmp_path_factory, lenses) -> Usd.Stage:
-    if not STAGES:
-        STAGES.append(open_episode(spool_ticks(tmp_path_factory.mktemp("cameras")), lenses))
-    return STAGES[0]
+    np.testing.assert_allclose(project(skewed, index, camera, np.array(point)), (x / z, y / z), atol=1e-3)
 
 
 def project(stage: Usd.Stage, index: int, camera: Camera, point: np.ndarray) -> tuple[float, float]:
@@ -265,12 +239,17 @@ def test_aperture_is_36_mm_and_render_products_have_the_resolution(stage):
         assert product.GetCameraRel().GetTargets() == [lens.GetPath()]
 
 
+def toward(azimuth: float, polar: float, yaw: float = 0.0) -> np.ndarray:
+    """Direction by its angles [degrees], turned about z [rad]."""
+    a, p = np.radians(azimuth) + yaw, np.radians(polar)
+    return np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
+
+
 def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> EnvironmentMap:
     """A dim map with a bright region, and the sun that replaces it. A sharpness of 100 is too wide for a distant light."""
-    a, p = np.radians(azimuth), np.radians(polar)
-    toward = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
-    radiance = 0.2 + 30.0 * np.exp(sharpness * (map_directions(rows)[0] @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
-    return EnvironmentMap("sunny", radiance.astype(np.float32), Sun(toward, irradiance * np.array([1.0, 0.8, 0.5])))
+    place = toward(azimuth, polar)
+    radiance = 0.2 + 30.0 * np.exp(sharpness * (map_directions(rows)[0] @ place - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
+    return EnvironmentMap("sunny", radiance.astype(np.float32), Sun(place, irradiance * np.array([1.0, 0.8, 0.5])))
 
 
 @pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0), (170.0, 75.0)])
@@ -290,9 +269,7 @@ def test_the_dome_light_has_the_orientation_of_the_renderer(tmp_path, rows, azim
     latitude = np.pi / 2 - (row + 0.5) / picture.shape[0] * np.pi
     local = np.array([np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)])
     direction = world_matrix(stage.GetPrimAtPath("/Episode/Lights/Dome"), 0)[:3, :3] @ local
-    a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
-    expected = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
-    assert np.degrees(np.arccos(direction @ expected)) < 180.0 / ROWS
+    assert np.degrees(np.arccos(direction @ toward(azimuth, polar, usd_sets.YAW))) < 180.0 / ROWS
 
 
 def test_the_dome_light_is_oriented_by_usds_own_operation(rows):
@@ -314,8 +291,7 @@ def test_distant_lights_have_direction_angle_and_irradiance_of_the_sun(rows, azi
     stage = open_episode(rows, lights=(light, light))
     sun = UsdLux.DistantLight.Get(stage, "/Episode/Lights/Sun")
     direction = world_matrix(sun.GetPrim(), 0)[:3, :3] @ [0.0, 0.0, -1.0]
-    a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
-    np.testing.assert_allclose(direction, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
+    np.testing.assert_allclose(direction, -toward(azimuth, polar, usd_sets.YAW), atol=1e-6)
     assert sun.GetNormalizeAttr().Get()
     assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(separate_sun(light)[2]), rel=1e-5)
     irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
@@ -331,10 +307,6 @@ def test_exposure_is_folded_into_the_intensity(stage):
     assert dome.GetIntensityAttr().Get() == pytest.approx(light.intensity * 2.0**usd_sets.EXPOSURE)
     assert dome.GetExposureAttr().Get() == 0.0
     assert dome.GetPrim().GetAttribute("userProperties:exposure").Get() == usd_sets.EXPOSURE
-
-
-def test_maps_without_a_sun_have_none(stage):
-    assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
 
 
 @pytest.mark.parametrize("irradiance", [0.01, 3.0, 100.0])
@@ -360,10 +332,10 @@ def test_map_and_sun_are_separated_like_in_the_renderer(irradiance, rows, sharpn
         np.testing.assert_allclose(separated, expected, rtol=1e-4)
 
 
-def test_wide_suns_stay_in_the_map(rows):
+def test_maps_without_a_sun_have_none_and_wide_suns_stay_in_the_map(stage, rows):
     light = sunny(30.0, 50.0, sharpness=100.0)
-    stage = open_episode(rows, lights=(light, light))
-    assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
+    for each in (stage, open_episode(rows, lights=(light, light))):
+        assert not each.GetPrimAtPath("/Episode/Lights/Sun")
 
 
 @pytest.mark.parametrize(
