@@ -1,4 +1,5 @@
-"""Faults to plant in a copy of a correct data set: the rule that must find each, words of its message, and how it is planted."""
+"""Faults to plant in a copy of a correct data set: the rule that must find each, words of its message, and how it is planted. Plants are
+functions of the set's folder that edit annotations, images, masks or bytes."""
 
 from __future__ import annotations
 
@@ -6,44 +7,130 @@ import io
 import json
 import os
 import tarfile
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import trimesh
 
 from synpick_warp.codes import Outcome, Share
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
-from tests.validation.planting import (
-    CAMERA,
-    COCO,
-    GT,
-    INFO,
-    MODELS,
-    SCENE,
-    SHARD,
-    TARGETS,
-    Plant,
-    doubled,
-    drop,
-    gone,
-    mask_path,
-    moved,
-    named,
-    pixels,
-    put,
-    raw,
-    read,
-    trials,
-    whole,
-    write,
-)
+from synpick_warp.dataset.reading import open_data_set
+from synpick_warp.exporters.picks import make_table, pick_files
+from synpick_warp.views.picks import COLUMNS
+from tests.harness.hostile import removed, replaced
+
+SCENE = "train/000001"
+GT, INFO, CAMERA, COCO = (f"{SCENE}/scene_{name}.json" for name in ("gt", "gt_info", "camera", "gt_coco"))
+MODELS, TARGETS, SHARD = "models/models_info.json", "test_targets_bop19.json", "train_web/shard-000000.tar"
+Plant = Callable[[Path], Any]
+
+
+def edit(path: Path, change: Callable[[Any], Any]) -> None:
+    """Change a JSON file in place."""
+    content = json.loads(path.read_text())
+    changed = change(content)
+    path.write_text(json.dumps(content if changed is None else changed))
+
+
+def edit_entry(folder: Path, name: str, index: int | None = None, image: str = "1", **values: Any) -> None:
+    """Set keys of an entry in a scene's JSON file."""
+    edit(folder / SCENE / f"scene_{name}.json", lambda content: (content[image] if index is None else content[image][index]).update(values))
+
+
+def whole(name: str, change: Callable[[Any], Any]) -> Plant:
+    """A JSON file's content is changed in place or, if the change returns something, replaced."""
+    return lambda folder: edit(folder / name, change)
+
+
+def put(name: str, *place: Any) -> Plant:
+    """The last of the arguments stands at the place that the others name."""
+    return whole(name, lambda content: replaced(content, place[:-1], place[-1]))
+
+
+def moved(name: str, *place: Any) -> Plant:
+    """A number at a place of a JSON file is larger by the last argument; numbers in a list, each."""
+
+    def add(content: Any) -> Any:
+        value = content
+        for key in place[:-1]:
+            value = value[key]
+        return replaced(content, place[:-1], np.add(value, place[-1]).tolist())
+
+    return whole(name, add)
+
+
+def drop(name: str, *place: Any) -> Plant:
+    """A JSON file lacks what stands at a place."""
+    return whole(name, lambda content: removed(content, place))
+
+
+def gone(name: str) -> Plant:
+    """A file is missing."""
+    return lambda folder: (folder / name).unlink()
+
+
+def named(name: str, other: str) -> Plant:
+    """A file or folder has another name."""
+    return lambda folder: (folder / name).rename(folder / other)
+
+
+def doubled(name: str, other: str) -> Plant:
+    """A file is there twice."""
+    return lambda folder: (folder / other).write_bytes((folder / name).read_bytes())
+
+
+def raw(name: str, change: Callable[[bytes], bytes]) -> Plant:
+    """A file has other bytes."""
+    return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+def trials(change: Callable[[np.ndarray], Any]) -> Plant:
+    """The trials of picks are changed in place or, if the change returns some, replaced."""
+
+    def damage(folder: Path) -> None:
+        path, rows = folder / pick_files(0)[0], open_data_set(folder)[0].picks
+        changed = change(rows)
+        pq.write_table(make_table(COLUMNS, rows if changed is None else changed), path)
+
+    return damage
+
+
+def pixels(name: str, change: Callable[[np.ndarray], np.ndarray]) -> Plant:
+    """Images of scene 1 whose names fit the pattern have other pixels; a change in place returns the image, too."""
+
+    def plant(folder: Path) -> None:
+        paths = list((folder / SCENE).glob(name))
+        assert paths
+        for path in paths:
+            write(path, change(read(path)))
+
+    return plant
+
+
+def read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return image
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    assert cv2.imwrite(str(path), image)
+
+
+def mask_path(folder: Path, index: int, kind: str = "mask") -> Path:
+    return folder / SCENE / kind / f"000001_{index:06d}.png"
+
+
+# ---- the faults ----
 
 Faults = dict[str, tuple[str, str, Plant]]
 RGB, DEPTH, MASK, VISIBLE = "rgb/000001.png", "depth/000001.png", "mask/000001_000001.png", "mask_visib/000001_000001.png"
-PLY = "models/obj_000007.ply"
+PLY, SEEN = "models/obj_000007.ply", "mask_visib/000001_000000.png"
 
 
 def link_image_out_of_the_set(folder: Path) -> None:
@@ -51,9 +138,10 @@ def link_image_out_of_the_set(folder: Path) -> None:
     os.symlink(outside, folder / SCENE / RGB)
 
 
-def in_metres(entries: list[dict[str, Any]], key: str) -> None:
+def scaled(entries: Iterable[dict[str, Any]], key: str, *factors: float) -> None:
+    """A vector of each entry is scaled."""
     for item in entries:
-        item[key] = [value / 1000.0 for value in item[key]]
+        item[key] = np.multiply(item[key], factors).tolist()
 
 
 FILES: Faults = {
@@ -70,11 +158,7 @@ FILES: Faults = {
     "odd file name": ("image-names", "", doubled(f"{SCENE}/{RGB}", f"{SCENE}/rgb/1.png")),
     "missing depth": ("image-missing", "", gone(f"{SCENE}/{DEPTH}")),
     "missing mask": ("image-missing", "", gone(f"{SCENE}/mask/000001_000002.png")),
-    "mask beyond the list": (
-        "image-extra",
-        "no instance 7",
-        doubled(f"{SCENE}/mask/000001_000000.png", f"{SCENE}/mask/000001_000007.png"),
-    ),
+    "mask beyond the list": ("image-extra", "no instance 7", doubled(f"{SCENE}/{MASK}", f"{SCENE}/mask/000001_000007.png")),
     "image without entry": ("image-extra", "no entry 9", doubled(f"{SCENE}/{RGB}", f"{SCENE}/rgb/000009.png")),
 }
 
@@ -103,22 +187,14 @@ ANNOTATIONS: Faults = {
     "image without truth": ("same-images", "", whole(GT, lambda content: {"0": content["0"]})),
     "mirrored rotation": ("rotation", "determinant is -1", put(GT, "1", 1, "cam_R_m2c", [1, 0, 0, 0, 1, 0, 0, 0, -1])),
     "scaled rotation": ("rotation", "cam_R_w2c", put(CAMERA, "1", "cam_R_w2c", [1.01, 0, 0, 0, 1, 0, 0, 0, 1])),
-    "two camera models": (
-        "camera-model",
-        "both",
-        whole(CAMERA, lambda content: content["1"].update(cam_model={"projection_params": [1.0]})),
-    ),
+    "two camera models": ("camera-model", "both", put(CAMERA, "1", "cam_model", {"projection_params": [1.0]})),
     "transposed intrinsics": ("camera-model", "column by column", put(CAMERA, "1", "cam_K", [600.0, 0, 0, 0, 600.0, 0, 100.0, 75.0, 1])),
     "no depth scale": ("depth-scale", "", drop(CAMERA, "1", "depth_scale")),
     "translation of minus one": ("skip-translation", "", put(GT, "1", 1, "cam_t_m2c", [-1, -1, -1])),
-    "pose in metres": ("translation-units", "metres", whole(GT, lambda content: in_metres(content["1"], "cam_t_m2c"))),
-    "camera in metres": ("camera-units", "metres", whole(CAMERA, lambda content: in_metres(list(content.values()), "cam_t_w2c"))),
+    "pose in metres": ("translation-units", "metres", whole(GT, lambda content: scaled(content["1"], "cam_t_m2c", 1e-3))),
+    "camera in metres": ("camera-units", "metres", whole(CAMERA, lambda content: scaled(content.values(), "cam_t_w2c", 1e-3))),
     "half of the extrinsics": ("extrinsics", "", drop(CAMERA, "1", "cam_t_w2c")),
-    "OpenGL pose": (
-        "behind-camera",
-        "",
-        whole(GT, lambda content: content["1"][0].update(cam_t_m2c=np.multiply(content["1"][0]["cam_t_m2c"], (1, -1, -1)).tolist())),
-    ),
+    "OpenGL pose": ("behind-camera", "", whole(GT, lambda content: scaled(content["1"][:1], "cam_t_m2c", 1.0, -1.0, -1.0))),
     "instance twice": ("instance-ids", "2 times", put(GT, "1", 0, "instance_id", 3)),
     "unknown object": ("object-model", "obj_id 99", put(GT, "1", 0, "obj_id", 99)),
     "short infos": ("list-lengths", "", drop(INFO, "1", -1)),
@@ -152,6 +228,7 @@ def row_major(content: dict[str, Any]) -> None:
         runs["counts"] = np.diff(np.concatenate(([0], edges, [height * width]))).tolist()
 
 
+ids_from_zero = whole(COCO, lambda content: [item.update(id=item["id"] - 1) for item in content["annotations"]] and None)
 IMAGES: Faults = {
     "truncated image": ("image-decodes", "", raw(f"{SCENE}/{RGB}", lambda data: data[:100])),
     "small depth": ("image-size", "100 x 75", pixels(DEPTH, lambda image: image[::2, ::2])),
@@ -168,11 +245,7 @@ IMAGES: Faults = {
     "visible box with one more": ("visible-box", "+ 1", moved(INFO, "1", 0, "bbox_visib", [0, 0, 1, 1])),
     "amodal box with one more": ("amodal-box", "+ 1", moved(INFO, "1", 2, "bbox_obj", [0, 0, 1, 1])),
     "COCO without categories": ("coco-schema", "", drop(COCO, "categories")),
-    "COCO ids from zero": (
-        "coco-ids",
-        "id 0",
-        whole(COCO, lambda content: [item.update(id=item["id"] - 1) for item in content["annotations"]] and None),
-    ),
+    "COCO ids from zero": ("coco-ids", "id 0", ids_from_zero),
     "COCO wrong file name": ("coco-images", "file_name", put(COCO, "images", 0, "file_name", "000000.png")),
     "COCO categories from one": ("coco-categories", "", put(COCO, "categories", [{"id": 1, "name": "1"}])),
     "COCO annotation missing": ("coco-instances", "", drop(COCO, "annotations", -1)),
@@ -248,13 +321,12 @@ def depth_of_rays(folder: Path) -> None:
     pixels("depth/*", lengthen)(folder)
 
 
-def swap(entries: list[Any], first: int, second: int) -> None:
-    entries[first], entries[second] = entries[second], entries[first]
-
-
-def swap_objects(content: dict[str, Any]) -> None:
-    one, two = content["1"][1:3]
-    one["obj_id"], two["obj_id"] = two["obj_id"], one["obj_id"]
+def swap(entries: Any, first: Any, second: Any, key: str = "") -> None:
+    """Swap two entries, or what they have at a key."""
+    if key:
+        entries[first][key], entries[second][key] = entries[second][key], entries[first][key]
+    else:
+        entries[first], entries[second] = entries[second], entries[first]
 
 
 def masks_swapped(folder: Path) -> None:
@@ -267,6 +339,10 @@ def masks_swapped(folder: Path) -> None:
 def turn(content: dict[str, Any]) -> None:
     about_z = np.array([[np.cos(0.5), -np.sin(0.5), 0.0], [np.sin(0.5), np.cos(0.5), 0.0], [0.0, 0.0, 1.0]])
     content["1"][2]["cam_R_m2c"] = (about_z @ np.reshape(content["1"][2]["cam_R_m2c"], (3, 3))).ravel().tolist()
+
+
+def half_of_a_mask(mask: np.ndarray) -> np.ndarray:
+    return fill(mask, np.s_[:, : int(np.flatnonzero(mask.any(axis=0)).mean())], 0)
 
 
 def mask_of_a_box(mask: np.ndarray) -> np.ndarray:
@@ -305,26 +381,15 @@ RENDERED: Faults = {
     "depth of rays": ("depth-planar", "", depth_of_rays),
     "masks shifted": ("mask-shifted", "(3, 0)", pixels("mask*/*_000001.png", lambda image: np.roll(image, 3, axis=1))),
     "mask shifted by one pixel": ("mask-shifted", "(0, -1)", pixels(MASK, lambda image: np.roll(image, -1, axis=0))),
-    "visible masks shifted": (
-        "mask-shifted",
-        "mask_visib is shifted by (4, 0)",
-        pixels("mask_visib/000001_000000.png", lambda image: np.roll(image, 4, axis=1)),
-    ),
-    "object ids swapped": ("object-shown", "object 7", whole(GT, swap_objects)),
+    "visible masks shifted": ("mask-shifted", "mask_visib is shifted by (4, 0)", pixels(SEEN, lambda image: np.roll(image, 4, axis=1))),
+    "object ids swapped": ("object-shown", "object 7", whole(GT, lambda content: swap(content["1"], 1, 2, "obj_id"))),
     "masks swapped": ("instances-swapped", "instances 0 and 2", masks_swapped),
     "truths swapped": ("instances-swapped", "instances 0 and 1", whole(GT, lambda content: swap(content["1"], 0, 1))),
     "pose moved sideways": ("pose", "about", moved(GT, "1", 0, "cam_t_m2c", [12.0, 0.0, 0.0])),
     "pose moved away": ("pose", "about 8 mm", moved(GT, "1", 2, "cam_t_m2c", [0.0, 0.0, -8.0])),
     "pose turned": ("pose", "does not fit", whole(GT, turn)),
     "mask of a box": ("mask-rendered", "", pixels(MASK, mask_of_a_box)),
-    "half of the visible mask": (
-        "visible-rendered",
-        "",
-        pixels(
-            "mask_visib/000001_000000.png",
-            lambda image: fill(image, np.s_[:, : int(np.flatnonzero(image.any(axis=0)).mean())], 0),
-        ),
-    ),
+    "half of the visible mask": ("visible-rendered", "", pixels(SEEN, half_of_a_mask)),
     "depth of something else": ("depth-rendered", "", depth_of_something_else),
 }
 PICKS: Faults = {
@@ -333,16 +398,8 @@ PICKS: Faults = {
     "trials of a candidate gone": ("picks-tables", "row 0 is 12; allowed: 11, which", trials(lambda rows: rows[rows["candidate"] > 0])),
     "normal too long": ("picks-tables", "allowed: a unit vector", trials(lambda rows: put_value(rows, "normal", (0.0, 0.0, 2.0)))),
     "seal above 1": ("picks-tables", "row 0 is 1.5; allowed: 0 to 1", trials(lambda rows: put_value(rows, "seal", 1.5))),
-    "pixel beside": (
-        "picks-pixels",
-        "does not project to its pixel",
-        trials(lambda rows: put_value(rows, "column", rows["column"][0] + 1)),
-    ),
-    "point above the surface": (
-        "picks-surface",
-        "from the surface",
-        trials(lambda rows: put_value(rows, "point", rows["point"][0] + 0.02)),
-    ),
+    "pixel beside": ("picks-pixels", "not project to its pixel", trials(lambda rows: put_value(rows, "column", rows["column"][0] + 1))),
+    "point above the surface": ("picks-surface", "from the surf", trials(lambda rows: put_value(rows, "point", rows["point"][0] + 0.02))),
     "other instance": ("picks-surface", "from the surface of its instance", trials(lambda rows: put_value(rows, "instance", 3))),
     "hidden instance": ("picks-pixels", "does not show its instance", trials(lambda rows: put_value(rows, "instance", 3))),
     "other object": ("picks-surface", "not an object of that obj_id", trials(lambda rows: put_value(rows, "obj_id", 7))),
@@ -352,4 +409,4 @@ PICKS: Faults = {
     "own grasp with another outcome": ("picks-own", "its outcome is dropped, that of attempt 0 is target_picked", other_outcome),
     "own grasp of no attempt": ("picks-own", "no attempt chose from frame 0", trials(lambda rows: put_value(rows, "share", 0))),
 }
-FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | PICKS | ANNOTATIONS | IMAGES | SETS | RENDERED
+FAULTS = FILES | ANNOTATIONS | IMAGES | SETS | PICKS | RENDERED
