@@ -11,6 +11,7 @@ import trimesh
 import warp as wp
 
 import synpick_warp
+from synpick_warp.configs.calibration.lens import make_lens_map
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
@@ -153,6 +154,15 @@ def test_two_instances_share_a_mesh(tmp_path):
     left, right = (np.argwhere(views["instance"][0] == number)[:, 1] for number in (1, 2))
     assert left.max() < 32 <= right.min()
     assert len(left) == len(right) > 100
+
+
+def test_a_lens_moves_the_edges_of_the_cube():
+    """A point at a slope s is at 64 s (1 + 20 s²) px from the centre."""
+    lens = make_lens_map("pinhole", (20.0, 0.0, 0.0, 0.0), (64.0, 64.0, 32.0, 24.0), (64, 48))
+    views = synpick_warp.render([(CUBE, at(0.0))], [CAMERA, dataclasses.replace(CAMERA, lens=lens)], device="cpu")
+    slope = SIDE / 2 / (HEIGHT - SIDE / 2)
+    for view, edge in enumerate((64.0 * slope, 64.0 * slope * (1 + 20.0 * slope**2))):
+        assert np.array_equal(views["instance"][view][24], np.abs(np.arange(64) + 0.5 - 32) < edge)
 
 
 @pytest.mark.parametrize(
