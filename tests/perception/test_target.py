@@ -11,7 +11,7 @@ from synpick_warp.codes import MAX_INSTANCES, Mode, Outcome, Phase, Stream
 from synpick_warp.stages.arrays import count_words
 from tests.twins import planning, rng
 from tests.twins.planning import PlannerHarness, paint_shapes
-from tests.worlds.kernel_worlds import filled
+from tests.worlds.kernel_worlds import cup_places, filled
 
 SEED = 9
 
@@ -148,9 +148,8 @@ def chosen(device, images, failures=0, flat=True, seed=1, attempt=0, cups=((0.0,
     ids, depths = zip(*images, strict=True)
     harness = PlannerHarness(device, list(ids), list(depths), 1)
     harness.planner.flat = flat
-    harness.worlds.cups = cups
     filled(harness.scene.suction, {"radius": RADIUS})
-    harness.scene.cups.count, harness.scene.cups.place = len(cups), harness.worlds._places()
+    harness.scene.cups.count, harness.scene.cups.place = len(cups), cup_places(cups, device)
     harness.worlds.begin(Phase.ACT)
     harness.arrays.distance.assign(harness.expected["distance"])
     harness.observation.distances.fill_(30.0)

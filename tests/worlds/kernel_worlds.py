@@ -72,6 +72,11 @@ MOVE: dict[str, Any] = {
 """Default members of the structs, overridden by the fields of `KernelWorlds` with the same names in lower case."""
 
 
+def cup_places(cups: Sequence[tuple[float, float]], device: Any, tcp_offset: float = MOVE["tcp_offset"]) -> wp.array:
+    """Places of cups in the frame of the wrist [m]."""
+    return wp.array([(x, y, -tcp_offset) for x, y in cups], dtype=wp.vec3, device=device)
+
+
 @dataclass
 class KernelWorlds:
     """State and constants of worlds, which stages take by GROUPS; arrays are read and written by name."""
@@ -112,7 +117,7 @@ class KernelWorlds:
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
         move = MOVE | self.move
         layout = {"gripper_bodies": GRIPPER_BODIES, "gripper_dofs": GRIPPER_DOFS, "shapes": SHAPES, "finger_shape": 10}
-        places = wp.array([(x, y, -move["tcp_offset"]) for x, y in self.cups], dtype=wp.vec3, device=self.device)
+        places = cup_places(self.cups, self.device, move["tcp_offset"])
         parts = [WorldPart(*part) for part in self.parts]
         self.scene = SceneData(
             fill(structs.LayoutData, self, **layout),
