@@ -15,7 +15,7 @@ import trimesh
 import yaml
 
 import synpick_warp
-from synpick_warp.apps.evaluation.models import read_models
+from synpick_warp.apps.evaluation.errors import read_models
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.calibration.files import Calibration, read_calibration
 from synpick_warp.configs.cell.bins import BinRow

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
@@ -41,14 +41,12 @@ def make_progress(console: Console, remark: object = "") -> Progress:
     return LiveProgress(console, remark) if console.is_terminal else PlainProgress(console, remark)
 
 
-class LiveProgress:
-    """Live progress bar: stage, episodes, worlds, views, rate, remaining time."""
+class LiveBar:
+    """Live progress bar, which is shown within a `with` statement."""
 
-    def __init__(self, console: Console, remark: object = "") -> None:
-        self._remark = remark
-        stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
-        columns = (stage, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
-        self._bar = Bar(*columns, console=console, transient=True)
+    def __init__(self, console: Console, *columns: ProgressColumn, disable: bool = False) -> None:
+        name = TextColumn("{task.description}", markup=False)
+        self._bar = Bar(name, *columns, console=console, transient=True, disable=disable)
         self._task = self._bar.add_task("starting", total=None, detail="")
 
     def __enter__(self) -> Self:
@@ -57,6 +55,15 @@ class LiveProgress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+
+
+class LiveProgress(LiveBar):
+    """Live progress bar of a bake: stage, episodes, worlds, views, rate, remaining time."""
+
+    def __init__(self, console: Console, remark: object = "") -> None:
+        self._remark = remark
+        detail = TextColumn("{task.fields[detail]}", markup=False)
+        super().__init__(console, BarColumn(bar_width=BAR_WIDTH), MofNCompleteColumn(), TimeElapsedColumn(), detail)
 
     def stage(self, text: str) -> None:
         """Show the stage's name beside the bar."""
@@ -110,29 +117,12 @@ class PlainProgress:
         self._console.file.flush()
 
 
-class CountProgress:
+class CountProgress(LiveBar):
     """Progress of a pass over a data set: a live bar on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bar = Bar(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        )
-        self._task = self._bar.add_task("starting", total=None)
-        self._printed_at = time.monotonic()
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
+        super().__init__(console, BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn(), disable=not console.is_terminal)
+        self._console, self._printed_at = console, time.monotonic()
 
     def report(self, unit: str, done: int, total: int) -> None:
         """Set the bar; without a terminal print a line, at most every PLAIN_INTERVAL. See `progress.Report`."""
@@ -142,6 +132,11 @@ class CountProgress:
             self._printed_at = now
             self._console.print(f"{unit} {done:,}/{total:,}", markup=False)
             self._console.file.flush()
+
+
+def count_on_stderr() -> CountProgress:
+    """Progress of a pass beside results on the standard output."""
+    return CountProgress(Console(stderr=True, highlight=False, soft_wrap=True))
 
 
 def print_summary(console: Console, summary: BakeSummary, out: Path | str) -> None:

@@ -1,7 +1,6 @@
 """Default folders and files of the commands: which data set is read, where outputs go.
 
-A data set is a folder with manifest.json and manifest/. Commands take the current folder if it is one, else the last data set in it:
-finished ones before unfinished ones, then by the time at which an episode was last committed, which neither reading nor checking changes.
+A data set is a folder with manifest.json and manifest/. Commands take the current folder if it is one, else that of a bake without --out.
 """
 
 from __future__ import annotations
@@ -9,13 +8,13 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from synpick_warp.cli.options import one_line
-from synpick_warp.errors import DatasetError, OutputError, escape
+from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
@@ -23,19 +22,8 @@ if TYPE_CHECKING:
 
 DEFAULT_NAME = "synpick-data"
 """Folder of a bake without --out."""
-_MAX_NAMED = 3
-"""Most folders that a message names."""
 OWN_SUFFIXES = (".png", ".jpg", ".jpeg", ".html", ".htm", ".csv")
 """Suffixes of pictures, pages and tables, which no format has in the data set's own folder: there, outputs may have them."""
-
-
-class _Found(NamedTuple):
-    """A data set in the current folder; the last one is the largest."""
-
-    finished: bool
-    committed: int
-    """Time at which an entry of the manifest was last written [ns]."""
-    folder: Path
 
 
 def is_data_set(folder: Path | str) -> bool:
@@ -54,59 +42,18 @@ def _has(path: str, kind: Callable[[int], bool]) -> bool:
 # ---- which data set is read ----
 
 
-def has_scenes(folder: Path) -> bool:
-    """Whether a data set has BOP scenes."""
-    return next(folder.glob("[!.]*/*/scene_camera*.json"), None) is not None
-
-
-def has_attempts(folder: Path) -> bool:
-    """Whether a data set has BOP scenes and pick attempts."""
-    try:
-        return (folder / "attempts.jsonl").stat().st_size > 0 and has_scenes(folder)
-    except OSError:
-        return False
-
-
-def has_images(folder: Path) -> bool:
-    """Whether a data set has BOP scenes or shards."""
-    return has_scenes(folder) or next(folder.glob("[!.]*_web/*.tar"), None) is not None
-
-
-_NEEDS: dict[Callable[[Path], bool], str] = {
-    has_scenes: "BOP scenes (--formats bop)",
-    has_attempts: "BOP scenes (--formats bop) with pick attempts (--mode pick, target, mixed or cycle)",
-    has_images: "images (--formats bop or shards)",
-}
-
-
-def find_data_set(named: Path | None, usage: str, suits: Callable[[Path], bool] | None = None) -> Path:
-    """Return the data set that is named, or else the last one of the current folder, which is announced on the standard error.
-
-    Args:
-        named: Folder that the user has named, which is not checked; None: none.
-        usage: How the command is called with a folder, for messages.
-        suits: Whether the command can use a data set; None: any.
-
-    Raises:
-        DatasetError: There is none.
-    """
+def find_data_set(named: Path | None, usage: str) -> Path:
+    """Return the data set that is named, which is not checked, or else the current folder or `DEFAULT_NAME` in it, which is announced on
+    the standard error. `usage`: how the command is called with a folder. Raises DatasetError if there is none."""
     if named is not None:
         url = store_url(named)
         return named if url is None else _fetch(url)
-    try:
-        found = [_Found(True, 0, Path.cwd())] if is_data_set(".") else sorted(_list_data_sets(), reverse=True)
-    except OSError as error:
-        raise DatasetError(f"the current folder cannot be read: {error.strerror}; name a data set: {usage}") from None
-    if not found:
+    found = next(filter(is_data_set, (".", DEFAULT_NAME)), None)
+    if found is None:
         raise DatasetError(f"there is no data set in the current folder; name one ({usage}), or make one first (synpick-warp bake)")
-    last = next((each for each in found if suits is None or suits(each.folder)), None)
-    if last is None:
-        needed = _NEEDS[suits] if suits else ""
-        here = ", ".join(str(each.folder) for each in found[:_MAX_NAMED])
-        raise DatasetError(f"no data set in the current folder ({escape(here)}) has {needed}; name one that has: {usage}")
-    state = "" if last.finished else ", which is not finished"
-    print(one_line(f"synpick-warp: data set: {last.folder}{state} (the last one here; {usage} takes another)"), file=sys.stderr)
-    return last.folder
+    folder = Path.cwd() if found == "." else Path(found)
+    print(one_line(f"synpick-warp: data set: {folder} ({usage} takes another)"), file=sys.stderr)
+    return folder
 
 
 _fetched: dict[Path, tuple[str, TemporaryDirectory[str]]] = {}
@@ -115,15 +62,13 @@ _fetched: dict[Path, tuple[str, TemporaryDirectory[str]]] = {}
 
 def _fetch(url: str) -> Path:
     """Copy a data set in an object store into a temporary folder, which `drop_fetched` deletes; returns the copy's folder."""
-    from rich.console import Console
-
-    from synpick_warp.cli.display import CountProgress
+    from synpick_warp.cli.display import count_on_stderr
     from synpick_warp.cloud.reading import copy_set
 
     place = TemporaryDirectory(prefix="synpick-read-")
     folder = Path(place.name) / url.rpartition("/")[2]
     _fetched[folder] = url, place
-    with CountProgress(Console(stderr=True, highlight=False)) as counter:
+    with count_on_stderr() as counter:
         copy_set(url, folder, report=counter.report)
     return folder
 
@@ -141,15 +86,6 @@ def name_fetched(text: str) -> str:
     return text
 
 
-def _list_data_sets() -> Iterator[_Found]:
-    """Yield the data sets among the folders in the current one."""
-    with os.scandir() as entries:
-        for entry in entries:
-            if not entry.name.startswith(".") and entry.is_dir() and is_data_set(entry.name):
-                committed = os.lstat(f"{entry.name}/manifest").st_mtime_ns
-                yield _Found(_has(f"{entry.name}/manifest/joined.json", stat.S_ISREG), committed, Path(entry.name))
-
-
 # ---- where outputs go ----
 
 
@@ -164,17 +100,10 @@ def beside(folder: Path, ending: str) -> Path:
 def check_output_file(
     out: Path, option: str, data_set: Path | None = None, inputs: Sequence[Path] = (), *, is_folder: bool = False
 ) -> None:
-    """Check that an output replaces no file of a data set, nor one that the command reads; call it before anything is read.
+    """Raise OutputError if an output replaces a file of a data set, or one that the command reads; call it before anything is read.
 
-    In the folder of a data set itself files may have the suffixes OWN_SUFFIXES; in its subfolders there are no outputs.
-
-    Args:
-        data_set: The data set that the command reads, which may be one of other programs.
-        inputs: Other files that the command reads.
-        is_folder: Whether it is a folder, which none is in the folder of a data set itself, either.
-
-    Raises:
-        OutputError: It does.
+    In the folder of a data set itself files, but no folders, may have the suffixes OWN_SUFFIXES; in its subfolders there are no outputs.
+    `data_set` is the one that the command reads, which may be one of other programs; `inputs` are other files that it reads.
     """
     from synpick_warp.exporters.writing.files import check_local
 
@@ -193,6 +122,18 @@ def check_output_file(
         if is_folder or place.parent != root or place.suffix.lower() not in OWN_SUFFIXES:
             kind = "folder" if is_folder else "file"
             raise OutputError(f"{option} is {out}, among the files of the data set {root}; name a {kind} outside of it")
+
+
+def check_new_folder(folder: Path, option: str) -> None:
+    """Raise OutputError unless a folder is new or empty, and below a folder; whether it can be written is not tested."""
+    try:
+        if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutputError(f"{option} is {folder}; allowed: a new or an empty folder")
+        parent = next(path for path in folder.absolute().parents if os.path.lexists(path))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{option} is {folder}: {getattr(error, 'strerror', None) or error}; name another folder") from error
+    if not parent.is_dir():
+        raise OutputError(f"{option} is {folder}, but {parent} is a file; name another folder")
 
 
 def open_split(folder: Path, split: str | None) -> DataSet:

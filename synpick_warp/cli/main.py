@@ -13,12 +13,11 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp._version import __version__
-from synpick_warp.cli.commands.convert import convert
+from synpick_warp.cli.commands.data_sets import convert, show_statistics, write_page
 from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate
 from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
-from synpick_warp.cli.commands.statistics import show_statistics, write_page
 from synpick_warp.cli.commands.validate import validate, verify
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
 from synpick_warp.cli.options import (
@@ -27,6 +26,7 @@ from synpick_warp.cli.options import (
     Count,
     WholeNumber,
     check_engine_options,
+    check_store_options,
     describe_limit,
     describe_misuse,
     one_line,
@@ -196,13 +196,13 @@ def bake(
     }
     profiles = profile or profile_out is not None
     several, names = parse_devices(devices, device, profiles), parse_splits(split)
-    resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     part = parse_shard(shard) if shard is not None else (0, 1)
-    DataLayout.of(resolved).plan_shard(names, part, "--shard")
-    _check_store_options(out, claim=claim, shard=shard, profile=profiles)
+    resolved = _resolve(config, given, resolution, set_, splits=split is not None)
+    planned = DataLayout.of(resolved).plan_shard(names, part, "--shard")
+    check_store_options(out, claim=claim, shard=shard, profile=profiles)
     check_engine_options(engine, workers, price, out, devices or shard, claim)
     if dry_run:
-        return _forecast(resolved, out, part, names)
+        return _forecast(resolved, out, [episode for split in planned for episode in split])
     out = out or _default_out()
     run = partial(_bake, resolved, out, part, names, several, claim, engine or "", workers, price)
     return _profiled(run, profile_out, out) if profiles else run()
@@ -357,24 +357,9 @@ def _resolve(
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
-def _check_store_options(out: Path | None, *, claim: bool, shard: str | None, profile: bool) -> None:
-    """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
-    url = store_url(out)
-    if claim and url is None:
-        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
-    if claim and shard is not None:
-        raise ConfigError("--claim and --shard both share out the episodes; drop one of them")
-    if url is not None and profile:
-        raise ConfigError(f"--profile writes beside a data set, and --out is {url}; profile a bake into a folder")
-
-
 def check_trace_file(trace: Path, out: Path) -> None:
-    """Check that a trace can be written, and not into the data set.
-
-    Raises:
-        ConfigError: The file is inside the data set, or its folder does not exist.
-        OutputError: It is inside another data set.
-    """
+    """Check that a trace can be written, and not into the data set; raises ConfigError if the file is inside the data set, or its folder
+    does not exist, and OutputError if it is inside another data set."""
     if trace.resolve().is_relative_to(out.resolve()):
         raise ConfigError(f"--profile-out is {trace}, inside the data set {out}; name a file outside of it")
     check_output_file(trace, "--profile-out")
@@ -405,21 +390,16 @@ def _default_out() -> Path:
     return Path(DEFAULT_NAME)
 
 
-def _forecast(config: Config, out: Path | None, shard: tuple[int, int], splits: Sequence[str]) -> int:
-    """Print the forecast of a bake; arguments as of `_bake`."""
+def _forecast(config: Config, out: Path | None, episodes: Sequence[int]) -> int:
     _check_inputs(config.bake.models, config.bake.lights)
-    from synpick_warp.cli.commands.forecast import print_forecast
+    from synpick_warp.cli.commands.doctor import print_forecast
 
-    return print_forecast(config, out, [episode for split in DataLayout.of(config).plan_shard(splits, shard) for episode in split])
+    return print_forecast(config, out, episodes)
 
 
 def _check_inputs(models: str, lights: str) -> None:
-    """Check that the folders of models and lights exist.
-
-    Raises:
-        CatalogError: There are no models.
-        LightError: There are no lights.
-    """
+    """Check that the folders of models and lights exist; raises CatalogError if there are no models, and LightError if there are no
+    lights."""
     if models and not os.path.isdir(models):
         raise CatalogError(
             f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF, STL or STEP files; "

@@ -29,11 +29,8 @@ _RESOLUTION = re.compile(r"([0-9]{1,9})[xX]([0-9]{1,9})")
 
 
 def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
-    """Parse the value of an integer option: decimal digits only, since what is rounded or read in another base is a guess.
-
-    Raises:
-        ConfigError: The text has another form.
-    """
+    """Parse the value of an integer option: decimal digits only, since what is rounded or read in another base is a guess. Raises
+    ConfigError if the text has another form."""
     text = tokens[0].value
     if _WHOLE.fullmatch(text) is None:
         option = tokens[0].keyword or "the number"
@@ -51,6 +48,10 @@ WholeNumber = Annotated[int, Parameter(converter=parse_whole_number)]
 Count = Annotated[int, Parameter(converter=parse_count)]
 """Type of count options that accept `auto`."""
 
+DataSetArgument = Annotated[
+    Path | None, Parameter(name="DIR", help="A data set (default: the current folder if it is one, or synpick-data in it).")
+]
+EpisodesOfOption = Annotated[str | None, Parameter(name="--split", help="Only the episodes of this split (default: all splits).")]
 PaperOption = Annotated[
     bool | None,
     Parameter(help="Show the numbers of the SynPick paper beside these, or don't (default: if the objects are those of the paper)."),
@@ -79,22 +80,14 @@ def describe_misuse(error: CycloptsError) -> str:
 
 
 def check_range(option: str, value: float, low: float, high: float) -> None:
-    """Check that the value of a numeric option lies in [low, high].
-
-    Raises:
-        ConfigError: It does not.
-    """
+    """Raise ConfigError unless the value of a numeric option lies in [low, high]."""
     if not low <= value <= high:
         shown = f"{value:g}" if isinstance(value, float) else value
         raise ConfigError(f"{option} is {shown}; allowed: {low} to {high}")
 
 
 def parse_resolution(text: str) -> list[int]:
-    """Parse "640x360" into width and height [px].
-
-    Raises:
-        ConfigError: The text has another form.
-    """
+    """Parse "640x360" into width and height [px]; raises ConfigError if the text has another form."""
     match = _RESOLUTION.fullmatch(text)
     if match is None:
         raise ConfigError(f"--resolution is {format_value(text)}; allowed: WIDTHxHEIGHT in pixels, such as 640x360")
@@ -107,11 +100,7 @@ def parse_splits(text: str | None) -> tuple[str, ...]:
 
 
 def parse_devices(devices: str | None, device: str | None, profile: bool) -> tuple[str, ...]:
-    """Parse "cuda:0,cuda:1" into names; None: no names.
-
-    Raises:
-        ConfigError: Another option cannot be beside it.
-    """
+    """Parse "cuda:0,cuda:1" into names; None: no names. Raises ConfigError if another option cannot be beside it."""
     if devices is None:
         return ()
     if device is not None:
@@ -122,13 +111,9 @@ def parse_devices(devices: str | None, device: str | None, profile: bool) -> tup
 
 
 def check_engine_options(engine: str | None, workers: int, price: float, out: Path | None, beside: str | None, claims: bool) -> None:
-    """Check --engine, --workers and --price. `beside`: value of an option that an engine excludes; `claims`: --claim is given, so
-    that workers on --devices have a price, too.
-
-    Raises:
-        ConfigError: An option is out of range, or does not go with the others.
-        DeviceError: There is no such engine.
-    """
+    """Check --engine, --workers and --price. `beside`: value of an option that an engine excludes; `claims`: --claim is given, so that
+    workers on --devices have a price, too. Raises ConfigError if an option is out of range, or does not go with the others, and DeviceError
+    if there is no such engine."""
     if engine is None and (workers or (price and not (claims and beside))):
         raise ConfigError("--workers and --price go with --engine; name one, such as ray. --price also goes with --claim --devices")
     check_range("--workers", workers, 0, MAX_WORKERS)
@@ -142,12 +127,19 @@ def check_engine_options(engine: str | None, workers: int, price: float, out: Pa
         raise ConfigError("--engine has workers claim episodes; drop --devices and --shard")
 
 
-def parse_shard(text: str) -> tuple[int, int]:
-    """Parse "0/4" into shard index and number of shards.
+def check_store_options(out: Path | None, *, claim: bool, shard: str | None, profile: bool) -> None:
+    """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
+    url = store_url(out)
+    if claim and url is None:
+        raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
+    if claim and shard is not None:
+        raise ConfigError("--claim and --shard both share out the episodes; drop one of them")
+    if url is not None and profile:
+        raise ConfigError(f"--profile writes beside a data set, and --out is {url}; profile a bake into a folder")
 
-    Raises:
-        ConfigError: The text has another form.
-    """
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Parse "0/4" into shard index and number of shards; raises ConfigError if the text has another form."""
     match = _SHARD.fullmatch(text)
     if match is None:
         raise ConfigError(f"--shard is {format_value(text)}; allowed: i/n with i from 0 to n - 1, such as 0/4")

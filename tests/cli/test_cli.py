@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp import __version__
-from synpick_warp.cli.commands import doctor, forecast
+from synpick_warp.cli.commands import doctor
 from synpick_warp.cli.main import app, main
 from synpick_warp.cli.options import EXAMPLES, MAX_LINE, one_line, parse_resolution, parse_shard
 from synpick_warp.codes import Ending
@@ -275,9 +275,8 @@ def plans(monkeypatch):
         rows = [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
         return [Term("poses", tuple(rows), ("bake.worlds",), (config.bake.worlds,), on_device=False)]
 
-    for command in (doctor, forecast):
-        monkeypatch.setattr(command, "plan_memory", plan_memory)
-        monkeypatch.setattr(command, "fit_to_device", lambda config, *_: config)
+    monkeypatch.setattr(doctor, "plan_memory", plan_memory)
+    monkeypatch.setattr(doctor, "fit_to_device", lambda config, *_: config)
 
 
 def test_doctor(capsys, plans, monkeypatch):
@@ -302,7 +301,7 @@ def test_a_dry_run_tells_what_a_bake_takes_and_writes_nothing(tmp_path, plans, b
     # Mode move at four times the speed, half the rounds: 51 frames, three cameras of 320 x 180 px; 103 kB a view in the format bop.
     assert all(words in text for words in ("1,000, of some 51 frames", "about 153,375", "about 15.8 GB", "at least 0.0 GiB"))
     disk = types.SimpleNamespace(free=12e9)
-    monkeypatch.setattr(forecast.shutil, "disk_usage", lambda path: disk)
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda path: disk)
     assert main(command) == 0
     assert "the disk may run full" in capsys.readouterr().out
     disk.free = 2e9

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -96,43 +95,18 @@ def test_without_a_data_set_the_commands_say_what_to_do(here, command):
     assert line.endswith(" DIR), or make one first (synpick-warp bake)")
 
 
-def touch(folder: Path, seconds: int, *, finished: bool = True) -> None:
-    if finished:
-        (folder / "manifest" / "joined.json").touch()
-    os.utime(folder / "manifest", (seconds, seconds))
-
-
-def test_the_last_data_set_is_the_finished_one_that_was_written_last(here, capsys):
-    """By the time of the last commit; verify reads the settings of each, and says whose manifest it is."""
-    for name, seconds, finished in (("b", 300, True), ("a", 200, True), ("c", 900, False), (".hidden", 999, True)):
-        touch(start(name, load_config("smoke")), seconds, finished=finished)
-    assert main(["verify"]) == 1
-    assert capsys.readouterr().err == "synpick-warp: data set: b (the last one here; synpick-warp verify DIR takes another)\n"
-    for name in ("a", "b"):
-        (here / name / "manifest" / "joined.json").unlink()
-        os.utime(here / name / "manifest", (100, 100))
-    assert main(["verify"]) == 1
-    assert capsys.readouterr().err.startswith("synpick-warp: data set: c, which is not finished (the last one here; ")
-
-
-def test_a_command_takes_the_last_data_set_that_it_can_read(made, here, capsys):
-    (here / "PICKS").symlink_to(made)
-    touch(start("zarr-only", load_config("smoke")), 2**32)
+def test_without_a_name_it_is_the_folder_of_a_bake_without_out_or_the_current_one(made, here, monkeypatch, capsys):
+    (here / "other").symlink_to(made)
+    assert main(["verify"]) == 2
+    capsys.readouterr()
+    (here / "other").rename(here / "synpick-data")
     assert main(["preview", "--views", "1"]) == 0
-    assert main(["explain"]) == 0
     captured = capsys.readouterr()
-    assert captured.out == "contact sheet: PICKS-contact-sheet.png\nexplanation: PICKS-explain.png\n"
-    assert captured.err.count("data set: PICKS (the last one here; ") == 2
-    assert Path("PICKS-explain.png").stat().st_size > 10_000
-    (here / "PICKS").unlink()
-    assert main(["preview"]) == 2
-    assert "no data set in the current folder (zarr-only) has BOP scenes (--formats bop); name one that has" in capsys.readouterr().err
-
-
-def test_within_a_data_set_it_is_the_one_and_a_named_one_is_not_announced(made, monkeypatch, capsys):
+    assert captured.out == "contact sheet: synpick-data-contact-sheet.png\n"
+    assert captured.err == "synpick-warp: data set: synpick-data (synpick-warp preview DIR takes another)\n"
     monkeypatch.chdir(made)
     assert main(["verify"]) == 0
-    assert f"data set: {made} (the last one here; " in capsys.readouterr().err
+    assert f"data set: {made} (synpick-warp verify DIR takes another)" in capsys.readouterr().err
     assert main(["verify", str(made)]) == 0
     assert capsys.readouterr().err == ""
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.apps.viz.cell.frusta import project
+from synpick_warp.apps.viz.frusta import project
 from synpick_warp.cli.commands import new_cell
 from synpick_warp.configs.cell.rig import intrinsics
 from synpick_warp.configs.episodes.objects import MATERIALS

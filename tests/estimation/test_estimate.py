@@ -16,8 +16,17 @@ from scipy.spatial.transform import Rotation
 
 import synpick_warp
 from synpick_warp.apps.estimation import run as estimation
-from synpick_warp.apps.estimation.gicp import MIN_POINTS, Aligner, read_object_models
-from synpick_warp.apps.estimation.run import REFINE, SINGLE, EstimationOptions, observed_points, read_scenes, run_estimation
+from synpick_warp.apps.estimation.run import (
+    MIN_POINTS,
+    REFINE,
+    SINGLE,
+    Aligner,
+    EstimationOptions,
+    observed_points,
+    read_object_models,
+    read_scenes,
+    run_estimation,
+)
 from synpick_warp.apps.estimation.scenes import ScenePlan
 from synpick_warp.cli.commands.estimate import parse_indices
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -258,7 +267,7 @@ def test_damaged_sets_and_a_missing_library_are_one_line(bop, tmp_path, monkeypa
         patch.setitem(sys.modules, "small_gicp", None)
         refuse("^estimate needs small_gicp")
     with monkeypatch.context() as patch:
-        patch.setattr("synpick_warp.apps.estimation.gicp.read_mesh", crash)
+        patch.setattr("synpick_warp.apps.estimation.run.read_mesh", crash)
         refuse(r"obj_\d{6}\.ply: the process that reads it crashed \(SIGSEGV\); repair or simplify the file$")
     image = bop / "train" / "000006" / "depth" / "000001.png"
     saved = image.read_bytes()

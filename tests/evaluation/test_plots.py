@@ -8,8 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.apps.evaluation.figures import write_figures
-from synpick_warp.apps.evaluation.plots import plot_error_by_speed, plot_error_by_visibility, plot_recall, plot_sweep, plot_trajectory
+from synpick_warp.apps.evaluation.figures import (
+    plot_error_by_speed,
+    plot_error_by_visibility,
+    plot_recall,
+    plot_sweep,
+    plot_trajectory,
+    write_figures,
+)
 from synpick_warp.apps.evaluation.tracking import filter_poses, sweep_alpha
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.system.codecs import charts

@@ -14,13 +14,24 @@ from scipy.spatial.transform import Rotation
 
 import synpick_warp
 from synpick_warp.apps.evaluation import results
-from synpick_warp.apps.evaluation.models import read_models
-from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.results import HEADER, ResultFile, check_results, encode_results, read_results, write_results
+from synpick_warp.apps.evaluation.errors import read_models
+from synpick_warp.apps.evaluation.results import (
+    HEADER,
+    ResultFile,
+    TargetRow,
+    check_results,
+    count_targets,
+    encode_results,
+    encode_targets,
+    in_layout,
+    read_results,
+    read_targets,
+    select_targets,
+    write_results,
+)
 from synpick_warp.apps.evaluation.run import make_methods
-from synpick_warp.apps.evaluation.targets import TargetRow, count_targets, encode_targets, in_layout, read_targets, select_targets
 from synpick_warp.apps.evaluation.tracking import filter_poses
-from synpick_warp.apps.evaluation.truth import instance_speeds, read_truth
+from synpick_warp.apps.evaluation.truth import PoseTable, instance_speeds, read_truth
 from synpick_warp.errors import CatalogError, DatasetError, ResultError
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 from tests.builders import refusal

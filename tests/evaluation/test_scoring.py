@@ -16,12 +16,24 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.evaluation import scoring
-from synpick_warp.apps.evaluation.auc import LIMIT, band_indices, error_bands, exact_auc, recall_curve, vocap_auc
-from synpick_warp.apps.evaluation.errors import VertexSearch, add_errors, adds_errors, rotation_errors, translation_errors
-from synpick_warp.apps.evaluation.models import expand_symmetries, read_models
-from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.errors import (
+    LIMIT,
+    VertexSearch,
+    add_errors,
+    adds_errors,
+    band_indices,
+    error_bands,
+    exact_auc,
+    expand_symmetries,
+    read_models,
+    recall_curve,
+    rotation_errors,
+    translation_errors,
+    vocap_auc,
+)
 from synpick_warp.apps.evaluation.scoring import ALL, METRICS, PER_INSTANCE, make_pairs, match, score
 from synpick_warp.apps.evaluation.tables import FORMATS, render, summarize
+from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.scenes.assets.models_info import FileModelInfo
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
 from synpick_warp.apps.evaluation import tracking
-from synpick_warp.apps.evaluation.poses import PoseTable
 from synpick_warp.apps.evaluation.tracking import filter_poses, find_tracks, sweep_alpha, track_of_instance
+from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.errors import ConfigError, DatasetError
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import FRAME, Motion, estimates, noisy_tables, true_poses

@@ -14,10 +14,9 @@ import vl_convert
 import synpick_warp
 from synpick_warp.apps.report.charts import ChartData, make_charts, object_labels
 from synpick_warp.apps.report.findings import NOTE, WARNING, Figures, find
-from synpick_warp.apps.report.sampling import (
+from synpick_warp.apps.report.frames import (
     Brightness,
     SampledEpisodes,
-    find_content,
     measure_brightness,
     read_episodes,
     sample_views,
@@ -131,7 +130,7 @@ def test_views_are_sampled_evenly_and_distinct(data):
     assert sorted(frame * 24 // 100 for _, frame, _ in many) == list(range(24))
     assert np.bincount([camera for _, _, camera in many]).tolist() == [8, 8, 8]
     view = opened[0].view(0)
-    assert find_content(view).masks
+    assert view.has("mask_visib")
     assert measure_brightness(view).mean == pytest.approx(float((view.rgb[::4, ::4] @ [0.2126, 0.7152, 0.0722]).mean()) / 255, abs=1e-4)
 
 

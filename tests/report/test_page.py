@@ -16,8 +16,8 @@ import pytest
 import synpick_warp
 from synpick_warp.apps.report import compose, write_report
 from synpick_warp.apps.report import page as page_module
-from synpick_warp.apps.report.album import Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
-from synpick_warp.apps.report.markup import Html, content_hash, element, embed_json, join, printable
+from synpick_warp.apps.report.frames import Album, EncodedPicture, Section, encode_ids, encode_photo, shrink
+from synpick_warp.apps.report.page import Html, content_hash, element, embed_json, join, printable
 from synpick_warp.errors import OutputError
 from tests.builders import mistake, run
 from tests.harness import scripted_bake

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.apps.viz.cell.rendering import lay_out
+from synpick_warp.apps.viz.cell import lay_out
 from synpick_warp.configs.cell.bins import AXES, BinRow, MeasuredBin
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.files.load import load_config, override_config

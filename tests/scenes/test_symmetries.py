@@ -12,7 +12,7 @@ import trimesh
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.evaluation.models import read_models
+from synpick_warp.apps.evaluation.errors import read_models
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import ObjectRow

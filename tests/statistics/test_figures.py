@@ -23,16 +23,12 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import synpick_warp
-from synpick_warp.apps.statistics import collect as collecting
-from synpick_warp.apps.statistics import columns, compute, counts
-from synpick_warp.apps.statistics.collect import SceneTask, collect, read_episode, read_scene
-from synpick_warp.apps.statistics.compute import DEPTH_QUANTILES, assemble, compute_statistics
-from synpick_warp.apps.statistics.counts import Block, Counts, Group
+from synpick_warp.apps.statistics import columns, compute
+from synpick_warp.apps.statistics.columns import Block, Counts, Group
+from synpick_warp.apps.statistics.compute import DEPTH_QUANTILES, SceneTask, assemble, collect, compute_statistics, read_episode, read_scene
 from synpick_warp.apps.statistics.figures import Annotations, BinUse, Coverage, EpisodeFigures, GroupStatistics, Rest
-from synpick_warp.apps.statistics.output import print_statistics
-from synpick_warp.apps.statistics.paper import compare, object_distance, read_paper, total_variation
-from synpick_warp.apps.statistics.ranking import BINS, Scored, calibrate, estimate, success_rate, weighted_auc
-from synpick_warp.apps.statistics.tables import make_tables
+from synpick_warp.apps.statistics.picks import BINS, Scored, calibrate, estimate, success_rate, weighted_auc
+from synpick_warp.apps.statistics.tables import make_tables, print_statistics
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.dataset.bop.arrays import SceneArrays
 from synpick_warp.dataset.reading import DataSet
@@ -270,7 +266,7 @@ def scene(visibility: Sequence[float], ids: np.ndarray, frames: Sequence[int] | 
 
 
 def test_processes_count_what_one_counts(data_set, statistics, monkeypatch):
-    monkeypatch.setattr(collecting, "VIEWS_PER_PROCESS", 1)
+    monkeypatch.setattr(compute, "VIEWS_PER_PROCESS", 1)
     seen = []
     found = compute_statistics(data_set, depth_views=1000, threads=3, report=lambda *progress: seen.append(progress))
     assert found == statistics
@@ -280,7 +276,7 @@ def test_processes_count_what_one_counts(data_set, statistics, monkeypatch):
 
 @given(frames=st.lists(st.integers(1, 40), min_size=1, max_size=8), count=st.integers(0, 50))
 def test_depth_is_sampled_evenly(frames, count):
-    tasks = list(collecting._sample_depth([SceneTask(index, 0, length) for index, length in enumerate(frames)], count))
+    tasks = list(compute._sample_depth([SceneTask(index, 0, length) for index, length in enumerate(frames)], count))
     places = [sum(frames[: task.episode]) + frame for task in tasks for frame in task.depth_frames]
     assert len(places) == len(set(places)) == min(count, sum(frames))
     assert all(frame < task.frames for task in tasks for frame in task.depth_frames)
@@ -333,7 +329,7 @@ def test_any_light_has_a_bin(yaw, exposure):
 
 
 def test_endlessly_many_objects_are_refused(monkeypatch):
-    monkeypatch.setattr(counts, "MAX_OBJECTS", 3)
+    monkeypatch.setattr(columns, "MAX_OBJECTS", 3)
     with pytest.raises(DatasetError, match="more than 3 different obj_id"):
         Counts().merge(counted(columns.scene_blocks(GROUP, scene(np.ones(4), np.arange(4)), "")))
 
@@ -381,7 +377,7 @@ COUNTS = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 1000)).filter
 
 
 def test_the_papers_numbers_add_up_and_its_own_set_has_no_difference():
-    paper = read_paper()
+    paper = compute.read_paper()
     assert sum(group.views for group in paper.groups) == paper.total_views == 503_232
     assert sum(group.instances for group in paper.groups) == 3_927_549
     assert {(group.split, group.mode) for group in paper.groups} == {
@@ -402,26 +398,26 @@ def test_the_papers_numbers_add_up_and_its_own_set_has_no_difference():
             GroupStatistics(each.split, each.mode, episodes, Annotations(each.views, each.instances, each.visibility, 0, (), objects), ())
         )
     names = {index: f"000_{name}" for name, index in ids.items()}
-    rows = compare(ours, {"train": "train", "test": "test"}, names, paper.cameras)
+    rows = compute.compare(ours, {"train": "train", "test": "test"}, names, paper.cameras)
     assert len(rows) == 6
     assert all(row.ours == row.paper and row.distance == 0.0 and 0.05 < row.paper_distance < 0.2 for row in rows)
 
 
 def test_distances_have_known_answers():
-    assert total_variation({"a": 1, "b": 1}, {"a": 5, "b": 5}) == 0.0
-    assert total_variation({"a": 1}, {"b": 7}) == 1.0
-    assert total_variation({"a": 3, "b": 1}, {"a": 1, "b": 1}) == pytest.approx(0.25)
+    assert compute.total_variation({"a": 1, "b": 1}, {"a": 5, "b": 5}) == 0.0
+    assert compute.total_variation({"a": 1}, {"b": 7}) == 1.0
+    assert compute.total_variation({"a": 3, "b": 1}, {"a": 1, "b": 1}) == pytest.approx(0.25)
     names = {1: "002_master_chef_can", 2: "003_cracker_box", 3: "banana"}  # The last is of another set, with the same word.
     theirs = {"master_chef_can": 1, "cracker_box": 1, "banana": 0}
-    assert [object_distance(ours, names, theirs) for ours in ({1: 5, 2: 5}, {3: 5}, {4: 5}, {})] == [0.0, None, None, None]
+    assert [compute.object_distance(ours, names, theirs) for ours in ({1: 5, 2: 5}, {3: 5}, {4: 5}, {})] == [0.0, None, None, None]
 
 
 @given(first=COUNTS, second=COUNTS, third=COUNTS)
 def test_total_variation_is_a_metric(first, second, third):
-    distance = total_variation(first, second)
+    distance = compute.total_variation(first, second)
     assert 0.0 <= distance <= 1.0 + 1e-12
-    assert distance == pytest.approx(total_variation(second, first))
-    assert distance <= total_variation(first, third) + total_variation(third, second) + 1e-12
+    assert distance == pytest.approx(compute.total_variation(second, first))
+    assert distance <= compute.total_variation(first, third) + compute.total_variation(third, second) + 1e-12
 
 
 # ---- ranking ----

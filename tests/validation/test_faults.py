@@ -17,11 +17,11 @@ from scipy.spatial.distance import pdist
 
 from synpick_warp.apps.validation.comparison import best_shift, fit_masks
 from synpick_warp.apps.validation.comparison import moved as shifted
-from synpick_warp.apps.validation.diagnosis import DiagnosedView
-from synpick_warp.apps.validation.model_files import diameter, sample_area
 from synpick_warp.apps.validation.registry import Level, Tolerance, distributions, load_rules
 from synpick_warp.apps.validation.rules.coco import run_lengths
 from synpick_warp.apps.validation.rules.images import _farthest, wrong_sides
+from synpick_warp.apps.validation.rules.models import diameter, sample_area
+from synpick_warp.apps.validation.rules.poses import DiagnosedView
 from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
 from synpick_warp.apps.validation.scene_files import crop_mask, decode_mask, png_type
 from synpick_warp.dataset.bop.layout import Layout

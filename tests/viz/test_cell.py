@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.apps.viz.cell.frusta import Canvas, draw_camera, footprint, image_border, project, rays
-from synpick_warp.apps.viz.cell.rendering import CellScene, Picture, lay_out, scaled_down
-from synpick_warp.apps.viz.cell.sheet import describe_camera
+from synpick_warp.apps.viz.cell import CellScene, Picture, describe_camera, lay_out, scaled_down
+from synpick_warp.apps.viz.frusta import Canvas, draw_camera, footprint, image_border, project, rays
 from synpick_warp.apps.viz.symmetries import group_turns
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.bin_meshes.loading import load_settings

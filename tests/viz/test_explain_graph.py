@@ -16,8 +16,19 @@ from hypothesis import strategies as st
 
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.explain import draw_words, load_chart
-from synpick_warp.apps.viz.explain_graph import CYCLIC, KEPT, OUTVOTED, RADIUS, Edge, clutter_edges, draw_graph, lay_out
-from synpick_warp.apps.viz.explain_record import MAX_ATTEMPTS, SeenAttempt, read_attempts
+from synpick_warp.apps.viz.explain_record import (
+    CYCLIC,
+    KEPT,
+    MAX_ATTEMPTS,
+    OUTVOTED,
+    RADIUS,
+    Edge,
+    SeenAttempt,
+    clutter_edges,
+    draw_graph,
+    lay_out,
+    read_attempts,
+)
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.records import MAX_OBSERVED
 from synpick_warp.errors import DatasetError

@@ -15,8 +15,19 @@ import pytest
 
 from synpick_warp.apps.viz.drawing import instance_color, short_labels
 from synpick_warp.apps.viz.false_colors import bin_scale, color_depth, pooled_scale
-from synpick_warp.apps.viz.preview import MAX_VIEWS, find_scenes, read_baked, sample, write_contact_sheet
-from synpick_warp.apps.viz.preview_legend import COLUMN, LINE, Box, draw_legend, legend_width, place_labels
+from synpick_warp.apps.viz.preview import (
+    COLUMN,
+    LINE,
+    MAX_VIEWS,
+    Box,
+    draw_legend,
+    find_scenes,
+    legend_width,
+    place_labels,
+    read_baked,
+    sample,
+    write_contact_sheet,
+)
 from synpick_warp.cli.main import main
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.truth import PoseTable
 
 FRAME = 1 / 15
 """Time from frame to frame [s]."""

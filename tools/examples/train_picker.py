@@ -33,7 +33,7 @@ except ModuleNotFoundError as missing:
     raise SystemExit(f"train_picker: {missing.name} is not installed; pip install torch") from None
 
 import synpick_warp
-from synpick_warp.apps.statistics.ranking import Interval, Scored, estimate, weighted_auc
+from synpick_warp.apps.statistics.picks import Interval, Scored, estimate, weighted_auc
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import find_pixels

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.apps.conversion.scenes import StoredSceneFiles, StoredViewFiles
+from synpick_warp.apps.conversion.source import StoredSceneFiles, StoredViewFiles
 from synpick_warp.apps.validation.comparison import MEASURED_DEPTH
 from synpick_warp.apps.validation.rendering import ObjectRenderer
 from synpick_warp.codes import Ending
@@ -70,13 +70,8 @@ class ForeignViewFiles(StoredViewFiles):
     """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, missing masks are rendered."""
 
     def __init__(self, files: SceneFiles, scene: int, frame: int, suffix: str, size: tuple[int, int], root: Path) -> None:
-        """
-        Args:
-            files, scene, frame: See `StoredViewFiles`.
-            suffix: Of all colour images.
-            size: Width and height of all images [px].
-            root: Folder of the data set.
-        """
+        """`suffix`: of all colour images; `size`: width and height of all images [px]; `root`: folder of the data set; others as of
+        `StoredViewFiles`."""
         super().__init__(files, scene, frame)
         self.suffix, self.size, self.root = suffix, size, root
 
@@ -128,19 +123,9 @@ def _renderer(root: Path) -> ObjectRenderer:
 def render_masks(
     root: Path, files: SceneFiles, frame: int, camera: dict[str, Any], gt: list[dict[str, Any]]
 ) -> list[tuple[np.ndarray, ...]]:
-    """Render the amodal and visible mask (H, W) bool of each instance of a view.
-
-    Args:
-        root: Folder of the data set, which has the models.
-        files: Files of the scene.
-        frame: BOP im_id.
-        camera: Entry in scene_camera.json.
-        gt: Entries in scene_gt.json.
-
-    Raises:
-        DatasetError: An object has no model, or the image no intrinsics.
-        CatalogError: A model cannot be read.
-    """
+    """Render the amodal and visible mask (H, W) bool of each instance of a view, by `camera` and `gt`, its entries in scene_camera.json and
+    scene_gt.json, with the models of the data set `root`; raises DatasetError if an object has no model, or the image no intrinsics, and
+    CatalogError if a model cannot be read."""
     if "cam_K" not in camera:
         raise DatasetError(f"{files.place}: the camera of image {frame} has no cam_K, by which masks are rendered")
     size = files.image_size(frame)
@@ -175,12 +160,8 @@ class _Context(ExportContext):
         super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
         self._data = data
 
-    @property
-    def names(self) -> dict[int, str]:
-        return self._names
-
     @cached_property
-    def _names(self) -> dict[int, str]:
+    def names(self) -> dict[int, str]:
         """Names by obj_id, sorted."""
         folder = self._data.folder
         found = {int(index) for view in self._data.views() for index in view.object_ids} | set(_found(self._data).layout.model_files)
@@ -200,26 +181,13 @@ class _Context(ExportContext):
 
 
 def _found(data: DataSet) -> ForeignScenes:
-    """The scenes of a data set from another source."""
     assert data.found is not None
     return data.found
 
 
 def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
     """Convert all scenes of a data set from another source; returns their number, and what was made that the source does not have.
-
-    Args:
-        data: The data set.
-        out: Folder of the converted one: new or empty.
-        formats: Names of formats.
-        processes: Number of processes; 0: one per core.
-        report: Observer: unit, number done, total.
-
-    Raises:
-        ConfigError: A format cannot be made of it.
-        DatasetError: A file is missing or damaged.
-        OutputError: `out` cannot be used, or a file not be written.
-    """
+    Arguments and errors are those of `run.convert`, but `out` is new or empty."""
     index = next((index for index, episode in data.items() if len(episode)), None)
     if index is None:
         raise DatasetError(f"{data.folder} has no images")

@@ -36,21 +36,9 @@ class Converted(NamedTuple):
 
 
 def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, report: Report, split: str | None = None) -> Converted:
-    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one from another source.
-
-    Args:
-        folder: The data set.
-        out: Folder of the converted one: new, empty, or of an interrupted conversion.
-        formats: Names of formats.
-        processes: Number of processes; 0: one per core.
-        report: Observer: unit, number done, total.
-        split: Split to convert, of a data set from another source; None: the only one.
-
-    Raises:
-        ConfigError: A format cannot be converted to, or `out` was started with other settings.
-        DatasetError: The source is no data set, is damaged, or lacks what a format needs.
-        OutputError: A file cannot be written.
-    """
+    """Convert the committed episodes of a data set to other formats, into a data set of its own; the scenes of one from another source. As
+    `synpick_warp.convert`, whose errors are ConfigError if a format cannot be converted to, or `out` was started with other settings,
+    DatasetError if the source is no data set, is damaged, or lacks what a format needs, and OutputError if a file cannot be written."""
     data = open_data_set(folder)
     if data.found is not None:
         _check_apart(folder, out)
@@ -109,17 +97,8 @@ def _convert_episodes(
 
 
 def check_formats(names: Sequence[str], layout: str, present: Collection[str], folder: Path) -> None:
-    """Check that a data set can be converted to these formats.
-
-    Args:
-        names: Names of formats.
-        layout: `bop.layout` of the data set.
-        present: Its formats.
-        folder: Its folder.
-
-    Raises:
-        ConfigError: A format is unknown, cannot be converted to, or is there already; or the settings are those of a bake only.
-    """
+    """Raise ConfigError unless a data set with this `bop.layout` and the formats `present` can be converted to formats of these names: they
+    are known, follow from others, and are not there already."""
     if layout != CLASSIC:
         raise ConfigError(f'{folder} has bop.layout = "{layout}", which convert does not read; bake the other formats')
     for name in names:

@@ -12,11 +12,10 @@ from PIL import Image as PillowImage
 from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.estimation.gicp import ObjectModel
-from synpick_warp.apps.evaluation.auc import LIMIT
-from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.estimation.run import ObjectModel
+from synpick_warp.apps.evaluation.errors import LIMIT
 from synpick_warp.apps.evaluation.scoring import Scores
-from synpick_warp.apps.evaluation.truth import Truth
+from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.scenes.types import Camera
@@ -87,30 +86,21 @@ class _Window:
 
 
 def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int) -> list[PoseFailure]:
-    """The worst instance of each object by ADD-S, worst first; an object's misses with an estimate before those without.
-
-    Args:
-        truth: Ground truth.
-        scores: Scores of the method.
-        estimates: Its estimates.
-        count: Maximum number of objects.
-    """
-    result = []
+    """The worst instance of each of at most `count` objects by ADD-S, worst first; an object's misses with an estimate before those
+    without."""
+    result, errors = list[PoseFailure](), scores.errors[METRIC]
     objects = truth.poses.object_id[scores.target]
     for object_id in np.unique(objects):
         rows = np.flatnonzero(objects == object_id)
-        errors = scores.errors[METRIC][rows]
-        found = [
-            nearest_estimate(truth.poses, int(scores.target[row]), estimates) if not np.isfinite(error) else 0
-            for row, error in zip(rows, errors, strict=True)
-        ]
-        # By error, and among misses those with an estimate first.
-        order = np.lexsort((np.array(found) < 0, -np.where(np.isfinite(errors), errors, 1e9)))
-        row = rows[order[0]]
+        nearest = {row: nearest_estimate(truth.poses, int(scores.target[row]), estimates) for row in rows if not np.isfinite(errors[row])}
+        if nearest:
+            row = next((row for row, estimate in nearest.items() if estimate >= 0), next(iter(nearest)))
+        else:
+            row = rows[np.argmax(errors[rows])]
         target = int(scores.target[row])
-        nearest = nearest_estimate(truth.poses, target, estimates)
-        offset = np.inf if nearest < 0 else np.linalg.norm(estimates.translation[nearest] - truth.poses.translation[target])
-        result.append(PoseFailure(target, nearest, float(scores.errors[METRIC][row]), float(offset)))
+        estimate = nearest[row] if row in nearest else nearest_estimate(truth.poses, target, estimates)
+        offset = np.inf if estimate < 0 else np.linalg.norm(estimates.translation[estimate] - truth.poses.translation[target])
+        result.append(PoseFailure(target, estimate, float(errors[row]), float(offset)))
     return sorted(result, key=lambda failure: -failure.error)[:count]
 
 
@@ -133,24 +123,16 @@ def draw_failures(
     names: Mapping[int, str],
     device: wp.Device,
 ) -> Image:
-    """Draw a sheet with a row for each failure.
-
-    Args:
-        data_set: The data set.
-        truth: Its ground truth.
-        estimates: Estimates of the method.
-        failures: At least one.
-        models: Models of their objects.
-        names: Names of objects by obj_id.
-        device: Where estimates are rendered.
-    """
+    """Draw a sheet with a row for each failure, at least one, with estimates rendered on a device; `models`: of their objects, `names`: by
+    obj_id."""
     meshes, keep = build_meshes([model.mesh for model in models], len(models), device)
     index = {model.object_id: row for row, model in enumerate(models)}
     width = len(_HEADINGS) * PANEL + (len(_HEADINGS) + 1) * _GAP
     canvas = np.full((_HEADING + len(failures) * (PANEL + _CAPTION), width, 3), 255, np.uint8)
     captions = []
     for number, failure in enumerate(failures):
-        view = _open_view(data_set, truth, failure.truth)
+        episode = data_set[int(truth.episode[failure.truth])]
+        view = episode.view(episode.image_ids.index(int(truth.poses.image[failure.truth])), int(truth.camera[failure.truth]))
         slot = int(np.flatnonzero(view.instance_ids == truth.poses.instance[failure.truth])[0])
         model = index[int(truth.poses.object_id[failure.truth])]
         renderer = _PoseRenderer(meshes, keep, models[model], model, device)
@@ -181,12 +163,6 @@ def describe_failure(truth: Truth, failure: PoseFailure, view: View, names: Mapp
     visibility = truth.visibility[failure.truth]
     seen = f"; {100 * visibility:.0f} % visible" if np.isfinite(visibility) else ""
     return f"{name}: {error}", f"{place}{seen}{moving}"
-
-
-def _open_view(data_set: DataSet, truth: Truth, row: int) -> View:
-    """View of the data set that a row of the ground truth belongs to."""
-    episode = data_set[int(truth.episode[row])]
-    return episode.view(episode.image_ids.index(int(truth.poses.image[row])), int(truth.camera[row]))
 
 
 def _pose_of(poses: PoseTable, row: int) -> np.ndarray | None:
@@ -279,7 +255,6 @@ def _resample(image: Image, window: _Window) -> Image:
 
 
 def _outline(image: Image, mask: np.ndarray, color: Color) -> None:
-    """Draw the contours of a mask into the image."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(image, contours, -1, color, 2, cv2.LINE_AA)
 
@@ -301,7 +276,6 @@ def _color_residual(observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray
 
 
 def _write_texts(canvas: Image, captions: Sequence[tuple[int, tuple[str, str]]]) -> Image:
-    """Headings above the columns, and captions below the rows."""
     picture = PillowImage.fromarray(canvas)
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(_FONT)
     for column, text in enumerate(_HEADINGS):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from msgspec import UNSET
 
-from synpick_warp.apps.evaluation.targets import TargetList
+from synpick_warp.apps.evaluation.results import TargetList
 from synpick_warp.codes import Mode, names
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.bop.arrays import SceneArrays, read_arrays
@@ -53,16 +53,9 @@ class ImageSelection:
 
 
 def plan_scenes(data_set: DataSet, selection: ImageSelection) -> tuple[list[ScenePlan], bool]:
-    """Scenes of a data set, and the frames of each for pose estimation.
-
-    Returns:
-        Scenes with at least one frame, in order; and whether these are all images of the data set.
-
-    Raises:
-        ConfigError: A mode, camera or episode does not exist, or nothing is left.
-        DatasetError: The data set has no episode.
-        ResultError: An image of the target list does not exist.
-    """
+    """Scenes of a data set with the frames of each for pose estimation, at least one, in order; and whether these are all images of the
+    data set. Raises ConfigError if a mode, camera or episode does not exist, or nothing is left, DatasetError if there is no episode, and
+    ResultError if an image of the target list does not exist."""
     known = list(data_set)
     if not known:
         raise DatasetError(f"{data_set.folder} has no episode to estimate poses in; finish the bake first")
@@ -143,11 +136,8 @@ class EstimationScene:
 
 
 def read_scene(data_set: DataSet, plan: ScenePlan) -> EstimationScene:
-    """Read the ground truth of a scene's planned frames; images are not read.
-
-    Raises:
-        DatasetError: A file is missing or damaged, or an instance has no index, two object ids, or is one of more than MAX_SLOTS.
-    """
+    """Read the ground truth of a scene's planned frames; images are not read. Raises DatasetError if a file is missing or damaged, or an
+    instance has no index, two object ids, or is one of more than MAX_SLOTS."""
     # Records stay in memory as long as the object that has read them: images get another one.
     source = data_set.scene_files(plan.episode, plan.camera)
     place = source.place

@@ -1,24 +1,32 @@
-"""BOP result files: CSV of pose estimates, version bop19 of the BOP toolkit, read with checks and written.
+"""BOP result files and target lists, read with checks and written.
 
-A line is `scene_id,im_id,obj_id,score,R,t,time`: R has 9 numbers row by row, t has 3 in millimetres, both separated by spaces, time is in
-seconds for the image, -1 if unknown. The header may be missing. Angles and units are those of scene_gt.json: object to camera.
+A line of a result file (CSV, version bop19 of the BOP toolkit) is `scene_id,im_id,obj_id,score,R,t,time`: R has 9 numbers row by row, t has
+3 in millimetres, both separated by spaces, time is in seconds for the image, -1 if unknown. The header may be missing. Angles and units are
+those of scene_gt.json: object to camera. A target list (test_targets_bop19.json) has the images and objects that poses are estimated for
+and scored on.
 """
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec.structs import replace as replace_struct
 
-from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.truth import Truth
-from synpick_warp.errors import OutputError, ResultError
+from synpick_warp.apps.evaluation.truth import PoseTable, Truth
+from synpick_warp.dataset.annotations import TargetEntry
+from synpick_warp.errors import OutputError, ResultError, format_value
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.json import read_json
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 FORMAT = f"{HEADER}, with 9 numbers in R and 3 in t [mm], separated by spaces"
@@ -166,16 +174,8 @@ def _check_duplicates(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarra
 
 
 def check_results(results: ResultFile, truth: Truth, object_ids: Collection[int]) -> None:
-    """Check estimates against a data set: scenes, images and objects exist, and lengths are in millimetres.
-
-    Args:
-        results: The estimates.
-        truth: Ground truth of the data set.
-        object_ids: Objects of the data set.
-
-    Raises:
-        ResultError: In one line, with the line's number.
-    """
+    """Raise ResultError, in one line with the line's number, unless scenes, images and objects of estimates exist in a data set, and
+    lengths are in millimetres."""
     poses = results.poses
     scenes = np.unique(truth.images[:, 0])
     _refuse_unknown(results, poses.scene, scenes, "scene")
@@ -238,12 +238,113 @@ def encode_results(poses: PoseTable) -> bytes:
 
 
 def write_results(path: Path, poses: PoseTable) -> None:
-    """Write pose estimates as a BOP result file, atomically.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
+    """Write pose estimates as a BOP result file, atomically; raises OutputError if the file cannot be written."""
     if path.is_dir():
         raise OutputError(f"{path} is a folder; name a file")
     with output_errors(path):
         write_atomically(path, encode_results(poses))
+
+
+_FORMAT = "a target list has objects with scene_id, im_id, obj_id and inst_count, as BOP's test_targets_bop19.json"
+
+
+class TargetRow(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
+    """Entry of a target list. `inst_count` is written but not read, since the ground truth has it."""
+
+    scene_id: int
+    im_id: int
+    obj_id: int | None = None
+    """None: all objects of the image, as in test_targets_bop24.json."""
+    inst_count: int = 0
+    sensor: str = ""
+    """See `TargetEntry`."""
+
+
+@dataclass(frozen=True)
+class TargetList:
+    """BOP target list, in the order of its file."""
+
+    path: Path
+    targets: tuple[TargetRow, ...]
+
+    @cached_property
+    def objects(self) -> dict[tuple[int, int], frozenset[int] | None]:
+        """(scene, image) -> obj_ids of the targets; None: all objects."""
+        found: dict[tuple[int, int], set[int] | None] = {}
+        for target in self.targets:
+            known = found.setdefault((target.scene_id, target.im_id), set())
+            if target.obj_id is None:
+                found[target.scene_id, target.im_id] = None
+            elif known is not None:
+                known.add(target.obj_id)
+        return {image: None if known is None else frozenset(known) for image, known in found.items()}
+
+    def in_classic_layout(self, sensors: Sequence[str]) -> TargetList:
+        """The list with a scene for each camera, as result files have it; that of a data set of several `sensors` has one for all of them.
+        Raises ResultError if it names a sensor that the data set does not have."""
+        known = {name: index for index, name in enumerate(sensors)}
+        for target in self.targets:
+            if target.sensor and target.sensor not in known:
+                found = f"sensors: {', '.join(known)}" if known else "it has a scene for each camera"
+                raise ResultError(f"{self.path} names the sensor {format_value(target.sensor)}, which the data set does not have; {found}")
+        if not known:
+            return self
+        classic = (
+            replace_struct(each, scene_id=len(known) * each.scene_id + known.get(each.sensor, 0), sensor="") for each in self.targets
+        )
+        return TargetList(self.path, tuple(classic))
+
+
+def read_targets(path: Path) -> TargetList:
+    """Read a target list; raises ResultError in one line if it cannot be read, is damaged, or is empty."""
+    entries = read_json(path, list[TargetEntry], ResultError, _FORMAT)
+    if not entries:
+        raise ResultError(f"{path} lists no images; {_FORMAT}")
+    return TargetList(path, tuple(target for entry in entries for target in _read_entry(entry)))
+
+
+def _read_entry(entry: TargetEntry) -> list[TargetRow]:
+    """Targets of an entry, one per image, as it may list several; object None: any object; count 0: not given."""
+    images = [(entry.sensor, entry.im_id)] if isinstance(entry.im_id, int) else entry.im_id
+    object_id, count = entry.obj_id if isinstance(entry.obj_id, int) else None, entry.inst_count or 0
+    return [TargetRow(entry.scene_id, image, object_id, count, sensor) for sensor, image in images]
+
+
+def in_layout(targets: Sequence[TargetRow], sensors: Sequence[str]) -> list[TargetRow]:
+    """Convert targets from the classic layout, a scene for each camera, to scenes with `sensors`: the inverse of `in_classic_layout`.
+
+    Without sensors the lists are alike."""
+    if not sensors:
+        return list(targets)
+    count = len(sensors)
+    return [replace_struct(each, scene_id=each.scene_id // count, sensor=sensors[each.scene_id % count]) for each in targets]
+
+
+def encode_targets(targets: Sequence[TargetRow]) -> bytes:
+    """Encode a target list, one target a line, sorted."""
+    return b"[\n" + b",\n".join(json.dumps(msgspec.to_builtins(target)).encode() for target in sorted(targets)) + b"\n]\n"
+
+
+def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[TargetRow]:
+    """Targets with their numbers of instances, from instances given as (scene, image, obj_id)."""
+    return [TargetRow(scene, image, object_id, count) for (scene, image, object_id), count in Counter(rows).items()]
+
+
+def select_targets(truth: Truth, targets: TargetList) -> Truth:
+    """Reduce the ground truth to listed images and objects; speeds stay those of all frames. Raises ResultError if a listed image is not in
+    the data set."""
+    objects = targets.objects
+    known = set(map(tuple, truth.images.tolist()))
+    for scene, image in objects:
+        if (scene, image) not in known:
+            raise ResultError(f"{targets.path}: the data set has no image {image} in scene {scene}")
+    images = np.array([image in objects for image in map(tuple, truth.images.tolist())], bool)
+    nothing: frozenset[int] = frozenset()
+    keys = zip(truth.poses.scene.tolist(), truth.poses.image.tolist(), truth.poses.object_id.tolist(), strict=True)
+    rows = np.array([(ids := objects.get((scene, image), nothing)) is None or object_id in ids for scene, image, object_id in keys], bool)
+    return replace(truth.select(rows), images=truth.images[images])
+
+
+def targets_file(results: Path) -> Path:
+    """Target list beside a result file: the images and objects that were estimated."""
+    return results.with_name(f"{results.stem}-targets.json")

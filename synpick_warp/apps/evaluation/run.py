@@ -6,15 +6,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from synpick_warp.apps.evaluation.errors import Model, read_models
 from synpick_warp.apps.evaluation.figures import Method
-from synpick_warp.apps.evaluation.models import Model, read_models
-from synpick_warp.apps.evaluation.poses import CameraMotion, PoseTable
-from synpick_warp.apps.evaluation.results import ResultFile, check_results, read_results
+from synpick_warp.apps.evaluation.results import ResultFile, check_results, read_results, read_targets, select_targets, targets_file
 from synpick_warp.apps.evaluation.scoring import Scores, score
 from synpick_warp.apps.evaluation.tables import GROUPS, ScoreRow, summarize
-from synpick_warp.apps.evaluation.targets import read_targets, select_targets, targets_file
 from synpick_warp.apps.evaluation.tracking import filter_poses
-from synpick_warp.apps.evaluation.truth import Truth, read_truth
+from synpick_warp.apps.evaluation.truth import CameraMotion, PoseTable, Truth, read_truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import ConfigError, escape
 
@@ -40,21 +38,8 @@ def score_files(
     targets: Path | None = None,
     remark: Callable[[str], None] = lambda _: None,
 ) -> Evaluation:
-    """Score result files, one for each method.
-
-    Args:
-        data_set: Where the ground truth is.
-        results: BOP result files.
-        min_visibility: Smallest visible fraction of a target.
-        top: Maximum number of estimates per image and object.
-        vertices: Number of vertices of a model; 0: all.
-        alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
-        targets: Target list; None: all images.
-        remark: Receives a line for each file without estimates in some images.
-
-    Raises:
-        SynpickError: A file is missing, damaged or of another data set, or nothing is as visible as that.
-    """
+    """Score BOP result files, one for each method, as `synpick_warp.evaluate`; `remark` receives a line for each file without estimates in
+    some images. Raises SynpickError if a file is missing, damaged or of another data set, or nothing is as visible as that."""
     # Result files first: their mistakes are the likely ones, and quick to find.
     files = [read_results(path) for path in results]
     truth = read_truth(data_set)

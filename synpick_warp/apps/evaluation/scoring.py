@@ -15,11 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.apps.evaluation.auc import LIMIT
-from synpick_warp.apps.evaluation.errors import NEAR, add_errors, adds_errors, rotation_errors, translation_errors
-from synpick_warp.apps.evaluation.models import Model
-from synpick_warp.apps.evaluation.poses import PoseTable
-from synpick_warp.apps.evaluation.truth import Truth
+from synpick_warp.apps.evaluation.errors import LIMIT, NEAR, Model, add_errors, adds_errors, rotation_errors, translation_errors
+from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 
 METRICS = ("ADD", "ADD-S", "ADD(-S)")
 """ADD(-S) is ADD-S for objects with symmetries in models_info.json, ADD for others."""
@@ -57,16 +54,8 @@ def score(
     min_visibility: float = MIN_VISIBILITY,
     top: int = PER_INSTANCE,
 ) -> Scores:
-    """Score pose estimates of a data set.
-
-    Args:
-        name: Name of the method.
-        truth: Ground truth.
-        estimates: Estimated poses of any scenes of the data set; images without estimates count as misses.
-        models: Models of all objects of the ground truth.
-        min_visibility: Smallest visible fraction of a target; instances below are neither found nor missed.
-        top: Maximum number of estimates per image and object; see `make_pairs`.
-    """
+    """Score estimated poses of any scenes of a data set by the models of all objects of its ground truth; images without estimates count as
+    misses, and instances below `min_visibility` are neither found nor missed. `top`: as of `make_pairs`."""
     target = truth.shown(min_visibility)
     pairs = make_pairs(truth.poses, target, estimates, top)
     pair_errors = _pair_errors(truth.poses, estimates, pairs, models)
@@ -142,9 +131,7 @@ class Pairs:
 
 
 def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: int = PER_INSTANCE) -> Pairs:
-    """Pair the best estimates with the instances of the same image and object.
-
-    Equal scores keep the order of the file, as in the toolkit.
+    """Pair the best estimates with the instances of the same image and object; equal scores keep the order of the file, as in the toolkit.
 
     Args:
         truth: True poses.
@@ -169,17 +156,8 @@ def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: 
 
 
 def match(pairs: Pairs, errors: np.ndarray, threshold: float, instances: int) -> np.ndarray:
-    """Match estimates to instances, each at most once.
-
-    Args:
-        pairs: Candidates.
-        errors: Error of each pair (P,).
-        threshold: A match has a smaller error.
-        instances: Number of rows N of the true poses.
-
-    Returns:
-        Index of each instance's pair (N,) int64; -1: missed.
-    """
+    """Match estimates to instances, each at most once, by errors (P,) below a threshold: index of each instance's pair (N,) int64, -1:
+    missed. `instances` is the number N of rows of the true poses."""
     result = np.full(instances, -1, np.int64)
     left = np.flatnonzero(errors < threshold)
     while len(left):  # As many rounds as an image has instances of an object, since each round matches one of them.

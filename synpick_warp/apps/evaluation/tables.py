@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from synpick_warp.apps.evaluation.auc import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
+from synpick_warp.apps.evaluation.errors import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
 from synpick_warp.apps.evaluation.scoring import METRICS, Scores
 from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
@@ -48,22 +48,20 @@ class ScoreRow:
 
 
 def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], groups: Sequence[str] = GROUPS) -> list[ScoreRow]:
-    """Rows of the table; groups without instances are left out.
-
-    Args:
-        truth: Ground truth.
-        scores: Scores of the methods, all with the same targets.
-        names: Names of objects by obj_id.
-        groups: What instances are grouped by, in order.
-    """
+    """Rows of the table of methods with the same targets, by groups in this order, with names by obj_id; groups without instances are left
+    out."""
     target = scores[0].target
     object_ids = truth.poses.object_id[target]
+
+    def row(group: str, label: str, inside: np.ndarray) -> ScoreRow:
+        return ScoreRow(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
+
     rows = []
     for group in groups:
         for label, inside in _labels(group, truth, target, names):
             if inside.any():
-                rows.append(_row(group, label, inside, object_ids, scores))
-    return [*rows, _row("mean", "mean", np.ones(len(target), bool), object_ids, scores)]
+                rows.append(row(group, label, inside))
+    return [*rows, row("mean", "mean", np.ones(len(target), bool))]
 
 
 def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, str]) -> list[tuple[str, np.ndarray]]:
@@ -79,17 +77,8 @@ def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, st
         (VISIBILITY_EDGES, truth.visibility[target], "visible") if group == "visibility" else (SPEED_EDGES, truth.speed[target], "m/s")
     )
     index = band_indices(values, edges)
-    return [(f"{_interval(low, high)} {unit}", index == band) for band, (low, high) in enumerate(pairwise(edges))]
-
-
-def _interval(low: float, high: float) -> str:
-    """Format an interval as text: "0.1 to 0.3", or "over 0.3" without an upper bound."""
-    return f"over {low:g}" if math.isinf(high) else f"{low:g} to {high:g}"
-
-
-def _row(group: str, label: str, inside: np.ndarray, object_ids: np.ndarray, scores: Sequence[Scores]) -> ScoreRow:
-    """Row of a table: the number of rows selected by `inside` (N,) bool, and each method's scores over them."""
-    return ScoreRow(group, label, int(inside.sum()), tuple(_cells(inside, object_ids, each) for each in scores))
+    names_of_bands = (f"over {low:g} {unit}" if math.isinf(high) else f"{low:g} to {high:g} {unit}" for low, high in pairwise(edges))
+    return [(name, index == band) for band, name in enumerate(names_of_bands)]
 
 
 def _cells(inside: np.ndarray, object_ids: np.ndarray, scores: Scores) -> dict[str, float]:
@@ -106,26 +95,17 @@ def _cells(inside: np.ndarray, object_ids: np.ndarray, scores: Scores) -> dict[s
 
 
 def _mean(values: list[float]) -> float:
-    """Mean of values; NaN if there are none."""
     return statistics.fmean(values) if values else math.nan
 
 
 def _median(values: np.ndarray) -> float:
-    """Median of the finite values; NaN without."""
     found = values[np.isfinite(values)]
     return float(np.median(found)) if len(found) else math.nan
 
 
 def render(rows: Sequence[ScoreRow], truth: Truth, scores: Sequence[Scores], style: str, convention: str = "exact") -> str:
-    """Write the table as text, in one of FORMATS.
-
-    Args:
-        rows: From `summarize`.
-        truth: Ground truth.
-        scores: Scores of the methods.
-        style: One of FORMATS. CSV and JSON have both conventions, JSON recall curves and bands of each object, too.
-        convention: Convention of the areas in text and LaTeX.
-    """
+    """Write the table as text, in one of FORMATS; `convention` is that of the areas in text and LaTeX, whereas CSV and JSON have both, and
+    JSON recall curves and bands of each object, too."""
     if style == "csv":
         return to_csv(_long(rows, scores), exact=True)
     if style == "json":
@@ -158,16 +138,9 @@ def _wide(rows: Sequence[ScoreRow], names: Sequence[str], shown: Mapping[str, st
 def _long(rows: Sequence[ScoreRow], scores: Sequence[Scores]) -> Table:
     """Table with a row for each group and method, and all columns."""
     columns = [Column(name) for name in ("group", "label", "targets", "method")] + [Column(name, digits=".6g") for name in rows[0].cells[0]]
-    return Table(
-        "scores",
-        "",
-        tuple(columns),
-        [
-            (row.group, row.label, row.targets, each.name, *map(_known, cells.values()))
-            for row in rows
-            for each, cells in zip(scores, row.cells, strict=True)
-        ],
-    )
+    by_method = [(row, each, cells) for row in rows for each, cells in zip(scores, row.cells, strict=True)]
+    values = [(row.group, row.label, row.targets, each.name, *map(_known, cells.values())) for row, each, cells in by_method]
+    return Table("scores", "", tuple(columns), values)
 
 
 def _known(value: float) -> float | None:

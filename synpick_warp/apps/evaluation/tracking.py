@@ -29,7 +29,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.evaluation.poses import PoseTable
+from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.errors import ConfigError, DatasetError
 
 PAPER_ALPHAS = (0.05, 0.2)
@@ -45,22 +45,17 @@ _MAX_ENTRY = 1.01
 
 
 def find_tracks(table: PoseTable) -> np.ndarray:
-    """Associate rows to tracks; a track has one scene (episode and camera), one object, and at most one row an image.
+    """Associate rows to tracks, (N,) int64 from 0; a track has one scene (episode and camera), one object, and at most one row an image.
 
-    The result does not depend on the order of rows, except among rows that are equal in scene, image, object, instance, score and pose.
-
-    Args:
-        table: N estimates; rows with instance >= 0 are associated among their instance only.
-
-    Returns:
-        Track index of each row (N,) int64, from 0; tracks are sorted by scene, object, instance and first image.
-
-    Raises:
-        DatasetError: A pose is not finite.
+    Rows with an instance are associated among their instance only. Tracks are sorted by scene, object, instance and first image. The result
+    does not depend on the order of rows, except among rows that are equal in scene, image, object, instance, score and pose. Raises
+    DatasetError if a pose is not finite.
     """
     _check_poses(table)
     tracks = np.empty(len(table), np.int64)
-    order = _canonical_order(table)
+    # By falling score and pose within an image, so that the same estimates have the same order however rows came.
+    pose = np.concatenate((table.translation, table.rotation.reshape(-1, 9)), axis=1)
+    order = np.lexsort((*pose.T[::-1], -table.score, table.image, table.instance, table.object_id, table.scene))
     key = np.stack([column[order] for column in (table.scene, table.object_id, table.instance)], axis=1)
     count = 0
     for group in np.split(order, 1 + np.flatnonzero((key[1:] != key[:-1]).any(axis=1))) if len(order) else ():
@@ -82,22 +77,9 @@ def _check_poses(table: PoseTable) -> None:
         raise DatasetError(f"the pose of {place} is not finite, or is no pose in metres; a failed estimate is a missing row")
 
 
-def _canonical_order(table: PoseTable) -> np.ndarray:
-    """Order by scene, object, instance, image, falling score and pose: the same estimates have the same order however rows came (N,)."""
-    pose = np.concatenate((table.translation, table.rotation.reshape(-1, 9)), axis=1)
-    return np.lexsort((*pose.T[::-1], -table.score, table.image, table.instance, table.object_id, table.scene))
-
-
 def _assign(image: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Associate the estimates of a group frame by frame.
-
-    Args:
-        image: Image of each row (n,), sorted.
-        position: Translation (n, 3) [m].
-
-    Returns:
-        Track of each row (n,), from 0 in order of their first images.
-    """
+    """Associate the estimates of a group frame by frame: track of each row (n,), from 0 in order of their first images, by the sorted
+    images (n,) and translations (n, 3) [m]."""
     tracks = np.empty(len(image), np.int64)
     starts = np.concatenate(([0], 1 + np.flatnonzero(image[1:] != image[:-1]), [len(image)]))
     history = np.empty((len(image), _HISTORY, 3))
@@ -125,15 +107,13 @@ def _medoids(points: np.ndarray) -> np.ndarray:
 
 
 def track_of_instance(truth: PoseTable, table: PoseTable, tracks: np.ndarray) -> np.ndarray:
-    """Find the track of a true instance: in each image the nearest estimate votes for its track; ties go to the lower index.
+    """Rows (n,) int64 of the track of a true instance, sorted by image: in each image the nearest estimate votes for its track; ties go to
+    the lower index.
 
     Args:
         truth: True poses of one instance: one scene, one object, one row an image.
-        table: N estimates.
+        table: N estimates; the result is empty if the instance was never estimated.
         tracks: Track of each row (N,), as `find_tracks` gives them.
-
-    Returns:
-        Rows of the track (n,) int64, sorted by image; empty if the instance was never estimated.
     """
     images = np.sort(truth.image)
     rows = np.flatnonzero((table.scene == truth.scene[0]) & (table.object_id == truth.object_id[0]) & np.isin(table.image, images))
@@ -150,20 +130,9 @@ def track_of_instance(truth: PoseTable, table: PoseTable, tracks: np.ndarray) ->
 
 
 def filter_poses(table: PoseTable, alpha: float = PAPER_ALPHAS[0], tracks: np.ndarray | None = None) -> PoseTable:
-    """Filter each track from its first image to its last.
-
-    Args:
-        table: N estimates, in any order.
-        alpha: Weight of the new estimate, above 0 and at most 1.
-        tracks: Track index of each row (N,) int64, as `find_tracks` gives them; None: they are found.
-
-    Returns:
-        The table with filtered poses, in the order of its rows; everything else is unchanged.
-
-    Raises:
-        ConfigError: alpha is out of range.
-        DatasetError: A pose is not finite, or a rotation is singular.
-    """
+    """Filter each track from its first image to its last; returns the table with filtered poses, in the order of its rows. `alpha` weighs
+    the new estimate, above 0 and at most 1; `tracks` are those of `find_tracks`, None: they are found. Raises ConfigError if alpha is out
+    of range, and DatasetError if a pose is not finite, or a rotation is singular."""
     check_alpha(alpha)
     tracks = find_tracks(table) if tracks is None else tracks
     if not len(table):
@@ -227,17 +196,10 @@ class AlphaSweep:
 def sweep_alpha(
     tables: Mapping[str, PoseTable], score: Callable[[str, PoseTable], float], alphas: Sequence[float] = SWEEP_ALPHAS
 ) -> AlphaSweep:
-    """Filter and score the estimates of each mode with each alpha, and score them unfiltered; tracks are found once a mode.
+    """Filter and score the estimates of each mode with each alpha, rising, and score them unfiltered; tracks are found once a mode.
 
-    The paper compares alpha 0.05 and 0.2 (table "Evaluation metrics"): a small alpha averages noise away, and lags behind what moves.
-
-    Args:
-        tables: Mode -> its estimates.
-        score: Score of the estimates of a mode, larger is better; misses count against the truth of that mode's scenes only.
-        alphas: Weights of the new estimate, rising.
-
-    Raises:
-        DatasetError: As `filter_poses`.
+    The paper compares alpha 0.05 and 0.2 (table "Evaluation metrics"): a small alpha averages noise away, and lags behind what moves. A
+    larger score of a mode's estimates is better; misses count against the truth of that mode's scenes only. Errors as of `filter_poses`.
     """
     scores, unfiltered = np.empty((len(tables), len(alphas))), np.empty(len(tables))
     for row, (mode, table) in enumerate(tables.items()):
@@ -248,14 +210,6 @@ def sweep_alpha(
 
 
 def split_by_mode(table: PoseTable, modes: Mapping[int, str]) -> dict[str, PoseTable]:
-    """Split estimates by the mode of their scenes.
-
-    Args:
-        table: N estimates.
-        modes: Scene index -> mode.
-
-    Returns:
-        Mode -> its rows, for every mode in `modes`, in order of their first scenes.
-    """
+    """Split estimates by the mode of their scenes, in order of the modes' first scenes; `modes`: scene index -> mode."""
     names = dict.fromkeys(modes[scene] for scene in sorted(modes))
     return {name: table.select(np.isin(table.scene, [scene for scene in modes if modes[scene] == name])) for name in names}

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from synpick_warp.apps.report.sampling import Brightness
+from synpick_warp.apps.report.frames import Brightness
 from synpick_warp.apps.statistics import GroupStatistics, ObjectStatistics, Statistics
 from synpick_warp.apps.statistics.columns import BANDS, EXPOSURE_BIN, FORCE_BIN, MIN_VISIBILITY, SECTORS, TIME_BIN, VISIBILITY_BINS
 from synpick_warp.configs.schema import Config
@@ -199,7 +199,6 @@ def _edges(rows: Rows, width: float, top: float) -> list[float]:
 
 
 def _objects(source: ChartData) -> Iterator[Chart]:
-    """Annotated instances by object and mode, the most frequent objects first."""
     names = object_labels(source.statistics.objects)
     counts = _by_mode(
         source.statistics, lambda group: {names.get(key, str(key)): count for key, count in group.annotations.objects.items()}
@@ -216,7 +215,6 @@ def _objects(source: ChartData) -> Iterator[Chart]:
 
 
 def _visibility(source: ChartData) -> Iterator[Chart]:
-    """Histogram of the visible fraction of instances, by mode."""
     rows = _binned_by_mode(source.statistics, lambda group: group.annotations.histogram, 1 / VISIBILITY_BINS)
     mean = source.statistics.total.annotations.visibility
     if rows and mean is not None:
@@ -226,7 +224,6 @@ def _visibility(source: ChartData) -> Iterator[Chart]:
 
 
 def _outcomes(source: ChartData) -> Iterator[Chart]:
-    """Attempts by outcome and mode."""
     episodes = source.statistics.total.episodes
     caption = f"How {episodes.attempts:,} attempts to pick ended; {episodes.good_seals:,} had a good seal."
     counts = _by_mode(source.statistics, lambda group: group.episodes.outcomes)
@@ -234,7 +231,6 @@ def _outcomes(source: ChartData) -> Iterator[Chart]:
 
 
 def _endings(source: ChartData) -> Iterator[Chart]:
-    """Episodes by ending and mode."""
     caption = "Why the episodes ended: bin empty, corners visited, or too many failures."
     counts = _by_mode(source.statistics, lambda group: group.episodes.endings)
     yield from _in_words("endings", "Episodes by ending", caption, counts, ("ending", "episodes"))
@@ -272,7 +268,6 @@ def _limit(force: float, text: str, side: str) -> Spec:
 
 
 def _timeline(source: ChartData) -> Iterator[Chart]:
-    """Mean number of objects over time, by mode."""
     sums: dict[tuple[str, float], tuple[int, float]] = {}
     for group in source.statistics.groups:
         for point in group.objects_over_time:
@@ -309,7 +304,6 @@ def _timeline(source: ChartData) -> Iterator[Chart]:
 
 
 def _coverage(source: ChartData) -> Iterator[Chart]:
-    """Heat map of viewing directions, for an object that the reader selects."""
     seen = sorted((each for each in source.statistics.objects if each.coverage.views), key=lambda each: -each.coverage.views)[:MAX_LINES]
     if not seen:
         return
@@ -349,7 +343,6 @@ def _coverage(source: ChartData) -> Iterator[Chart]:
 
 
 def _lights(source: ChartData) -> Iterator[Chart]:
-    """Episodes by environment map, the most frequent maps."""
     if lights := source.statistics.lights:
         plural = "" if len(lights.maps) == 1 else "s"
         caption = f"{len(lights.maps):,} environment map{plural} in {lights.episodes:,} episodes."
@@ -380,7 +373,6 @@ def _exposure(source: ChartData) -> Iterator[Chart]:
 
 
 def _luma(source: ChartData) -> Iterator[Chart]:
-    """Histogram of the mean luma of views."""
     bins = Counter(min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1) for view in source.brightness)
     if bins:
         rows = _binned([bins[index] for index in range(BRIGHTNESS_BINS)], 1 / BRIGHTNESS_BINS)

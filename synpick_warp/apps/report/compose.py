@@ -4,26 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from synpick_warp._version import __version__
-from synpick_warp.apps.report.album import Album
 from synpick_warp.apps.report.charts import ChartData, make_charts
-from synpick_warp.apps.report.explained import choose_attempts, make_attempt
+from synpick_warp.apps.report.explained import DRAWS, PICKS_LEAD, calibration_chart, choose_attempts, make_attempt, picks_section
 from synpick_warp.apps.report.findings import WARNING, Figures, Remark, find
-from synpick_warp.apps.report.frames import choose_episodes, make_frame, make_strip
-from synpick_warp.apps.report.markup import Html, changed_settings, element, findings_list, join, settings_tables, statistics_tables, tiles
-from synpick_warp.apps.report.page import Page, PageSection, read_vega, render, summary
-from synpick_warp.apps.report.picks import DRAWS, PICKS_LEAD, calibration_chart, picks_section
-from synpick_warp.apps.report.sampling import (
+from synpick_warp.apps.report.frames import (
+    BUDGET,
     SURVEY_VIEWS,
+    Album,
     Brightness,
     SampledEpisodes,
-    find_content,
+    choose_episodes,
+    make_frame,
+    make_strip,
     measure_brightness,
     read_episodes,
     sample_views,
+)
+from synpick_warp.apps.report.page import (
+    Html,
+    Page,
+    PageSection,
+    changed_settings,
+    element,
+    findings_list,
+    join,
+    read_vega,
+    render,
+    settings_tables,
+    statistics_tables,
+    summary,
+    tiles,
 )
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.picks import find_picks
@@ -31,11 +46,10 @@ from synpick_warp.apps.viz.false_colors import bin_scale
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.inputs.paths import make_folder
-from synpick_warp.system.progress import Report
+from synpick_warp.system.progress import Report, ignore_progress
 
 SUFFIXES = (".html", ".htm")
 FRAMES = 12
@@ -62,26 +76,21 @@ def write_report(
         write_report(synpick_warp.open("DATA"), Path("report.html"))
 
     Args:
-        data_set: The data set; with settings.
         out: HTML file to write; its folder is created. A file is replaced, a link never followed.
         frames: Number of sampled frames.
         paper: Whether the paper's numbers stand beside; None: if the objects are the paper's.
-        threads: Maximum number of processes that count; 0: one per core.
-        report: Receives the progress.
+        threads, report: As of `compute_statistics`, whose errors are raised.
 
     Raises:
-        ConfigError: The settings are damaged.
-        DatasetError: There is no episode, or a file is missing or damaged.
         ChartError: The charts' library cannot run.
         OutputError: The file cannot be written.
     """
     check_out(out)
     read_vega()
-    progress = report or (lambda _unit, _done, _total: None)
     statistics = compute_statistics(data_set, threads=threads, report=report)
     episodes = read_episodes(data_set)
     album = Album()
-    samples = take_samples(data_set, statistics, episodes, album, frames, progress)
+    samples = take_samples(data_set, statistics, episodes, album, frames, report or ignore_progress)
     versions, remarks = _versions(data_set)
     findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
     findings.sort(key=lambda finding: finding.level != WARNING)
@@ -109,36 +118,31 @@ def write_report(
 def take_samples(
     data_set: DataSet, statistics: Statistics, episodes: SampledEpisodes, album: Album, frames: int, report: Report
 ) -> Samples:
-    """Read all pictures of a report; none if the data set has no images.
-
-    Raises:
-        DatasetError: A file is missing or damaged.
-    """
-    data: dict[str, list[dict[str, Any]]] = {"frames": [], "strips": [], "attempts": []}
-    asked = dict.fromkeys(data, 0)
+    """Read all pictures of a report; none if the data set has no images. Raises DatasetError if a file is missing or damaged."""
+    made: dict[str, list[dict[str, Any] | None]] = {"frames": [], "strips": [], "attempts": []}
     views = sample_views(data_set, episodes, frames) if statistics.total.annotations.views else []
     if not any(view.has(name) for view in views for name in ("rgb", "depth")):
-        return Samples(data, [], asked)
+        return Samples({name: [] for name in made}, [], dict.fromkeys(made, 0))
     names = {each.object_id: each.name for each in statistics.objects}
-    content = find_content(views[0])
-    asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))
         scale = None if data_set.found else bin_scale(data_set.config.cell.bins, [view.records.camera])
-        data["frames"] += _present(make_frame(view, find_content(view), names, episodes.rows[view.episode].mode, album, scale))
+        made["frames"].append(make_frame(view, names, episodes.rows[view.episode].mode, album, scale))
     chosen = choose_episodes(episodes)
-    asked["strips"] = len(chosen)
     for place, index in enumerate(chosen):
-        strip = make_strip(
-            data_set, index, len(chosen) - place, album, lambda done, most, place=place: report(f"film strip {place + 1}", done, most)
-        )
-        data["strips"] += _present(strip)
+        progress = partial(report, f"film strip {place + 1}")
+        made["strips"].append(make_strip(data_set, index, len(chosen) - place, album, progress))
     attempts = choose_attempts(data_set, episodes)
-    asked["attempts"] = len(attempts)
     for done, found in enumerate(attempts):
         report("attempts", done, len(attempts))
-        data["attempts"] += _present(make_attempt(data_set, found, content, names, album))
-    return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
+        made["attempts"].append(make_attempt(data_set, found, names, album))
+    brightness = []
+    views = sample_views(data_set, episodes, SURVEY_VIEWS)
+    for done, view in enumerate(view for view in views if view.has("rgb")):
+        report("brightness", done, len(views))
+        brightness.append(measure_brightness(view))
+    fitting = {name: [each for each in items if each is not None] for name, items in made.items()}
+    return Samples(fitting, brightness, {name: len(items) for name, items in made.items()})
 
 
 def _durations(data_set: DataSet, episodes: SampledEpisodes) -> dict[str, float]:
@@ -147,20 +151,6 @@ def _durations(data_set: DataSet, episodes: SampledEpisodes) -> dict[str, float]
     for row in episodes.rows.values():
         longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
     return {} if data_set.period is None else {mode: frames * data_set.period for mode, frames in longest.items()}
-
-
-def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """Optional item as a list: empty for None."""
-    return [] if made is None else [made]
-
-
-def _measure(views: list[View], report: Report) -> list[Brightness]:
-    """Brightness of each view with a colour image; reports progress."""
-    measured = []
-    for done, view in enumerate(view for view in views if view.has("rgb")):
-        report("brightness", done, len(views))
-        measured.append(measure_brightness(view))
-    return measured
 
 
 def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Remark]]:
@@ -189,63 +179,39 @@ def _parts(
     data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Remark], versions: Mapping[str, str]
 ) -> list[PageSection]:
     """Sections of the report in order: frames, episodes, attempts (each says what did not fit the budget), figures, findings, settings."""
-    views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
+    shown, views = samples.data["frames"], statistics.total.annotations.views
     leads = {
-        "frames": ("Frames", f"{shown['frames']} of {views:,} views, evenly spread over episodes, cameras and time."),
+        "frames": ("Frames", f"{len(shown)} of {views:,} views, evenly spread over episodes, cameras and time."),
         "strips": ("Episodes", "One episode of each mode, of median length, from its first frame to its last."),
         "attempts": ("Attempts", "What was perceived, chosen and engaged, and why: attempts of every outcome."),
+        "figures": ("Figures", "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out."),
+        "findings": ("Findings", "What a person who looks through the figures would raise. A note may be meant."),
+        "settings": ("Configuration", "Settings that differ from the preset synpick, which has the paper's values."),
     }
-    parts = []
-    for name, (title, lead) in leads.items():
-        cut = samples.asked[name] - shown[name]
-        lead += f" {cut} more did not fit the {samples_budget()} of pictures." if cut else ""
-        empty = element("p", _EMPTY[name], class_="empty") if not shown[name] else element("div", id=f"{name}-host")
-        parts.append(PageSection(name, title, lead, empty))
-    figures = join([element("div", id="charts-host"), statistics_tables(statistics)])
-    return [
-        *parts,
-        PageSection(
-            "figures",
-            "Figures",
-            "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.",
-            figures,
-        ),
-        PageSection(
-            "findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)
-        ),
-        PageSection(
-            "settings",
-            "Configuration",
-            "Settings that differ from the preset synpick, which has the paper's values.",
-            _settings_tables(data_set, versions) if data_set.found is None else element("p", _NO_SETTINGS, class_="empty"),
-        ),
-    ]
+    cut, bodies = dict.fromkeys(leads, ""), dict[str, Html]()
+    for name, made in samples.data.items():
+        bodies[name] = element("div", id=f"{name}-host") if made else element("p", _EMPTY[name], class_="empty")
+        if left := samples.asked[name] - len(made):
+            cut[name] = f" {left} more did not fit the {BUDGET / 1e6:.0f} MB of pictures."
+    bodies["figures"] = join([element("div", id="charts-host"), statistics_tables(statistics)])
+    bodies["findings"] = findings_list(findings)
+    if data_set.found is None:
+        bodies["settings"] = settings_tables(changed_settings(data_set.config), config_to_toml(data_set.config, comments=True), versions)
+    else:
+        bodies["settings"] = element("p", _EMPTY["settings"], class_="empty")
+    return [PageSection(name, title, lead + cut[name], bodies[name]) for name, (title, lead) in leads.items()]
 
 
-def _settings_tables(data_set: DataSet, versions: Mapping[str, str]) -> Html:
-    """Tables of a data set's settings."""
-    return settings_tables(changed_settings(data_set.config), config_to_toml(data_set.config, comments=True), versions)
-
-
-_NO_SETTINGS = "A BOP data set from another source than synpick-warp bake: there are no settings."
 _EMPTY = {
     "frames": "This data set has no images.",
     "strips": "This data set has no images.",
     "attempts": "No attempts can be shown: no episode picks, or there are no images.",
+    "settings": "A BOP data set from another source than synpick-warp bake: there are no settings.",
 }
 
 
-def samples_budget() -> str:
-    """Budget of the pictures as text, in MB."""
-    return f"{Album().budget / 1e6:.0f} MB"
-
-
 def check_out(out: Path) -> None:
-    """Check the name of the file.
-
-    Raises:
-        OutputError: It is not that of an HTML file, or it is a folder.
-    """
+    """Check the name of the file; raises OutputError if it is not that of an HTML file, or it is a folder."""
     if out.suffix.lower() not in SUFFIXES:
         raise OutputError(f"{out} is not an HTML file; its name must end in {', '.join(SUFFIXES)}")
     if out.is_dir() and not out.is_symlink():
@@ -253,11 +219,7 @@ def check_out(out: Path) -> None:
 
 
 def write_text(out: Path, pieces: Iterable[str]) -> None:
-    """Write a file atomically.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Write a file atomically; raises OutputError if it cannot be written."""
     try:
         with output_errors(out):
             make_folder(out.parent)

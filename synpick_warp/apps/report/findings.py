@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from synpick_warp.apps.report.sampling import Brightness, SampledEpisodes
+from synpick_warp.apps.report.frames import Brightness, SampledEpisodes
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.codes import Ending, Outcome
 
@@ -74,31 +74,22 @@ def find(figures: Figures) -> list[Remark]:
 
 
 def _unfinished(figures: Figures) -> Rule:
-    """Warn of planned episodes that are missing."""
     present = figures.episodes.total
     if present < figures.planned:
-        yield (
-            WARNING,
-            f"{figures.planned - present:,} of {figures.planned:,} planned episodes are missing",
-            "The bake is not finished, or gave them up; the command that started it resumes it.",
-        )
+        title = f"{figures.planned - present:,} of {figures.planned:,} planned episodes are missing"
+        yield WARNING, title, "The bake is not finished, or gave them up; the command that started it resumes it."
 
 
 def _never_drawn(figures: Figures) -> Rule:
-    """Warn of objects that have a model but occur in no view."""
     never = [each for each in figures.statistics.objects if not each.instances]
     if never and figures.statistics.total.annotations.views:
         listed = _listed(each.name or f"object {each.object_id}" for each in never)
-        count = len(never)
-        yield (
-            WARNING,
-            f"{count} object{' was' if count == 1 else 's were'} never drawn",
-            f"{listed}: in the models folder, but in no view. More episodes, or a larger arrangement.volume, draw more objects.",
-        )
+        title = f"{len(never)} object{' was' if len(never) == 1 else 's were'} never drawn"
+        remedy = "More episodes, or a larger arrangement.volume, draw more objects."
+        yield WARNING, title, f"{listed}: in the models folder, but in no view. {remedy}"
 
 
 def _rare(figures: Figures) -> Rule:
-    """Note objects with fewer annotations than RARE times the median."""
     counts = [each.instances for each in figures.statistics.objects if each.instances]
     if len(counts) < 3:
         return
@@ -110,7 +101,6 @@ def _rare(figures: Figures) -> Rule:
 
 
 def _failures(figures: Figures) -> Rule:
-    """Warn of each failed outcome that makes up FAILURE_SHARE of the attempts or more."""
     episodes = figures.statistics.total.episodes
     sentences = {outcome.name.lower(): outcome for outcome in Outcome}
     for name, count in episodes.outcomes.items():
@@ -120,15 +110,11 @@ def _failures(figures: Figures) -> Rule:
         share = count / episodes.attempts
         if share >= FAILURE_SHARE and episodes.attempts >= MIN_ATTEMPTS:
             reason = outcome.sentence if outcome is not None else name
-            yield (
-                WARNING,
-                f"{share:.0%} of the attempts failed for one reason: {name.replace('_', ' ')}",
-                f"{count:,} of {episodes.attempts:,}: {reason}. The explained attempts show some of them.",
-            )
+            title = f"{share:.0%} of the attempts failed for one reason: {name.replace('_', ' ')}"
+            yield WARNING, title, f"{count:,} of {episodes.attempts:,}: {reason}. The explained attempts show some of them."
 
 
 def _without_attempt(figures: Figures) -> Rule:
-    """Warn of picking episodes without an attempt."""
     rows = figures.episodes.rows
     idle = [index for index, row in rows.items() if row.mode in ("pick", "target") and not figures.episodes.attempts[index]]
     if idle:
@@ -137,23 +123,18 @@ def _without_attempt(figures: Figures) -> Rule:
 
 
 def _endings(figures: Figures) -> Rule:
-    """Warn if GIVEN_UP_SHARE of the picking episodes or more were given up, and of episodes of one frame."""
     endings = figures.statistics.total.episodes.endings
     given_up = endings.get(Ending.GAVE_UP.name.lower(), 0)
     picking = sum(group.episodes.episodes for group in figures.statistics.groups if group.mode != "move")
     if picking >= MIN_EPISODES and given_up / picking >= GIVEN_UP_SHARE:
-        yield (
-            WARNING,
-            f"{given_up / picking:.0%} of the picking episodes were given up",
-            f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their bins are not empty at the end.",
-        )
+        title = f"{given_up / picking:.0%} of the picking episodes were given up"
+        yield WARNING, title, f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their bins are not empty at the end."
     short = [index for index, row in figures.episodes.rows.items() if row.frames <= 1]
     if short:
         yield WARNING, f"{_number(len(short), 'episode')} of one frame or none", f"Episodes {_listed(map(str, short))}."
 
 
 def _lost(figures: Figures) -> Rule:
-    """Warn if LOST_SHARE of the objects or more fell out of the scene."""
     episodes = figures.statistics.total.episodes
     if episodes.objects and episodes.lost / episodes.objects >= LOST_SHARE:
         share = episodes.lost / episodes.objects
@@ -161,41 +142,30 @@ def _lost(figures: Figures) -> Rule:
 
 
 def _brightness(figures: Figures) -> Rule:
-    """Warn if EXTREME_SHARE of the measured views or more are too dark, or too bright."""
     views = figures.brightness
-    extremes = (("dark", [each for each in views if each.mean < DARK]), ("bright", [each for each in views if each.mean > BRIGHT]))
-    for word, found in extremes:
+    dark, bright = [each for each in views if each.mean < DARK], [each for each in views if each.mean > BRIGHT]
+    for word, found, side, limit in (("dark", dark, "below", DARK), ("bright", bright, "above", BRIGHT)):
         if views and len(found) / len(views) >= EXTREME_SHARE:
             listed = _listed(f"episode {each.episode}, camera {each.camera}, frame {each.frame}" for each in found)
             title = f"{len(found)} of {len(views)} measured views are too {word}"
-            yield (
-                WARNING,
-                title,
-                f"Mean brightness {'below' if word == 'dark' else 'above'} {DARK if word == 'dark' else BRIGHT:.0%}: {listed}.",
-            )
+            yield WARNING, title, f"Mean brightness {side} {limit:.0%}: {listed}."
 
 
 def _invisible(figures: Figures) -> Rule:
-    """Note if INVISIBLE_SHARE of the instances or more have no visible pixel."""
     counted = figures.statistics.total.annotations
     if counted.instances and counted.invisible / counted.instances >= INVISIBLE_SHARE:
         share = counted.invisible / counted.instances
-        yield (
-            NOTE,
-            f"{share:.0%} of the instances have no visible pixel",
-            "They lie below others or outside of the image; targets leave them out.",
-        )
+        title = f"{share:.0%} of the instances have no visible pixel"
+        yield NOTE, title, "They lie below others or outside of the image; targets leave them out."
 
 
 def _depth(figures: Figures) -> Rule:
-    """Warn if MISSING_DEPTH of the depth pixels or more have no measurement."""
     depth = figures.statistics.depth
     if depth is not None and depth.missing >= MISSING_DEPTH:
         yield WARNING, f"{depth.missing:.0%} of the depth pixels have no measurement", f"In {depth.views:,} sampled views."
 
 
 def _lights(figures: Figures) -> Rule:
-    """Note if one environment map lights more than ONE_MAP_SHARE of the episodes."""
     lights = figures.statistics.lights
     if lights is None or lights.episodes < MIN_EPISODES:
         return
@@ -207,7 +177,6 @@ def _lights(figures: Figures) -> Rule:
 
 
 def _coverage(figures: Figures) -> Rule:
-    """Note objects that were often seen, but from less than COVERED of the sphere of viewing directions."""
     poor = [each for each in figures.statistics.objects if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED]
     if poor:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.coverage.occupied:.0%})" for each in poor)

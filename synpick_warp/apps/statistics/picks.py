@@ -1,24 +1,18 @@
-"""Evaluation of analytic suction scores against simulated success: ROC AUC and calibration, by population of candidates and by object."""
+"""Evaluation of analytic suction scores against simulated success, by population of candidates and by object.
+
+ROC AUC: Fawcett, An introduction to ROC analysis, 2006; expected calibration error: Naeini et al., 2015; cluster bootstrap: Field and
+Welsh, 2007. Samples have weights.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from synpick_warp.apps.statistics.ranking import (
-    BINS,
-    DRAWS,
-    CalibrationCurve,
-    Interval,
-    Scored,
-    calibrate,
-    estimate,
-    success_rate,
-    weighted_auc,
-)
 from synpick_warp.codes import Outcome, Share
 from synpick_warp.dataset.bop.models import names_of
 from synpick_warp.errors import DatasetError
@@ -26,6 +20,136 @@ from synpick_warp.system.codecs.tables import Table, parse_columns
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
+
+BINS = 10
+"""Bins of a calibration curve, of equal width from 0 to 1."""
+DRAWS = 1000
+"""Bootstrap resamples."""
+_LEVELS = (2.5, 97.5)
+"""Percentiles of a 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Estimate with its 95 % confidence interval; NaN: undefined, as an AUC without failures."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scored:
+    """Sample of a binary predictor: scores with outcomes, weights and clusters.
+
+    Samples of a cluster depend on each other, such as picks from one state; clusters are independent.
+    """
+
+    score: np.ndarray
+    """(sample) float."""
+    outcome: np.ndarray
+    """(sample) bool."""
+    weight: np.ndarray
+    """(sample) float, 0 or more."""
+    cluster: np.ndarray
+    """Index of the cluster (sample) int, from 0."""
+
+    @cached_property
+    def ties(self) -> tuple[int, np.ndarray]:
+        """Dense ranking of the scores: number of distinct scores, and the rank of each sample, ascending from 0 (sample) int."""
+        values, rank = np.unique(self.score, return_inverse=True)
+        return len(values), rank
+
+    def select(self, kept: np.ndarray) -> Scored:
+        """Subset by a mask (sample) bool; clusters keep their indices."""
+        return Scored(self.score[kept], self.outcome[kept], self.weight[kept], self.cluster[kept])
+
+
+def weighted_auc(scored: Scored, weight: np.ndarray | None = None) -> float:
+    """ROC AUC by the weighted Mann-Whitney statistic, from 0 to 1: probability that a success outscores a failure; ties count half. NaN
+    without successes or failures. `weight`: others (sample) than the samples' own."""
+    weight = scored.weight if weight is None else weight
+    count, rank = scored.ties
+    gained, lost = (np.bincount(rank, weight * side, count) for side in (scored.outcome, ~scored.outcome))
+    pairs = gained.sum() * lost.sum()
+    return float(gained @ (np.cumsum(lost) - lost / 2.0) / pairs) if pairs > 0.0 else float("nan")
+
+
+def success_rate(scored: Scored, weight: np.ndarray | None = None) -> float:
+    """Weighted share of successes; NaN without samples. Arguments as of `weighted_auc`."""
+    weight = scored.weight if weight is None else weight
+    return float(weight @ scored.outcome / weight.sum()) if weight.sum() > 0.0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationCurve:
+    """Calibration curve (reliability diagram) by bin of the score."""
+
+    count: np.ndarray
+    """(bin) int."""
+    predicted: np.ndarray
+    """Weighted mean score (bin); NaN here and below: the bin is empty."""
+    observed: np.ndarray
+    """Weighted success rate (bin)."""
+    low: np.ndarray
+    """Lower end of the 95 % interval of `observed` (bin)."""
+    high: np.ndarray
+    """Upper end of that interval (bin)."""
+    error: Interval
+    """Expected calibration error: weighted mean of |observed - predicted| over bins."""
+
+    def bins(self) -> Iterator[tuple[float, ...]]:
+        """Count, mean score, success rate, and the ends of its interval, of each bin."""
+        yield from zip(self.count, self.predicted, self.observed, self.low, self.high, strict=True)
+
+
+def calibrate(scored: Scored, draws: int = DRAWS) -> CalibrationCurve:
+    """Calibration curve of scores from 0 to 1, read as probabilities, with cluster bootstrap intervals."""
+    place = np.clip((scored.score * BINS).astype(np.int64), 0, BINS - 1)
+
+    def sums(weight: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(place, weight * values, BINS) for values in (1.0, scored.score, scored.outcome)])
+
+    def curve(weight: np.ndarray) -> np.ndarray:
+        total, predicted, observed = sums(weight)
+        with np.errstate(invalid="ignore"):
+            return np.concatenate((observed / total, [np.abs(predicted - observed).sum() / total.sum()]))
+
+    with np.errstate(invalid="ignore"):
+        total, predicted, _ = sums(scored.weight)
+        mean = predicted / total
+    value, low, high = bootstrap(scored, curve, draws)
+    error = Interval(float(value[-1]), float(low[-1]), float(high[-1]))
+    return CalibrationCurve(np.bincount(place, minlength=BINS), mean, value[:-1], low[:-1], high[:-1], error)
+
+
+def estimate(scored: Scored, statistic: Callable[[Scored, np.ndarray], float], draws: int = DRAWS) -> Interval:
+    """Estimate of a statistic of samples and weights, such as `weighted_auc`, with its cluster bootstrap interval."""
+    value, low, high = bootstrap(scored, lambda weight: np.array([statistic(scored, weight)]), draws)
+    return Interval(float(value[0]), float(low[0]), float(high[0]))
+
+
+def bootstrap(
+    scored: Scored, statistic: Callable[[np.ndarray], np.ndarray], draws: int = DRAWS
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cluster bootstrap, percentile intervals: whole clusters are drawn with replacement; k draws multiply a cluster's weights by k.
+
+    `statistic` maps weights (sample) to an array of fixed shape; resamples are drawn from a fixed seed. Returns values, and lower and upper
+    ends of their 95 % intervals, which are NaN with fewer than two clusters.
+    """
+    value = statistic(scored.weight)
+    names, cluster = np.unique(scored.cluster, return_inverse=True)
+    if len(names) < 2:
+        return value, np.full_like(value, np.nan), np.full_like(value, np.nan)
+    generator = np.random.default_rng(0)
+    drawn = np.stack(
+        [statistic(scored.weight * generator.multinomial(len(names), np.full(len(names), 1.0 / len(names)))[cluster]) for _ in range(draws)]
+    )
+    ends = np.full((2, *value.shape), np.nan)
+    known = ~np.isnan(drawn).all(axis=0)
+    ends[:, known] = np.nanpercentile(drawn[:, known], _LEVELS, axis=0)
+    return value, ends[0], ends[1]
+
 
 SCORES = ("seal x wrench", "seal", "wrench")
 """Analytic scores; the first is SuctionNet's."""
@@ -82,10 +206,8 @@ class PickFigures:
 def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
     """Concatenate the trials of all episodes; returns them, and the number of episodes with trials.
 
-    The structured array (trial) also has `cluster`, a number of the state, and `angle` between press and surface normal [°].
-
-    Raises:
-        DatasetError: There are no trials, or a table is damaged.
+    The structured array (trial) also has `cluster`, a number of the state, and `angle` between press and surface normal [°]. Raises
+    DatasetError if there are no trials, or a table is damaged.
     """
     parts, states, episodes = [], 0, 0
     for episode in data_set.values():
@@ -107,16 +229,9 @@ def collect_picks(data_set: DataSet) -> tuple[np.ndarray, int]:
 
 
 def evaluate_picks(trials: np.ndarray, episodes: int, names: dict[int, str], draws: int = DRAWS) -> PickFigures:
-    """Evaluate the analytic scores on trials, by population and by object, with cluster bootstrap intervals over states.
+    """Evaluate the analytic scores on trials of `collect_picks`, by population and by object, with cluster bootstrap intervals over states.
 
-    Args:
-        trials: As of `collect_picks`.
-        episodes: Number of episodes with trials.
-        names: Name of each object.
-        draws: Bootstrap resamples of the intervals.
-
-    Returns:
-        The figures; without scores and objects if no trial of a sampled candidate has an outcome, as with picks.candidates = 1.
+    The figures have neither scores nor objects if no trial of a sampled candidate has an outcome, as with picks.candidates = 1.
     """
     counted = trials[(trials["share"] != Share.OWN) & (trials["outcome"] != Outcome.NONE)]
     both = {"seal x wrench": counted["seal"] * counted["wrench"], "seal": counted["seal"], "wrench": counted["wrench"]}
@@ -149,17 +264,12 @@ def _by_object(trials: np.ndarray, scored: Scored, names: dict[int, str], draws:
         yield ObjectFigures(obj_id, names.get(obj_id, f"object {obj_id}"), len(own.score), estimate(own, success_rate, draws), auc)
 
 
-def picks_figures(data_set: DataSet, draws: int = DRAWS) -> PickFigures:
-    """Collect and evaluate the picks of a data set. Errors: see `collect_picks`."""
-    trials, episodes = collect_picks(data_set)
-    return evaluate_picks(trials, episodes, names_of(data_set), draws)
-
-
 def find_picks(data_set: DataSet, draws: int = DRAWS) -> PickFigures | None:
-    """Like `picks_figures`, but None if the data set has no picks. Raises DatasetError if a table is damaged."""
+    """Collect and evaluate the picks of a data set; None: it has none. Raises DatasetError if a table is damaged."""
     if data_set.found is not None or "picks" not in data_set.config.bake.formats or not any(len(each.picks) for each in data_set.values()):
         return None
-    return picks_figures(data_set, draws)
+    trials, episodes = collect_picks(data_set)
+    return evaluate_picks(trials, episodes, names_of(data_set), draws)
 
 
 _RATE = "success:.1% success_low:.1%:from success_high:.1%:to"

@@ -101,11 +101,6 @@ class ComparedView:
         bound = EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH
         return max(bound if self.given is None else self.given.mm, 1.5 * count)
 
-    @property
-    def exact_masks(self) -> bool:
-        """Whether the data set is of this program, so that its masks are exactly those of the same rasterizer."""
-        return self.view.scene.layout.ours
-
     @cached_property
     def matrix(self) -> np.ndarray | None:
         """Intrinsics (3, 3); None: the image has none, or another camera model."""

@@ -90,15 +90,8 @@ RULES: dict[str, Rule] = {}
 
 
 def rule(subject: type, name: str, cure: str, level: Level = Level.ERROR, unit: str = "") -> Callable[[_Check], _Check]:
-    """Declare the decorated function as the check of a rule, whose sentence is its docstring.
-
-    Args:
-        subject: Type of the function's argument; the rule is applied to each such subject of a data set.
-        name: Name of the rule: words joined by hyphens.
-        cure: How to mend a violation.
-        level: Level of its violations.
-        unit: Unit of its deviations; empty: it has none.
-    """
+    """Declare the decorated function as the check of a rule, whose sentence is its docstring, about each subject of a type; `name` is words
+    joined by hyphens, `cure` how to mend a violation, `unit` that of its deviations, empty: it has none."""
 
     def declare(check: _Check) -> _Check:
         assert name not in RULES, name
@@ -122,10 +115,8 @@ def apply_rules(
 ) -> Iterator[Violation]:
     """Check a subject by all rules for its type; yields violations. A rule that meets unreadable data ends with a violation about it.
 
-    Args:
-        subject: What is checked.
-        tolerance: Deviations up to it are accepted; None: each rule has its own bound.
-        deviations: If there is a tolerance, (rule, obj_id, value) of each deviation is appended to this list.
+    Deviations up to a tolerance are accepted, and (rule, obj_id, value) of each is appended to `deviations`; None: each rule has its own
+    bound.
     """
     for item in load_rules().values():
         if item.subject is not type(subject):
@@ -163,21 +154,14 @@ def distributions(deviations: Mapping[tuple[str, int], Sequence[float]]) -> list
         parts = {obj_id: np.array(values) for (rule, obj_id), values in sorted(deviations.items()) if rule == item.name}
         if parts:
             every = {None: np.concatenate(list(parts.values()))} | parts
-            found += [DeviationSummary(item.name, obj_id, item.unit, len(part), *_summarize(part)) for obj_id, part in every.items()]
+            for obj_id, part in every.items():
+                shares = float(np.median(part)), float(np.quantile(part, 0.95)), float(part.max())
+                found.append(DeviationSummary(item.name, obj_id, item.unit, len(part), *shares))
     return found
 
 
-def _summarize(values: np.ndarray) -> tuple[float, float, float]:
-    """Median, 95th percentile and maximum."""
-    return float(np.median(values)), float(np.quantile(values, 0.95)), float(values.max())
-
-
 def parse_tolerance(text: str) -> Tolerance:
-    """Parse the tolerance MM,PX.
-
-    Raises:
-        ConfigError: The text is not two numbers above 0.
-    """
+    """Parse the tolerance MM,PX; raises ConfigError if the text is not two numbers above 0."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

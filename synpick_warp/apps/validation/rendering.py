@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ class ObjectRenderer:
         start_warp()
         self.layout = layout
         self.device = pick_device("cpu")
-        self._models: dict[int, tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]] = {}
+        self._load = lru_cache(MAX_MODELS)(self._read)
         self._damaged: set[int] = set()
 
     def render(
@@ -55,19 +56,11 @@ class ObjectRenderer:
         size: tuple[int, int],
         lens: LensMap | None = None,
     ) -> DepthPatch:
-        """Render an object.
+        """Render an object by its pose to the camera, rotation (3, 3) and translation (3) [mm].
 
-        Args:
-            obj_id: The object.
-            rotation: Object to camera (3, 3).
-            translation: Object to camera (3) [mm].
-            matrix: Intrinsics (3, 3) [px]; the centre of pixel (row, column) is (column + 0.5, row + 0.5).
-            size: Width and height of the image [px].
-            lens: Distortion; None: a pinhole.
-
-        Raises:
-            CatalogError: The model cannot be read, or has too many triangles.
-            DatasetError: The object has no model.
+        `matrix` (3, 3) [px] has the intrinsics, where the centre of pixel (row, column) is (column + 0.5, row + 0.5); `size` is width and
+        height of the image [px]; `lens`: distortion, None: a pinhole. Raises CatalogError if the model cannot be read, or has too many
+        triangles, and DatasetError if there is none.
         """
         mesh, meshes, keep = self._load(obj_id)
         points = mesh.vertices.astype(np.float64) @ rotation.T + translation * _MILLIMETRE
@@ -90,23 +83,15 @@ class ObjectRenderer:
                 self._damaged.add(obj_id)
         return obj_id not in self._damaged
 
-    def _load(self, obj_id: int) -> tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]:
-        """Load a model, or take it from a cache of MAX_MODELS models, least recently used first out; raises if there is none, or no
-        triangles.
-        """
-        found = self._models.pop(obj_id, None)
-        if found is None:
-            if obj_id not in self.layout.model_files:
-                raise DatasetError(f"there is no model of obj_id {obj_id}")
-            folder, name = self.layout.model_files[obj_id]
-            mesh = read_mesh(self.layout.models[folder].path(name), _MILLIMETRE)[0]
-            if not len(mesh.faces):
-                raise CatalogError(f"{folder}/{name}: no triangles")
-            found = (mesh, *build_meshes([mesh], 1, self.device))
-        while len(self._models) >= MAX_MODELS:
-            self._models.pop(next(iter(self._models)))
-        self._models[obj_id] = found
-        return found
+    def _read(self, obj_id: int) -> tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]:
+        """Read a model; raises DatasetError if there is none, and CatalogError if it cannot be read, or has no triangles."""
+        if obj_id not in self.layout.model_files:
+            raise DatasetError(f"there is no model of obj_id {obj_id}")
+        folder, name = self.layout.model_files[obj_id]
+        mesh = read_mesh(self.layout.models[folder].path(name), _MILLIMETRE)[0]
+        if not len(mesh.faces):
+            raise CatalogError(f"{folder}/{name}: no triangles")
+        return mesh, *build_meshes([mesh], 1, self.device)
 
 
 def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int], lens: LensMap | None) -> tuple[int, int, int, int]:

@@ -1,24 +1,105 @@
 """Files of a scene behind one interface: scene folders (classic, one per sensor), webdataset shards, and the imagewise layout.
 
-Masks are crops, with the bit depth and colour type that the file states.
+Masks are crops, with the bit depth and colour type that the file states. Schemas are as loose as the toolkit is, so that rules, not the
+parser, name what is wrong.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
+import msgspec
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 
-from synpick_warp.apps.validation.schemas import PLAIN_KEY, RECORDS, Coco, Segmentation, convert
+from synpick_warp.dataset.annotations import GraphEntry, Index, InfoEntry, Length, Matrix3, TruthEntry, camera_schema
 from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.inputs.image_files import MAX_SIDE, decode_picture
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+
+PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
+"""An index as a key: decimal digits without leading zeros."""
+
+
+CAMERA = camera_schema(cam_model=dict[str, Any], depth_scale=Length, cam_R_w2c=Matrix3)
+
+
+class TruthSchema(TruthEntry, gc=False):
+    """Schema of an instance's entry in scene_gt.json: object-to-camera rotation and translation [mm], obj_id."""
+
+    cam_R_m2c: Matrix3  # noqa: N815
+
+
+class Info(InfoEntry, gc=False):
+    """Schema of an instance's entry in scene_gt_info.json: boxes and pixel counts [px], visible fraction."""
+
+    visib_fract: Length
+
+
+class Segmentation(Struct, gc=False):
+    """Run-length encoding (RLE) of a mask; `counts` is a list, or a string in pycocotools' compressed form."""
+
+    counts: list[Index] | str
+    size: tuple[Index, Index]
+    """Height and width [px]."""
+
+
+class Annotation(Struct, gc=False):
+    """Schema of an annotation in scene_gt_coco.json: ids, box [px], run lengths; UNSET: missing."""
+
+    id: Index
+    image_id: Index
+    category_id: Index
+    bbox: Annotated[list[Length], msgspec.Meta(min_length=4, max_length=4)]
+    segmentation: Segmentation
+    area: Length | UnsetType = UNSET
+    ignore: bool | UnsetType = UNSET
+
+
+class CocoImage(Struct, gc=False):
+    """Schema of an image in scene_gt_coco.json."""
+
+    id: Index
+    file_name: str
+    width: Index
+    height: Index
+
+
+class Category(Struct, gc=False):
+    """Schema of a category, an object, in scene_gt_coco.json."""
+
+    id: Index
+
+
+class Coco(Struct, gc=False):
+    """Schema of scene_gt_coco.json: images, annotations, categories."""
+
+    images: list[CocoImage]
+    annotations: list[Annotation]
+    categories: list[Category]
+
+
+RECORDS: dict[str, Any] = {"camera": CAMERA, "gt": list[TruthSchema], "gt_info": list[Info], "graph": GraphEntry}
+"""Schema of an image's entry by file."""
+
+
+def convert(content: Any, schema: Any) -> Any:
+    """Check decoded JSON against a schema; returns it as the schema's types, or raises ValueError in few words, with the place in
+    `content`."""
+    try:
+        return msgspec.convert(content, schema)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except msgspec.ValidationError as fault:
+        raise ValueError(str(fault).replace("`", "")) from None
+
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _COLOUR_TYPES = {0: "greyscale", 2: "RGB", 3: "palette", 4: "greyscale with alpha", 6: "RGB with alpha"}
@@ -222,11 +303,7 @@ CheckedScene = FolderScene | KeyedScene
 
 
 def decode_runs(runs: Segmentation, file: str) -> np.ndarray:
-    """Decode run lengths (H, W) bool.
-
-    Raises:
-        DatasetError: They are compressed, or do not cover the image.
-    """
+    """Decode run lengths (H, W) bool; raises DatasetError if they are compressed, or do not cover the image."""
     height, width = runs.size
     if isinstance(runs.counts, str) or max(runs.size) > MAX_SIDE or sum(runs.counts) != height * width:
         raise DatasetError(f"{file}: the runs do not cover the image of {width} x {height} pixels")

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from synpick_warp.apps.validation.scene_files import CheckedScene, RecordFile, StoredMask, png_type
-from synpick_warp.apps.validation.schemas import Annotation, Coco, Info, TruthSchema
+from synpick_warp.apps.validation.scene_files import Annotation, CheckedScene, Coco, Info, RecordFile, StoredMask, TruthSchema, png_type
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError

@@ -36,11 +36,7 @@ def check_picture_name(out: Path) -> None:
 
 
 def write_picture(out: Path, picture: Image) -> Path:
-    """Write an image in the format of its suffix; its folder is created. Returns the path.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
+    """Write an image in the format of its suffix; its folder is created. Returns the path. Raises OutputError if it cannot be written."""
     try:
         encoded, data = cv2.imencode(out.suffix, picture)
     except cv2.error:

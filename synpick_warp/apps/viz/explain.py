@@ -24,14 +24,22 @@ from synpick_warp.apps.viz.drawing import (
     shorten,
     write_picture,
 )
-from synpick_warp.apps.viz.explain_graph import CYCLIC, GREY, OUTVOTED, RED, clutter_edges, disc, draw_graph, fixed, put_boxed
 from synpick_warp.apps.viz.explain_record import (
+    CYCLIC,
+    GREY,
     MODE_WORDS,
+    OUTVOTED,
+    RED,
     SeenAttempt,
     break_force,
     choice_words,
     choose_attempts,
+    clutter_edges,
+    disc,
+    draw_graph,
+    fixed,
     labels,
+    put_boxed,
     read_attempts,
     seal_words,
     suction_kind,
@@ -93,19 +101,9 @@ _COLUMNS = ((0, "object"), (236, "above"), (296, "area"), (356, "pixels"), (416,
 
 
 def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: int | None = None) -> Path:
-    """Draw one attempt of an episode, all of them, or the first ones worth seeing, below each other, and write the image file.
-
-    Args:
-        dataset: Folder of the data set.
-        out: PNG or JPEG file to write; its folder is created.
-        episode: Index of the episode; None: the first DEFAULT_ATTEMPTS worth seeing, of any.
-        attempt: Index of the attempt in the episode; None: all.
-
-    Raises:
-        ConfigError: The data set's config.toml is damaged.
-        DatasetError: There is no such attempt, or a file is missing or damaged.
-        OutputError: The image cannot be written.
-        ChartError: The charts' library cannot run.
+    """Draw one attempt of an episode, all of them (None), or the first DEFAULT_ATTEMPTS worth seeing of any, below each other, and write a
+    PNG or JPEG file, whose folder is created. Raises ConfigError if the data set's config.toml is damaged, DatasetError if there is no such
+    attempt, or a file is missing or damaged, OutputError if the image cannot be written, and ChartError if the charts' library cannot run.
     """
     check_picture_name(out)
     if not dataset.is_dir():
@@ -140,14 +138,10 @@ def _open_view(dataset: Path, scenes: SceneIndex, attempt: SeenAttempt, camera: 
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """Map a pixel of the perception image to the colour image (column, row); in both, integers are pixel centres.
+    """Map a pixel (column, row) of the perception image to the colour image, by width and height of both [px]; in both, integers are pixel
+    centres.
 
     Both images have the same camera and horizontal field of view, and the same point in the middle; their aspect ratios may differ.
-
-    Args:
-        pixel: Column and row in the perception image.
-        resolution: Width and height of the perception image [px].
-        size: Width and height of the colour image [px].
     """
     scale = size[0] / resolution[0]
     column, row = ((value + 0.5 - old / 2) * scale + new / 2 - 0.5 for value, old, new in zip(pixel, resolution, size, strict=True))
@@ -171,11 +165,6 @@ def to_view(view: View, planned: Camera, places: list[tuple[float, float]]) -> l
     rays = np.column_stack(((np.array(places) + 0.5 - matrix[:2, 2]) / matrix[[0, 1], [0, 1]], np.ones(len(places))))
     points = (rays * np.where(near > 0.0, near, 1.0)[:, None] - planned.translation) @ planned.rotation
     return [(x, y) for x, y in (view.project(points, view.world_to_camera) - 0.5).tolist()]
-
-
-def image_scale(size: tuple[int, int]) -> float:
-    """Scale of a colour image of that width and height [px] on the sheet."""
-    return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
 def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image, min_votes: float) -> tuple[Image, int]:
@@ -210,19 +199,14 @@ def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image,
 def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -> Image:
     """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
-    Args:
-        attempt: The attempt.
-        view: The camera of perception at the observation.
-        planned: As of `planning_camera`.
-
-    Raises:
-        DatasetError: A file is missing or damaged, or has no such view.
+    `view` is the camera of perception at the observation, `planned` as of `planning_camera`. Raises DatasetError if a file is missing or
+    damaged.
     """
     color, seen = view.rgb[..., ::-1], attempt.objects
     ids = view.instance_ids.tolist() if view.has("mask_visib") else []
     masks = {instance: view.masks[row] for row, instance in enumerate(ids) if instance in seen}
     height, width = color.shape[:2]
-    scale = image_scale((width, height))
+    scale = min(IMAGE_WIDTH / width, _MAX_IMAGE_HEIGHT / height)
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
     color = cv2.resize(color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     drawn = (0.62 * color).astype(np.uint8)
@@ -324,7 +308,6 @@ def draw_words(attempt: SeenAttempt, names: Mapping[int, str], rules: tuple[Targ
 
 
 def _draw_table(canvas: Image, attempt: SeenAttempt, names: Mapping[int, str], top: int) -> None:
-    """Draw the table of objects, in place; the target's row is highlighted."""
     short = labels(attempt)
     for x, text in _COLUMNS:
         put_text(canvas, text, (x, top + 16), TEXT, SOFT)

@@ -36,9 +36,7 @@ class DepthScale(NamedTuple):
 def bin_scale(bins: Sequence[BinSizes], cameras: Iterable[Mapping[str, Any]]) -> DepthScale | None:
     """Depths from the nearest corner of the bins' rims to the farthest of their floors, over some cameras; None: a camera has no pose.
 
-    Args:
-        bins: The bins.
-        cameras: Records of scene_camera.json; their world is the bin's frame: origin in the middle of the inner floor, z up.
+    The world of the cameras' records is the bin's frame: origin in the middle of the inner floor, z up.
     """
     corners, depths = np.array([corner for sizes in bins for corner in sizes.inner_corners]), []
     for camera in cameras:
@@ -81,15 +79,14 @@ def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = N
 
     `depth_scale` is that of depth images beside it, in the unit of the values; None: the image's own.
     """
-    return _draw_depth(_DEPTHS[name], values, depth_scale) if name in _DEPTHS else _DRAW[name](values)
+    if name not in _DEPTHS:
+        return _DRAW[name](values)
+    return f"{_DEPTHS[name]}: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, depth_scale)
 
 
 def layer_pictures(files: SceneFiles, frame: int, depth_scale: DepthScale | None) -> list[tuple[str, Image]]:
-    """Caption and colours of each layer that a scene has.
-
-    Raises:
-        DatasetError: The scene has a layer, but not for this frame, or the file is damaged.
-    """
+    """Caption and colours of each layer that a scene has; raises DatasetError if the scene has a layer, but not for this frame, or the file
+    is damaged."""
     present = [name for name in (*_DRAW, *_DEPTHS) if files.has(name)]
     return [draw_layer(name, read_layer(files, name, frame), depth_scale) for name in present]
 
@@ -122,11 +119,6 @@ def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
     full = _full_scale(size)
     colors = _bytes((values / full + 1.0) / 2.0)
     return f"scene flow: x, y, z as red, green, blue, up to {1e3 * full:.1f} mm", _with_unknown(colors, size)
-
-
-def _draw_depth(caption: str, values: np.ndarray, scale: DepthScale | None) -> tuple[str, Image]:
-    """Depth as a TURBO colour map; holes are black."""
-    return f"{caption}: {100.0 * (values == 0).mean():.1f} % holes, black", color_depth(values, scale)
 
 
 def _draw_score(caption: str, values: np.ndarray) -> tuple[str, Image]:

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from synpick_warp.apps.viz.drawing import INK, WHITE, Image, blank, check_picture_name, paste, put_text, write_picture
 from synpick_warp.apps.viz.explain import GREEN, LINE, TEXT, wrapped
-from synpick_warp.apps.viz.explain_graph import disc, fixed
+from synpick_warp.apps.viz.explain_record import disc, fixed
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.bop.models import names_of
 from synpick_warp.dataset.view import mean_by_candidate
@@ -44,13 +44,7 @@ _HEAD = 48
 def spread_over_surface(view: View, points: np.ndarray, instances: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Inverse distance weighting (Shepard, 1968) of values over the visible pixels of instances (H, W) float64; NaN: no point on it.
 
-    Weights are inverse squared distances in the image to the NEIGHBOURS nearest points of the same instance.
-
-    Args:
-        view: The view.
-        points: Places in the image (point, 2) [px].
-        instances: Instance of each (point).
-        values: Value of each (point).
+    Weights are inverse squared distances in the image to the NEIGHBOURS nearest points (point, 2) [px] of the same instance (point).
     """
     width, height = view.size
     result = np.full((height, width), np.nan)
@@ -81,11 +75,8 @@ def heat_colors(values: np.ndarray) -> Image:
 
 
 def draw_pick_maps(view: View, picks: np.ndarray, width: int = WIDTH) -> list[tuple[str, Image]]:
-    """Heat maps of the picks that were tried from a view's frame, with the tried points: simulated success, and the analytic score.
-
-    Returns:
-        Caption and picture of each, `width` pixels wide.
-    """
+    """Heat maps of the picks that were tried from a view's frame, with the tried points: simulated success, and the analytic score. Returns
+    caption and picture of each, `width` pixels wide."""
     first, success = mean_by_candidate(picks)
     tried = picks[first]
     score = (tried["seal"] * tried["wrench"]).astype(np.float64)
@@ -165,40 +156,22 @@ def draw_trial(view: View, trial: np.void, radius: float) -> Image:
 
 def choose_trial(picks: np.ndarray, candidate: int | None = None) -> np.void:
     """Choose a trial to explain: the unperturbed failure with the highest analytic score; without failures, the success with the lowest.
-
-    With `candidate`, its first trial.
-
-    Raises:
-        DatasetError: There is no such candidate.
-    """
+    With `candidate`, its first trial; raises DatasetError if there is no such candidate."""
     if candidate is not None:
         own = np.flatnonzero(picks["candidate"] == candidate)
         if not len(own):
             raise DatasetError(f"the state has no candidate {candidate}; it has {len(np.unique(picks['candidate']))} candidates")
-        return _row(picks, int(own[0]))
+        return picks[own[0]]
     plain = np.flatnonzero(picks["repeat"] == picks["repeat"].min())
     score, failed = picks["seal"][plain] * picks["wrench"][plain], ~picks["success"][plain]
-    return _row(picks, plain[np.argmax(np.where(failed, score, -1.0)) if failed.any() else np.argmin(score)])
-
-
-def _row(picks: np.ndarray, index: int) -> Any:
-    """One row of a table."""
-    return picks[index]
+    return picks[plain[np.argmax(np.where(failed, score, -1.0)) if failed.any() else np.argmin(score)]]
 
 
 def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: int | None = None, candidate: int | None = None) -> Path:
     """Draw the heat maps of a state, and below them a trial explained: picture and sentences.
 
-    Args:
-        data_set: A data set with picks and images.
-        out: PNG or JPEG file.
-        episode: Index of the episode; None: the first with trials.
-        state: Index of the state in it; None: the first.
-        candidate: Candidate that is explained; None: as `choose_trial`.
-
-    Raises:
-        DatasetError: There is no such state or candidate, or a file is missing or damaged.
-        OutputError: The picture cannot be written.
+    None stands for the first episode with trials, its first state, and the candidate of `choose_trial`. Raises DatasetError if there is no
+    such state or candidate, or a file is missing or damaged, and OutputError if the picture cannot be written.
     """
     check_picture_name(out)
     chosen = _find_episode(data_set, episode)
@@ -215,17 +188,8 @@ def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: i
 
 
 def write_pick_maps(data_set: DataSet, out: Path, count: int) -> Path:
-    """Draw the heat maps of states, evenly spread over those of the data set, one below the other.
-
-    Args:
-        data_set: A data set with picks and images.
-        out: PNG or JPEG file.
-        count: Maximum number of states.
-
-    Raises:
-        DatasetError: There is no state, or a file is missing or damaged.
-        OutputError: The picture cannot be written.
-    """
+    """Draw the heat maps of up to `count` states, evenly spread over those of the data set, one below the other; raises DatasetError if
+    there is no state, or a file is missing or damaged, and OutputError if the picture cannot be written."""
     check_picture_name(out)
     states = [(episode, state, view) for episode in data_set.values() for state, view in episode.state_views()]
     if not states:

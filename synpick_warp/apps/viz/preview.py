@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -13,9 +14,20 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import GOLDEN, Image, check_picture_name, instance_color, put_text, write_picture
+from synpick_warp.apps.viz.drawing import (
+    GOLDEN,
+    Image,
+    check_picture_name,
+    instance_color,
+    put_lines,
+    put_text,
+    readable_on,
+    short_labels,
+    shorten,
+    text_size,
+    write_picture,
+)
 from synpick_warp.apps.viz.false_colors import DepthScale, bin_scale, color_depth, describe_depth, layer_pictures, pooled_scale
-from synpick_warp.apps.viz.preview_legend import PAPER, Box, draw_labels, draw_legend, label_texts, legend_width
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
@@ -68,17 +80,9 @@ class _View:
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
-    """Draw sampled views of a data set, one per row, and write the image file.
-
-    Args:
-        dataset: Folder of the data set; all its splits are sampled.
-        out: PNG or JPEG file to write; its folder is created.
-        views: Maximum number of views, spread over cameras, scenes and time; the sheet has no more than the data set.
-
-    Raises:
-        DatasetError: The folder is not a data set, or a file is missing or damaged.
-        OutputError: The image cannot be written, or has more than MAX_VIEWS views.
-    """
+    """Draw views of a data set, one per row, at most so many, spread over all its splits, cameras, scenes and time, and write a PNG or JPEG
+    file, whose folder is created. Raises DatasetError if the folder is not a data set, or a file is missing or damaged, and OutputError if
+    the image cannot be written, or has more than MAX_VIEWS views."""
     check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
@@ -120,12 +124,8 @@ class Baked(NamedTuple):
 
 
 def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
-    """Read settings and names of a data set, as far as it has them.
-
-    Raises:
-        ConfigError: Its settings are damaged.
-        DatasetError: Its models_info.json is.
-    """
+    """Read settings and names of a data set, as far as it has them; raises ConfigError if its settings are damaged, and DatasetError if its
+    models_info.json is."""
     path = dataset / CONFIG_FILE
     config = load_config(str(path), {}) if path.exists() else None
     if not (dataset / "models" / "models_info.json").exists():
@@ -135,11 +135,8 @@ def read_baked(dataset: Path, object_ids: set[int]) -> Baked:
 
 
 def find_scenes(dataset: Path) -> list[SheetScene]:
-    """Find the scenes of a data set, of each sensor, sorted; not those in hidden folders, where a running bake has unfinished ones.
-
-    Raises:
-        DatasetError: There is none.
-    """
+    """Find the scenes of a data set, of each sensor, sorted; not those in hidden folders, where a running bake has unfinished ones. Raises
+    DatasetError if there is none."""
     try:
         found = ForeignScenes(dataset)
     except NoLayoutError:
@@ -157,11 +154,8 @@ def sample(scenes: list[SheetScene], views: int, cameras: int = 0) -> list[tuple
     """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
 
     Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence. `cameras`: number of cameras of our
-    own data set; 0: scenes are told apart by the poses of their cameras.
-
-    Raises:
-        DatasetError: A file is damaged, or no scene has a view.
-        OutputError: More views are there and asked for than a sheet shows.
+    own data set; 0: scenes are told apart by the poses of their cameras. Raises DatasetError if a file is damaged, or no scene has a view,
+    and OutputError if more views are there and asked for than a sheet shows.
     """
     by_camera: dict[tuple[Any, ...], list[tuple[SheetScene, list[int]]]] = {}
     for scene in scenes:
@@ -201,7 +195,6 @@ def _read_views(samples: list[tuple[SheetScene, int]]) -> Iterator[_View]:
 
 
 def _read_depth(view: _View) -> np.ndarray | None:
-    """Depth image of a view [mm]; None: it has none."""
     if not view.files.has("depth") or "depth_scale" not in view.camera:
         return None
     counts = view.files.typed_image("depth", view.frame, None, "")
@@ -217,11 +210,12 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     colored = _placeholder(color, "no depth in this data set") if colored is None else colored
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     place, *facts = baked.facts(view.scene, view.frame, view.camera)
+    seen = sum(info["px_count_visib"] > 0 for _, info in view.truth)
     low = max(_MIN_LEGEND, round(size[1] * scale))
     panels = [
         (place, _fit(color, scale)),
         (f"{describe_depth(depth_scale)}; one scale", _fit(colored, scale, smooth=False)),
-        (_instances_caption(view), _fit(_color_instances(view, color), scale, smooth=False)),
+        (f"instances: {len(view.truth)}, of which {seen} seen", _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick", _draw_boxes(view, _fit(color, scale), scale)),
         ("object: label, visible fraction, name", draw_legend((legend_width(low, most), low), facts, view.truth, baked.names)),
     ]
@@ -246,12 +240,6 @@ def _captioned(image: Image, caption: str, height: int) -> Image:
     head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
     put_text(head, caption, (4, 14), 0.42, PAPER)
     return np.pad(np.concatenate((head, image)), ((0, height - image.shape[0] + _GAP), (0, _GAP), (0, 0)))
-
-
-def _instances_caption(view: _View) -> str:
-    """Caption with the number of instances, and of those seen."""
-    seen = sum(info["px_count_visib"] > 0 for _, info in view.truth)
-    return f"instances: {len(view.truth)}, of which {seen} seen"
 
 
 def _color_instances(view: _View, color: Image) -> Image:
@@ -316,3 +304,153 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
         colors.append(color)
     draw_labels(image, boxes, labels, colors)
     return image
+
+
+LABEL = 0.42
+"""Font scale of a box's label."""
+_PAD = 2
+"""Margin of a label's text [px]."""
+_STEP = 6
+"""Distance of the places that are tried where none in or around the box is free [px]."""
+_TEXT = 0.42
+"""Font scale of the legend."""
+_SPACE = 8
+"""Space between facts and objects [px]."""
+LINE = 17
+"""Height of a line of the legend [px]."""
+_SWATCH = 30
+"""Width of a coloured label in the legend [px]."""
+COLUMN = 240
+"""Width of a column of the legend [px]."""
+_COLUMNS = 2
+"""Most columns of a legend."""
+_FACTS = 2
+"""Lines above the objects: episode, mode, time; light."""
+_SHADE = 0.85
+"""Brightness of a label's ground, of the instance's colour: with contrast to the box's line."""
+PAPER, SOFT = (230, 230, 230), (150, 150, 150)
+
+
+class Box(NamedTuple):
+    """Rectangle: left upper corner, width and height [px]."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+    def meets(self, other: Box) -> bool:
+        """Whether two rectangles overlap; common edges do not count."""
+        return (
+            self.x < other.x + other.width
+            and other.x < self.x + self.width
+            and self.y < other.y + other.height
+            and other.y < self.y + self.height
+        )
+
+
+def place_labels(boxes: Sequence[Box], sizes: Sequence[tuple[int, int]], area: tuple[int, int]) -> list[Box | None]:
+    """Place a label for each box so that none overlaps another: in the box, else at it, else as near as there is room; None: there is no
+    room left.
+
+    Small boxes come first, as they have the fewest places. `sizes` and `area` are width and height of each label, and of the image [px].
+    """
+    placed: list[Box | None] = [None] * len(boxes)
+    for index in sorted(range(len(boxes)), key=lambda index: boxes[index].width * boxes[index].height):
+        taken = [label for label in placed if label is not None]
+        tried = (Box(x, y, *sizes[index]) for x, y in _places(boxes[index], sizes[index], area))
+        placed[index] = next((label for label in tried if not any(label.meets(other) for other in taken)), None)
+    return placed
+
+
+def _places(box: Box, size: tuple[int, int], area: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    """Corners of a label's places in the image, the best ones first."""
+    room = area[0] - size[0], area[1] - size[1]
+    if min(room) < 0:
+        return
+    inside = box.x + box.width - size[0], box.y + box.height - size[1]
+    near = [(box.x, box.y), (inside[0], box.y), (box.x, inside[1]), inside]
+    near += [(box.x, box.y - size[1]), (box.x, box.y + box.height), (box.x - size[0], box.y), (box.x + box.width, box.y)]
+    for x, y in near:
+        yield round(min(max(x, 0), room[0])), round(min(max(y, 0), room[1]))
+    middle = box.x + (box.width - size[0]) / 2, box.y + (box.height - size[1]) / 2
+    grid = [(x, y) for x in range(0, room[0] + 1, _STEP) for y in range(0, room[1] + 1, _STEP)]
+    yield from sorted(grid, key=lambda place: (place[0] - middle[0]) ** 2 + (place[1] - middle[1]) ** 2)
+
+
+def label_texts(truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
+    """Short label of each instance of a view: obj_id, with a letter where several share it."""
+    instances = [record.get("instance_id", index) for index, (record, _) in enumerate(truth)]
+    labels = short_labels(zip(instances, (record["obj_id"] for record, _ in truth), strict=True))
+    return [labels[instance] for instance in instances]
+
+
+def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors: Sequence[tuple[int, int, int]]) -> None:
+    """Draw labels of boxes on their instances' colours, in place; a line leads from a label outside its box to it. Those without room are
+    left out."""
+    sizes = [(width + 2 * _PAD, height + 2 * _PAD) for width, height in (text_size(text, LABEL) for text in texts)]
+    for box, place, text, color in zip(boxes, place_labels(boxes, sizes, image.shape[1::-1]), texts, colors, strict=True):
+        if place is None:
+            continue
+        if not place.meets(Box(box.x - 1, box.y - 1, box.width + 2, box.height + 2)):
+            start, end = ((round(each.x + each.width / 2), round(each.y + each.height / 2)) for each in (place, box))
+            cv2.line(image, start, end, _ground(color), 1, cv2.LINE_AA)
+        _put_label(image, text, place, color)
+
+
+def _ground(color: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Darkened colour (BGR), as ground of a label."""
+    blue, green, red = (round(_SHADE * value) for value in color)
+    return blue, green, red
+
+
+def _put_label(image: Image, text: str, place: Box, color: tuple[int, int, int]) -> None:
+    """Draw text into a box of the darkened colour."""
+    low = round(place.x), round(place.y)
+    high = round(place.x + place.width) - 1, round(place.y + place.height) - 1
+    cv2.rectangle(image, low, high, _ground(color), -1)
+    put_text(image, text, (low[0] + _PAD, high[1] - _PAD), LABEL, readable_on(_ground(color)))
+
+
+def legend_width(height: int, instances: int) -> int:
+    """Width of legends of a height [px] with up to `instances` instances [px]: one column or several."""
+    return COLUMN * (1 if instances <= _rows(height, _FACTS) else _COLUMNS)
+
+
+def _rows(height: int, facts: int) -> int:
+    """Number of instances that the legend's height has space for, below the facts."""
+    return max(1, (height - LINE * facts - _SPACE) // LINE)
+
+
+def draw_legend(
+    size: tuple[int, int],
+    facts: Sequence[str],
+    truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]],
+    names: Mapping[int, str],
+) -> Image:
+    """Draw the legend of a view, a new image: facts, then label, name and visible fraction of each instance, the most visible first.
+
+    `size` is width and height [px], and what does not fit is counted; `truth` has the records of scene_gt and scene_gt_info of each
+    instance; `names` by obj_id may lack some.
+    """
+    panel = np.zeros((size[1], size[0], 3), np.uint8)
+    put_lines(panel, (shorten(fact, size[0] - 12, _TEXT) for fact in facts), (6, LINE - 3), LINE, _TEXT, PAPER)
+    texts = label_texts(truth)
+    order = sorted(range(len(truth)), key=lambda index: (-np.nan_to_num(truth[index][1]["visib_fract"]), index))
+    top, rows, columns = LINE * len(facts) + _SPACE, _rows(size[1], len(facts)), size[0] // COLUMN
+    shown = order if len(order) <= rows * columns else order[: rows * columns - 1]
+    for place, index in enumerate(shown):
+        record, info = truth[index]
+        x, y = 6 + COLUMN * (place // rows), top + LINE * (place % rows)
+        color = instance_color(record.get("instance_id", index))
+        _put_label(panel, texts[index], Box(x, y, max(_SWATCH, text_size(texts[index], LABEL)[0] + 2 * _PAD), LINE - 3), color)
+        name = names.get(record["obj_id"], "") or f"object {record['obj_id']}"
+        hidden = info["px_count_visib"] == 0
+        unknown = math.isnan(info["visib_fract"])
+        seen = "" if unknown else "hidden" if hidden else f"{info['visib_fract']:.2f}"
+        put_text(panel, seen, (x + _SWATCH + 8, y + LINE - 6), _TEXT, SOFT)
+        put_text(panel, shorten(name, COLUMN - _SWATCH - 58, _TEXT), (x + _SWATCH + 48, y + LINE - 6), _TEXT, SOFT if hidden else PAPER)
+    if len(shown) < len(order):
+        place = (6 + COLUMN * (columns - 1), top + LINE * rows - 6)
+        put_text(panel, f"and {len(order) - len(shown)} more", place, _TEXT, SOFT)
+    return panel

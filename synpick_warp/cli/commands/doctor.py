@@ -1,4 +1,4 @@
-"""Machine report: versions, CPU, device, caches, memory plan, verdict."""
+"""Machine report (versions, CPU, device, caches, memory plan, verdict), and forecast of a bake (views, disk, memory, time)."""
 
 from __future__ import annotations
 
@@ -6,24 +6,28 @@ import contextlib
 import importlib.metadata
 import os
 import platform
+import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import warp as wp
 from rich.table import Table
 
 from synpick_warp._version import __version__
-from synpick_warp.cli.display import make_console
+from synpick_warp.cli.display import format_duration, make_console, make_progress
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory.memory_plan import check_memory, plan_memory
+from synpick_warp.factory.forecast import GB, check_disk, forecast_settings
+from synpick_warp.factory.memory_plan import check_memory, plan_memory, split_memories
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.green_contexts import SmPartition, count_reserved
+from synpick_warp.system.inputs.urls import store_url
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 _SMALL = 1e-3
@@ -54,7 +58,19 @@ def print_report(config: Config, with_arrays: bool) -> None:
 
 def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
     """Rows (name, value) of versions, CPU, memory and device, to be quoted with measurements."""
-    return [*_software(), *_host(), *_device(device)]
+    rows = [("synpick-warp", __version__), ("python", f"{platform.python_version()} on {platform.platform()}")]
+    rows += [(name, importlib.metadata.version(name)) for name in _PACKAGES]
+    rows.append(("CPU cores", f"{count_cores()} usable of {os.cpu_count()}"))
+    if hasattr(os, "sysconf"):
+        rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
+    rows.append(("device", f"{device.alias}: {device.name}"))
+    if device.is_cuda:
+        rows.append(("device memory", f"{device.free_memory / GIB:.1f} of {device.total_memory / GIB:.1f} GiB free"))
+        rows.append(("compute capability", f"{device.arch / 10:.1f}"))
+        rows.append(("multiprocessors", f"{device.sm_count}, {_describe_partition(device)}"))
+    toolkit = wp.get_cuda_toolkit_version()
+    driver = wp.get_cuda_driver_version() if wp.is_cuda_available() else None
+    return [*rows, ("CUDA", f"driver {_dotted(driver)}, Warp built with {_dotted(toolkit)}")]
 
 
 def memory_report(config: Config) -> Table:
@@ -76,33 +92,6 @@ def memory_report(config: Config) -> Table:
     table.columns[0].footer = "the whole plan"
     table.columns[3].footer = f"{total / MIB:.2f}"
     return table
-
-
-def _software() -> list[tuple[str, str]]:
-    """Rows (name, value) of versions: this program, Python, packages."""
-    versions = [("synpick-warp", __version__), ("python", f"{platform.python_version()} on {platform.platform()}")]
-    return versions + [(name, importlib.metadata.version(name)) for name in _PACKAGES]
-
-
-def _host() -> list[tuple[str, str]]:
-    """Rows (name, value) of the host: usable cores and memory."""
-    rows = [("CPU cores", f"{count_cores()} usable of {os.cpu_count()}")]
-    if hasattr(os, "sysconf"):
-        rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
-    return rows
-
-
-def _device(device: wp.Device) -> list[tuple[str, str]]:
-    """Rows (name, value) of the device: name, memory, compute capability, multiprocessors, CUDA versions."""
-    rows = [("device", f"{device.alias}: {device.name}")]
-    if device.is_cuda:
-        rows.append(("device memory", f"{device.free_memory / GIB:.1f} of {device.total_memory / GIB:.1f} GiB free"))
-        rows.append(("compute capability", f"{device.arch / 10:.1f}"))
-        rows.append(("multiprocessors", f"{device.sm_count}, {_describe_partition(device)}"))
-    toolkit = wp.get_cuda_toolkit_version()
-    driver = wp.get_cuda_driver_version() if wp.is_cuda_available() else None
-    rows.append(("CUDA", f"driver {_dotted(driver)}, Warp built with {_dotted(toolkit)}"))
-    return rows
 
 
 def _describe_partition(device: wp.Device) -> str:
@@ -141,3 +130,32 @@ def _describe_folder(folder: Path, noun: str) -> str:
 def _dotted(version: tuple[int, int] | None) -> str:
     """Version as text with dots; None: "not found"."""
     return "not found" if version is None else ".".join(map(str, version))
+
+
+def print_forecast(config: Config, out: Path | None, episodes: Sequence[int]) -> int:
+    """Print what a bake of these episodes is expected to take, and compare it with memory and disk; returns the exit code. Nothing is
+    written but shapes' cache. Raises SynpickError if it takes more than there is, or objects cannot be used."""
+    console = make_console()
+    with make_progress(console) as progress:
+        device = pick_device(config.bake.device)
+        writers = count_writers(config.bake.writers, Needs.of(config).slot_bytes)
+        fitted = fit_to_device(without_pictures(config), device, len(episodes), writers)
+        terms = plan_memory(fitted, device, writers)
+        forecast = forecast_settings(fitted, episodes, progress)
+        here = out is None or store_url(out) is None
+        folder = next((path for path in (Path(out or ".").absolute(), *Path(out or ".").absolute().parents) if path.is_dir()), Path("/"))
+        if here:
+            check_disk(forecast, folder, progress)
+        check_memory(terms, device)
+    table = Table(show_header=False, box=None)
+    table.add_row("episodes", f"{forecast.episodes:,}, of some {forecast.frames_of_episode:.0f} frames")
+    table.add_row("views", f"about {forecast.views:,}")
+    free = f", {shutil.disk_usage(folder).free / GB:,.1f} GB are free" if here else ""
+    table.add_row("data set", f"about {forecast.size / GB:,.1f} GB{free}")
+    for part, memory in split_memories(terms, device, 1):
+        place = device.alias if part[0].on_device else "host"
+        table.add_row(f"memory, {place}", f"at least {sum(term.size for term in part) / GIB:.1f} GiB, {memory / GIB:.1f} GiB are free")
+    table.add_row("worlds", f"{fitted.bake.worlds:,} on {device.alias}")
+    table.add_row("time", f"about {format_duration(forecast.gpu_seconds)} on an H100 with 16 cores; on a CPU some hundred times as long")
+    console.print(table)
+    return 0

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import check_output_file, find_data_set, has_images
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
+from synpick_warp.cli.folders import check_output_file, find_data_set
+from synpick_warp.cli.options import MAX_THREADS, EpisodesOfOption, WholeNumber, check_range
 from synpick_warp.errors import ConfigError, OutputError, escape, format_value
 
 if TYPE_CHECKING:
     from synpick_warp.apps.estimation.run import EstimationOptions, EstimationRun
     from synpick_warp.apps.estimation.scenes import ImageSelection
+    from synpick_warp.dataset.reading import DataSet
 
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
@@ -26,25 +27,22 @@ _MAX_RANGE = 10**6
 """Most indices of an option: more are a mistake."""
 
 
-DataOption = Annotated[
-    Path | None,
-    Parameter(
-        name="--data", help="A data set in the format bop or shards, with masks (bop.masks; default: the last one in the current folder)."
-    ),
-]
-OutOption = Annotated[
-    Path | None,
-    Parameter(
-        help="BOP result file to write; an existing file is replaced (default METHOD_DATASET-SPLIT.csv in the current folder, where "
-        "DATASET is the folder's name in lower-case letters and digits)."
-    ),
-]
-
-
 def estimate(
-    data: DataOption = None,
+    data: Annotated[
+        Path | None,
+        Parameter(
+            name="--data",
+            help="A data set in the format bop or shards, with masks (bop.masks; default: synpick-data in the current folder).",
+        ),
+    ] = None,
     *,
-    out: OutOption = None,
+    out: Annotated[
+        Path | None,
+        Parameter(
+            help="BOP result file to write; an existing file is replaced (default METHOD_DATASET-SPLIT.csv in the current folder, where "
+            "DATASET is the folder's name in lower-case letters and digits)."
+        ),
+    ] = None,
     method: Annotated[
         str,
         Parameter(
@@ -62,7 +60,7 @@ def estimate(
     modes: Annotated[str | None, Parameter(help="Only episodes of these modes: pick, target, move; joined by commas.")] = None,
     cameras: Annotated[str | None, Parameter(help="Only these cameras, such as 0,2.")] = None,
     episodes: Annotated[str | None, Parameter(help="Only these episodes, such as 0-9,12.")] = None,
-    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
+    split: EpisodesOfOption = None,
     visib_min: Annotated[float, Parameter(help="Smallest visible fraction of an instance that is estimated, from 0 to 1.")] = (
         DEFAULT_VISIBILITY
     ),
@@ -78,34 +76,29 @@ def estimate(
 
     selection = make_selection(method, every, targets, modes, cameras, episodes)
     options = make_options(method, depth, visib_min, seed, threads)
-    data = find_data_set(data, "synpick-warp estimate DIR", has_images)
-    out = Path(f"{method}_{toolkit_ending(open_data_set(data))}.csv") if out is None else out
+    data = find_data_set(data, "synpick-warp estimate DIR")
+    whole = open_data_set(data)
+    out = Path(f"{method}_{toolkit_ending(whole)}.csv") if out is None else out
     check_output(out, selection)
     check_output_file(out, "--out", data)
-    run, listed = run_method(data, selection, options, out, split=split)
-    print(describe_run(run))
-    print(f"results: {escape(str(out))}")
+    run, listed = run_method(whole if split is None else whole.split(split), selection, options, out, part=split is not None)
+    rate = f"{len(run.poses) / max(run.wall, 1e-9):,.0f} poses/s"
+    print(f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({rate})", f"results: {escape(str(out))}", sep="\n")
     if listed is not None:
         print(f"targets: {escape(str(listed))}; eval --targets {escape(str(listed))}")
     return 0
 
 
 def run_method(
-    data: Path, selection: ImageSelection, options: EstimationOptions, out: Path, *, split: str | None = None
+    data_set: DataSet, selection: ImageSelection, options: EstimationOptions, out: Path, *, part: bool
 ) -> tuple[EstimationRun, Path | None]:
-    """Estimate, and write the files; returns the run, and the file of targets if it was written."""
-    from synpick_warp.apps.estimation.gicp import Aligner, read_object_models
-    from synpick_warp.apps.estimation.run import list_targets, read_scenes, run_estimation
+    """Estimate in a data set, or a `part` of one, and write the files; returns the run, and the file of targets if it was written."""
+    from synpick_warp.apps.estimation.run import Aligner, list_targets, read_object_models, read_scenes, run_estimation
     from synpick_warp.apps.estimation.scenes import plan_scenes
-    from synpick_warp.apps.evaluation.results import write_results
-    from synpick_warp.apps.evaluation.targets import encode_targets, in_layout, targets_file
+    from synpick_warp.apps.evaluation.results import encode_targets, in_layout, targets_file, write_results
     from synpick_warp.cli.display import CountProgress, make_console
-    from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.exporters.writing.files import output_errors, write_atomically
 
-    data_set = open_data_set(data)
-    if split is not None:
-        data_set = data_set.split(split)
     if selection.targets is not None:
         selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.sensors))
     plans, complete = plan_scenes(data_set, selection)
@@ -113,7 +106,7 @@ def run_method(
         scenes = read_scenes(data_set, plans, options, selection.targets, counter.report)
         wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
         run = run_estimation(scenes, Aligner(read_object_models(data_set.folder, wanted)), options, counter.report)
-    listed = None if complete and split is None else targets_file(out)
+    listed = None if complete and not part else targets_file(out)
     if listed is not None:
         with output_errors(listed):
             write_atomically(listed, encode_targets(in_layout(list_targets(scenes), data_set.sensors)))
@@ -124,15 +117,10 @@ def run_method(
 def make_selection(
     method: str, every: int | None, targets: Path | None, modes: str | None, cameras: str | None, episodes: str | None
 ) -> ImageSelection:
-    """Make the selection of images from the command's options, which are checked.
-
-    Raises:
-        ConfigError: A value is not allowed, or two exclude each other.
-        ResultError: The target list cannot be read.
-    """
+    """Make the selection of images from the command's options; raises ConfigError, or ResultError if the target list cannot be read."""
     from synpick_warp.apps.estimation.run import METHODS, SPARSE, TRACK
     from synpick_warp.apps.estimation.scenes import ImageSelection
-    from synpick_warp.apps.evaluation.targets import read_targets
+    from synpick_warp.apps.evaluation.results import read_targets
 
     if method not in METHODS:
         raise ConfigError(f"--method is {format_value(method)}; allowed: {', '.join(METHODS)}")
@@ -152,11 +140,7 @@ def make_selection(
 
 
 def make_options(method: str, depth: str, visib_min: float, seed: int, threads: int) -> EstimationOptions:
-    """Make the options of the estimation from the command's options, which are checked.
-
-    Raises:
-        ConfigError: A value is not allowed.
-    """
+    """Make the options of the estimation from the command's options; raises ConfigError."""
     from synpick_warp.apps.estimation.run import DEPTHS, EstimationOptions
 
     if depth not in DEPTHS:
@@ -169,11 +153,7 @@ def make_options(method: str, depth: str, visib_min: float, seed: int, threads: 
 
 
 def parse_indices(option: str, text: str) -> tuple[int, ...]:
-    """Parse "0-2,5" into 0, 1, 2, 5.
-
-    Raises:
-        ConfigError: The text has another form, or names too many.
-    """
+    """Parse "0-2,5" into 0, 1, 2, 5; raises ConfigError for another form, or too many."""
     indices: set[int] = set()
     for part in text.split(","):
         match = _RANGE.fullmatch(part)
@@ -185,20 +165,12 @@ def parse_indices(option: str, text: str) -> tuple[int, ...]:
 
 
 def check_output(out: Path, selection: ImageSelection) -> None:
-    """Check the output before anything is read.
-
-    Raises:
-        OutputError: Its folder does not exist, it or the list beside it is a folder, or it would replace the list that is read.
-    """
-    from synpick_warp.apps.evaluation.targets import targets_file
+    """Raise OutputError if the folder of the output does not exist, it or the list beside it is a folder, or it would replace the list that
+    is read."""
+    from synpick_warp.apps.evaluation.results import targets_file
 
     if out.is_dir() or not out.absolute().parent.is_dir() or targets_file(out).is_dir():
         raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
     given = selection.targets
     if given is not None and given.path.resolve() in (out.resolve(), targets_file(out).resolve()):
         raise OutputError(f"--out is {out}, which would replace {given.path}; name another file")
-
-
-def describe_run(run: EstimationRun) -> str:
-    """One line on a run: views, poses, rate."""
-    return f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({len(run.poses) / max(run.wall, 1e-9):,.0f} poses/s)"

@@ -5,21 +5,20 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import check_output_file, find_data_set, has_images, name_fetched
-from synpick_warp.cli.options import WholeNumber, check_range
+from synpick_warp.cli.folders import check_new_folder, check_output_file, find_data_set, name_fetched
+from synpick_warp.cli.options import EpisodesOfOption, WholeNumber, check_range
 from synpick_warp.configs.dataset.splits import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, format_value
 
 if TYPE_CHECKING:
-    from synpick_warp.apps.evaluation.figures import Method
-    from synpick_warp.apps.evaluation.scoring import Scores
-    from synpick_warp.apps.evaluation.truth import Truth
+    from synpick_warp.apps.evaluation.figures import Settings
+    from synpick_warp.apps.evaluation.run import Evaluation
     from synpick_warp.dataset.reading import DataSet
 
 FILTER = "ema"
@@ -33,11 +32,8 @@ _TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
 
 DataOption = Annotated[
-    Path | None,
-    Parameter(name="--data", help="A data set in the format bop or shards (default: the last one in the current folder)."),
+    Path | None, Parameter(name="--data", help="A data set in the format bop or shards (default: synpick-data in the current folder).")
 ]
-
-
 PlotsOption = Annotated[
     Path | None,
     Parameter(help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha, worst estimates."),
@@ -65,7 +61,7 @@ def evaluate(
     targets: Annotated[
         Path | None, Parameter(help="Score only images and objects of this list, such as estimate writes or BOP's test_targets_bop19.json.")
     ] = None,
-    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
+    split: EpisodesOfOption = None,
     filter_: Annotated[
         str | None,
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
@@ -81,145 +77,73 @@ def evaluate(
     Instances without an estimate count as missed. BOP's own scores come from the BOP toolkit, by the command that is printed.
     """
     check_options(results, format_, out, visib_min, convention, top, vertices)
-    data = find_data_set(data, "synpick-warp eval DIR", has_images)
+    data = find_data_set(data, "synpick-warp eval DIR")
     if out is not None:
         check_output_file(out, "--out", data, [*results, *([] if targets is None else [targets])])
     if plots is not None:
         check_output_file(plots, "--plots", data, is_folder=True)
-    weight = check_filter(filter_, alpha)
-    chosen = check_plots(plots, track)
+    weight, chosen = check_filter(filter_, alpha), check_plots(plots, track)
+    from synpick_warp.apps.evaluation.figures import Settings, write_figures
+    from synpick_warp.apps.evaluation.run import score_files
+    from synpick_warp.apps.evaluation.tables import render
     from synpick_warp.dataset.reading import open_data_set
 
-    data_set = open_data_set(data)
-    if split is not None:
-        data_set = data_set.split(split)
-    given = {"visib_min": visib_min, "convention": convention, "top": top, "vertices": vertices, "alpha": weight, "targets": targets}
-    table, pictures = make_table(data_set, results, format_, **given, plots=plots, track=chosen)
-    if out is not None:
-        write_table(out, table)
-        print(f"table: {escape(str(out))}")
-    else:
-        print(table, end="\n" if format_ == "text" else "")
-    show_rest(
-        toolkit_command(data_set, results, targets), plots, pictures, sys.stdout if format_ == "text" or out is not None else sys.stderr
+    data_set = open_data_set(data) if split is None else open_data_set(data).split(split)
+    scored = score_files(
+        data_set, results, visib_min, top, vertices, weight, targets, remark=lambda line: print(escape(line), file=sys.stderr)
     )
+    pictures = {} if plots is None else draw_pictures(data_set, scored, Settings(scored.models, visib_min, top), chosen)
+    show_table(render(scored.rows, scored.truth, scored.scores, format_, convention), out, end="\n" if format_ == "text" else "")
+    # What does not mix with a table for a program.
+    stream = sys.stdout if format_ == "text" or out is not None else sys.stderr
+    for path in () if plots is None else write_figures(plots, pictures):
+        print(f"picture: {escape(str(path))}", file=stream)
+    print(toolkit_command(data_set, results, targets), file=stream)
     return 0
 
 
-def show_rest(command: str, plots: Path | None, pictures: Mapping[str, bytes], stream: TextIO) -> None:
-    """Write the pictures, and print their paths and the toolkit's command, where they don't mix with a table for a program."""
-    if plots is not None:
-        from synpick_warp.apps.evaluation.figures import write_figures
+def show_table(table: str, out: Path | None, end: str) -> None:
+    """Print a table, or write it into a file."""
+    from synpick_warp.exporters.writing.files import output_errors, write_atomically
 
-        for path in write_figures(plots, pictures):
-            print(f"picture: {escape(str(path))}", file=stream)
-    print(command, file=stream)
-
-
-def make_table(
-    data_set: DataSet,
-    results: Sequence[Path],
-    style: str,
-    *,
-    visib_min: float,
-    convention: str,
-    top: int,
-    vertices: int,
-    alpha: float | None = None,
-    targets: Path | None = None,
-    plots: Path | None = None,
-    track: tuple[int, int] | None = None,
-) -> tuple[str, dict[str, bytes]]:
-    """Score result files, write the table and draw the pictures.
-
-    Args:
-        data_set: Where the ground truth is.
-        visib_min: Smallest visible fraction of a target.
-        top: Maximum number of estimates per image and object.
-        vertices: Number of vertices of a model; 0: all.
-        alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
-        targets: Target list; None: all images.
-        plots: Folder of the pictures; None: none are drawn.
-        track: Scene and instance of the trajectory; None: the one that moves farthest.
-
-    Returns:
-        The table, and file name -> PNG file.
-    """
-    from synpick_warp.apps.evaluation.figures import Settings, draw_figures
-    from synpick_warp.apps.evaluation.run import score_files
-    from synpick_warp.apps.evaluation.tables import render
-
-    def remark(line: str) -> None:
-        print(escape(line), file=sys.stderr)
-
-    scored = score_files(data_set, results, visib_min, top, vertices, alpha, targets, remark)
-    table = render(scored.rows, scored.truth, scored.scores, style, convention)
-    if plots is None:
-        return table, {}
-    settings = Settings(scored.models, visib_min, top)
-    pictures = draw_figures(scored.truth, scored.methods, scored.scores, settings, track, attempt_frames(data_set))
-    return table, pictures | draw_failure_sheets(data_set, scored.truth, scored.methods, scored.scores)
+    if out is None:
+        print(table, end=end)
+        return
+    with output_errors(out):
+        write_atomically(out, table.encode("utf-8"))
+    print(f"table: {escape(str(out))}")
 
 
-def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, bytes]:
-    """Sheets of the worst estimate of each object, one for each method: file name -> PNG file. None without the images they need."""
+def draw_pictures(data_set: DataSet, scored: Evaluation, settings: Settings, track: tuple[int, int] | None) -> dict[str, bytes]:
+    """File name -> PNG file: the figures, and a sheet of the worst estimate of each object for each method, if there are images for it."""
     from synpick_warp.apps.estimation.failures import draw_failures, find_failures
-    from synpick_warp.apps.estimation.gicp import read_object_models
-    from synpick_warp.apps.evaluation.figures import file_names
+    from synpick_warp.apps.estimation.run import read_object_models
+    from synpick_warp.apps.evaluation.figures import draw_figures, file_names
     from synpick_warp.apps.evaluation.run import object_names
     from synpick_warp.exporters.writing.png import encode_png
     from synpick_warp.system.hardware.device import pick_device
 
-    by_name = {each.name: each for each in scores}
-    pictures, objects = {}, object_names(data_set)
-    for method, name in zip(methods, file_names([method.name for method in methods]), strict=True):
+    attempts = {index: [int(attempt["frame"]) for attempt in data_set[index].attempts] for index in data_set if data_set.has_store}
+    figures = draw_figures(scored.truth, scored.methods, scored.scores, settings, track, attempts)
+    truth, by_name = scored.truth, {each.name: each for each in scored.scores}
+    sheets, objects = {}, object_names(data_set)
+    for method, name in zip(scored.methods, file_names([method.name for method in scored.methods]), strict=True):
         failures = find_failures(truth, by_name[method.name], method.poses, MAX_FAILURES)
         models = read_object_models(data_set.folder, [int(truth.poses.object_id[each.truth]) for each in failures])
         try:
             sheet = draw_failures(data_set, truth, method.poses, failures, models, objects, pick_device("auto"))
         except DatasetError as error:
             print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
-            return {}
-        pictures[f"failures_{name}.png"] = encode_png(sheet)
-    return pictures
-
-
-def attempt_frames(data_set: DataSet) -> dict[int, list[int]]:
-    """Frames of the pick attempts of each episode; none of data sets that hold no trajectories."""
-    if not data_set.has_store:
-        return {}
-    return {index: [int(attempt["frame"]) for attempt in episode.attempts] for index, episode in data_set.items()}
-
-
-def check_plots(folder: Path | None, track: str | None) -> tuple[int, int] | None:
-    """Scene and instance of `--track`; None: to be chosen.
-
-    Raises:
-        ConfigError: The track has another form, or there are no plots.
-        OutputError: The folder of the plots is neither new nor empty.
-    """
-    from synpick_warp.apps.evaluation.figures import check_folder
-
-    match = None if track is None else _TRACK.fullmatch(track)
-    if track is not None and match is None:
-        raise ConfigError(f"--track is {format_value(track)}; allowed: SCENE:INSTANCE, such as 3:12")
-    if track is not None and folder is None:
-        raise ConfigError(f"--track is {track}, but there are no plots; add --plots DIR")
-    if folder is not None:
-        check_folder(folder)
-    return None if match is None else (int(match[1]), int(match[2]))
+            return figures
+        sheets[f"failures_{name}.png"] = encode_png(sheet)
+    return figures | sheets
 
 
 def check_options(
     results: Sequence[Path], style: str, out: Path | None, visib_min: float, convention: str, top: int, vertices: int
 ) -> None:
-    """Check the options before anything is read.
-
-    Raises:
-        ConfigError: A value is not allowed.
-        OutputError: The output's folder does not exist, or it is a folder itself.
-    """
-    from synpick_warp.apps.evaluation.auc import CONVENTIONS
+    """Check the options before anything is read; raises ConfigError, or OutputError if `--out` is no file in an existing folder."""
+    from synpick_warp.apps.evaluation.errors import CONVENTIONS
     from synpick_warp.apps.evaluation.tables import FORMATS
 
     for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
@@ -232,41 +156,35 @@ def check_options(
         raise ConfigError(f"--top is {top}; allowed: -1 for as many as instances, 0 for all, or a number of estimates")
     if not 0 <= vertices <= _MAX_VERTICES:
         raise ConfigError(f"--vertices is {vertices}; allowed: 0 for all, to {_MAX_VERTICES}")
-    if out is None:
-        return
-    if out.is_dir() or not out.absolute().parent.is_dir():
+    if out is not None and (out.is_dir() or not out.absolute().parent.is_dir()):
         raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
 
 
 def check_filter(name: str | None, alpha: float | None) -> float | None:
-    """Weight of the new estimate of `--filter` and `--alpha`; None: no filter.
-
-    Raises:
-        ConfigError: There is no such filter, or the weight is out of range or without one.
-    """
+    """Weight of the new estimate of `--filter` and `--alpha`, None: no filter; raises ConfigError."""
     from synpick_warp.apps.evaluation.tracking import PAPER_ALPHAS, check_alpha
 
-    if name is None:
-        if alpha is not None:
-            raise ConfigError(f"--alpha is {alpha:g}, but there is no filter; add --filter ema")
-        return None
-    if name != FILTER:
+    if name not in (None, FILTER):
         raise ConfigError(f"--filter is {format_value(name)}; allowed: {FILTER}")
+    if name is None and alpha is not None:
+        raise ConfigError(f"--alpha is {alpha:g}, but there is no filter; add --filter ema")
     alpha = PAPER_ALPHAS[0] if alpha is None else alpha
     check_alpha(alpha)
-    return alpha
+    return None if name is None else alpha
 
 
-def write_table(out: Path, table: str) -> None:
-    """Write the table's file atomically.
-
-    Raises:
-        OutputError: It cannot be written.
-    """
-    from synpick_warp.exporters.writing.files import output_errors, write_atomically
-
-    with output_errors(out):
-        write_atomically(out, table.encode("utf-8"))
+def check_plots(folder: Path | None, track: str | None) -> tuple[int, int] | None:
+    """Scene and instance of `--track`, None: to be chosen; raises ConfigError, or OutputError if the folder is neither new nor empty."""
+    if folder is not None:
+        check_new_folder(folder, "--plots")
+    if track is None:
+        return None
+    match = _TRACK.fullmatch(track)
+    if match is None:
+        raise ConfigError(f"--track is {format_value(track)}; allowed: SCENE:INSTANCE, such as 3:12")
+    if folder is None:
+        raise ConfigError(f"--track is {track}, but there are no plots; add --plots DIR")
+    return int(match[1]), int(match[2])
 
 
 def toolkit_name(data_set: DataSet) -> str:

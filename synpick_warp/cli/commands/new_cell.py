@@ -123,7 +123,7 @@ def new_cell(
     _check_parts(parts := part or [], {"--unit": unit, "--density": density, "--mass": mass})
     weights = _parse_density(density), _check_mass(mass, density)
     shape = _read_bin(bin_, bin_unit, bin_up, bin_collision)
-    from synpick_warp.apps.viz.cell.frusta import pose_for
+    from synpick_warp.apps.viz.frusta import pose_for
     from synpick_warp.cli.display import make_console, make_progress
 
     with _staged(folder, place) as stage, make_progress(make_console()) as progress:
@@ -194,11 +194,8 @@ def _check_mass(mass: float | None, density: str | None) -> float | None:
 
 
 def _check_parts(parts: Sequence[Path], options: dict[str, Any]) -> None:
-    """Check the files of parts by their names, and that they are whole; `options` need parts.
-
-    Raises:
-        ConfigError: One is missing or refers to other files, two have one name, a folder stands beside others, or the unit is unknown.
-    """
+    """Check the files of parts by their names, and that they are whole; `options` need parts. Raises ConfigError if one is missing or
+    refers to other files, two have one name, a folder stands beside others, or the unit is unknown."""
     from synpick_warp.scenes.assets.meshes import SUFFIXES
 
     unit = options["--unit"]
@@ -224,30 +221,24 @@ def _check_parts(parts: Sequence[Path], options: dict[str, Any]) -> None:
 
 
 def _content(file: Path) -> bytes:
-    """Content of a mesh file."""
     from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
 
     return read_file(file, MAX_MESH_FILE, CatalogError)
 
 
 def _refers(file: Path) -> bool:
-    """Whether a mesh file refers to other files."""
     mark = _OTHER_FILES.get(file.suffix.lower())
     return mark is not None and re.search(mark, _content(file), re.MULTILINE) is not None
 
 
 def _copy(file: Path, folder: Path) -> None:
-    """Copy a mesh file into a folder, which is created."""
     folder.mkdir(exist_ok=True)
     (folder / file.name).write_bytes(_content(file))
 
 
 def _read_bin(text: str, unit: str | None, up: str | None, collision: str | None) -> BinRow:
-    """Bin of a size, or of a mesh file, which is measured.
-
-    Raises:
-        ConfigError: There is neither, the file cannot be used as a bin, or its options are unknown or without it.
-    """
+    """Bin of a size, or of a mesh file, which is measured; raises ConfigError if there is neither, the file cannot be used as a bin, or its
+    options are unknown or without it."""
     from synpick_warp.scenes.assets.meshes import SUFFIXES
     from synpick_warp.scenes.bin_meshes.reading import read_bin
 
@@ -280,11 +271,7 @@ def _copy_bin(row: BinRow, stage: Path) -> BinRow:
 
 
 def _parse_size(text: str) -> tuple[float, float, float]:
-    """Parse "600x400x220mm" into lengths [m].
-
-    Raises:
-        ConfigError: The text has another form, or no bin has this size.
-    """
+    """Parse "600x400x220mm" into lengths [m]; raises ConfigError if the text has another form, or no bin has this size."""
     match = _SIZE.fullmatch(text.strip())
     try:
         numbers = [float(match[index]) for index in (1, 2, 3)] if match else []
@@ -329,11 +316,8 @@ def _staged(folder: Path, place: Path) -> Iterator[Path]:
 
 
 def _read_cameras(files: Sequence[Path], resolution: str | None, model: str, stage: Path) -> list[tuple[CameraRow, dict[str, Any]]]:
-    """Cameras of calibration files, with the keys of their tables; without files two with a field of view.
-
-    Raises:
-        ConfigError: A file cannot be used, or does not say the size of the image.
-    """
+    """Cameras of calibration files, with the keys of their tables; without files two with a field of view. Raises ConfigError if a file
+    cannot be used, or does not say the size of the image."""
     if model not in ("", *MODELS):
         raise ConfigError(f"--lens is {format_value(model)}; allowed: {', '.join(MODELS)}{suggest(model, MODELS)}")
     size = None if resolution is None else parse_resolution(resolution)
@@ -382,11 +366,8 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
 
 def _write_cell(cell: NewCell, name: str, stage: Path, say: Callable[[str], None]) -> list[RawObject] | None:
     """Write the settings, with a volume budget and masses for the parts, which are moved to their middle if that is far from their origin;
-    returns the parts, None: the embedded objects. `say` is called with each line on them.
-
-    Raises:
-        SynpickError: A setting, or a part, cannot be used.
-    """
+    returns the parts, None: the embedded objects. `say` is called with each line on them. Raises SynpickError if a setting, or a part,
+    cannot be used."""
     from synpick_warp.scenes.catalog import describe_masses, read_objects
 
     lines: list[str] = []

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import beside, check_output_file, find_data_set, has_attempts, has_scenes
-from synpick_warp.cli.options import WholeNumber
+from synpick_warp.cli.folders import beside, check_output_file, find_data_set
+from synpick_warp.cli.options import DataSetArgument, WholeNumber
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError, escape
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def preview(
-    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
+    folder: DataSetArgument = None,
     /,
     *,
     out: Annotated[Path | None, Parameter(help="PNG or JPEG file to write (default DIR-contact-sheet.png, beside the data set).")] = None,
@@ -65,21 +65,29 @@ def preview(
         raise ConfigError("--config is given without --symmetries; a data set has its settings")
     if views < 1:
         raise ConfigError(f"--views is {views}; allowed: at least 1")
-    folder = find_data_set(folder, "synpick-warp preview DIR", has_scenes)
-    sheet = out or beside(folder, "-picks.png" if picks else "-contact-sheet.png")
-    from synpick_warp.apps.viz.preview import check_picture_name, write_contact_sheet
-
-    check_picture_name(sheet)
-    check_output_file(sheet, "--out", folder)
+    folder = find_data_set(folder, "synpick-warp preview DIR")
+    sheet = _picture_file(out, folder, "-picks.png" if picks else "-contact-sheet.png")
     if picks:
         from synpick_warp.apps.viz.picks import write_pick_maps
         from synpick_warp.dataset.reading import open_data_set
 
         write_pick_maps(open_data_set(folder), sheet, views)
     else:
+        from synpick_warp.apps.viz.preview import write_contact_sheet
+
         write_contact_sheet(folder, sheet, views)
     print(f"contact sheet: {escape(str(sheet))}")
     return 0
+
+
+def _picture_file(out: Path | None, folder: Path, ending: str) -> Path:
+    """Picture to write: `--out`, which replaces no file of a data set, or else beside the folder, whose name it has with an ending."""
+    from synpick_warp.apps.viz.drawing import check_picture_name
+
+    picture = out or beside(folder, ending)
+    check_picture_name(picture)
+    check_output_file(picture, "--out", folder)
+    return picture
 
 
 def _preview_symmetries(folder: Path | None, out: Path | None, config: str | None) -> int:
@@ -89,20 +97,17 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
     settings: dict[str, object] = {"objects.symmetries": DETECT}
     models, is_set = folder, False
     if folder is None or (folder / MANIFEST_FILE).is_file():
-        folder = find_data_set(folder, "synpick-warp preview DIR --symmetries", has_scenes)
+        folder = find_data_set(folder, "synpick-warp preview DIR --symmetries")
         if config is not None:
             raise ConfigError(f"--config is given, but {folder} is a data set, which has its settings; name the folder of models")
         # Its models are BOP's, with symmetries of their own; rows may be of meshes with other ids.
         models, is_set = folder / "models", True
         settings = {"objects.symmetries": DECLARED, "objects.unit": AUTO_UNIT}
         config = str(folder / CONFIG_FILE) if (folder / CONFIG_FILE).exists() else None
-    sheet = out or beside(folder, "-symmetries.png")
-    from synpick_warp.apps.viz.drawing import check_picture_name
+    sheet = _picture_file(out, folder, "-symmetries.png")
     from synpick_warp.apps.viz.symmetries import write_symmetry_sheet
     from synpick_warp.scenes.catalog import read_objects
 
-    check_picture_name(sheet)
-    check_output_file(sheet, "--out", folder)
     # A data set's settings have what its bins measured; their files may be gone.
     load = load_config if is_set else load_settings
     resolved = load(config, settings | {"bake.models": str(models)})
@@ -118,7 +123,6 @@ def _preview_symmetries(folder: Path | None, out: Path | None, config: str | Non
 
 
 def _preview_cell(cell: str, out: Path | None) -> int:
-    """Draw the cell of settings."""
     sheet = out or Path(cell).with_suffix(".png")
     from synpick_warp.apps.viz.drawing import check_picture_name
 
@@ -140,18 +144,11 @@ def draw_cell(
     say: Callable[[str], None],
     objects: Sequence[RawObject] | None = None,
 ) -> None:
-    """Draw the cell of settings, as of `load_settings`.
-
-    Args:
-        name: What the sheet is of, for its title.
-        objects: Objects of the settings; None: they are read.
-
-    Raises:
-        SynpickError: Settings, device, bins, cameras or all objects cannot be used, or the file cannot be written.
-    """
+    """Draw the cell of settings, as of `load_settings`; `name`: what the sheet is of, for its title; `objects`: those of the settings,
+    None: they are read. Raises SynpickError if settings, device, bins, cameras or all objects cannot be used, or the file cannot be
+    written."""
     config = load_settings(preset_or_file)
-    from synpick_warp.apps.viz.cell.rendering import CellScene
-    from synpick_warp.apps.viz.cell.sheet import write_cell_sheet
+    from synpick_warp.apps.viz.cell import CellScene, write_cell_sheet
     from synpick_warp.configs.dataset.splits import may_pick
     from synpick_warp.scenes.cameras import describe_cameras
 
@@ -164,7 +161,7 @@ def draw_cell(
 
 def explain(
     folder: Annotated[
-        Path | None, Parameter(name="DIR", help="A data set with pick attempts (default: the last one in the current folder).")
+        Path | None, Parameter(name="DIR", help="A data set with pick attempts (default: synpick-data in the current folder).")
     ] = None,
     /,
     *,
@@ -197,28 +194,23 @@ def explain(
         raise ConfigError("--attempt is given beside --state, which is of picks; allowed: one of both")
     if candidate is not None and state is None:
         raise ConfigError(f"--candidate is {candidate}, but no state is named; add --state")
-    folder = find_data_set(folder, "synpick-warp explain DIR", has_attempts)
+    folder = find_data_set(folder, "synpick-warp explain DIR")
     if state is not None:
         return _explain_picks(folder, episode, state, candidate, out)
     ending = "" if episode is None else f"-{episode:06d}" if attempt is None else f"-{episode:06d}-{attempt:03d}"
-    picture = out or beside(folder, f"-explain{ending}.png")
-    from synpick_warp.apps.viz.explain import check_picture_name, write_explanation
+    picture = _picture_file(out, folder, f"-explain{ending}.png")
+    from synpick_warp.apps.viz.explain import write_explanation
 
-    check_picture_name(picture)
-    check_output_file(picture, "--out", folder)
     write_explanation(folder, picture, episode, attempt)
     print(f"explanation: {escape(str(picture))}")
     return 0
 
 
 def _explain_picks(folder: Path, episode: int | None, state: int, candidate: int | None, out: Path | None) -> int:
-    """Explain a trial among the picks of a state."""
-    from synpick_warp.apps.viz.picks import check_picture_name, write_pick_sheet
+    from synpick_warp.apps.viz.picks import write_pick_sheet
     from synpick_warp.dataset.reading import open_data_set
 
-    picture = out or beside(folder, f"-picks-{'' if episode is None else f'{episode:06d}-'}{state:03d}.png")
-    check_picture_name(picture)
-    check_output_file(picture, "--out", folder)
+    picture = _picture_file(out, folder, f"-picks-{'' if episode is None else f'{episode:06d}-'}{state:03d}.png")
     write_pick_sheet(open_data_set(folder), picture, episode, state, candidate)
     print(f"explanation: {escape(str(picture))}")
     return 0

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import find_data_set, has_scenes
-from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber, check_range, one_line
+from synpick_warp.cli.folders import find_data_set
+from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, DataSetArgument, WholeNumber, check_range, one_line
 from synpick_warp.errors import ConfigError
 from synpick_warp.system.inputs.urls import store_url
 
@@ -27,7 +28,7 @@ def validate(
         Path | None,
         Parameter(
             name="DIR",
-            help="A BOP data set: the folder that contains train_pbr, models, ... (default: the last one of ours in the current folder)",
+            help="A BOP data set: the folder that contains train_pbr, models, ... (default: synpick-data in the current folder)",
         ),
     ] = None,
     /,
@@ -63,29 +64,23 @@ def validate(
     options = _make_options(sample, threads, tolerance, poses=poses, fast=fast)
     if limit < 0:
         raise ConfigError(f"--limit is {limit}; allowed: 0 for all, or more")
-    folder = find_data_set(folder, "synpick-warp validate DIR", has_scenes)
-    from rich.console import Console
-
+    folder = find_data_set(folder, "synpick-warp validate DIR")
     from synpick_warp.apps.validation.run import Summary
     from synpick_warp.apps.validation.run import validate as check
-    from synpick_warp.cli.display import CountProgress
+    from synpick_warp.cli.display import count_on_stderr
 
     summary, counts = Summary(), Counter()
-    with CountProgress(Console(stderr=True, highlight=False)) as counter:
+    with count_on_stderr() as counter:
         for violation in check(folder, options, summary, counter.report):
             counts[violation.rule] += 1
             if json or not limit or counts[violation.rule] <= limit:
-                print(_encode(violation) if json else _describe(violation))
+                print(_line(violation, as_json=json))
     _print_summary(summary, counts, 0 if json else limit, as_json=json)
     return EXIT_VIOLATIONS if summary.errors else 0
 
 
 def _make_options(sample: int | None, threads: int, tolerance: str | None, *, poses: bool, fast: bool) -> ValidationOptions:
-    """Make the options of the validation from the command's options, which are checked.
-
-    Raises:
-        ConfigError: A value is not allowed, or two options exclude each other.
-    """
+    """Make the options of the validation from the command's options; raises ConfigError."""
     from synpick_warp.apps.validation.registry import parse_tolerance
     from synpick_warp.apps.validation.run import DEFAULT_SAMPLE, ValidationOptions
 
@@ -100,35 +95,22 @@ def _make_options(sample: int | None, threads: int, tolerance: str | None, *, po
     return ValidationOptions(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, tolerance=bounds, **given)
 
 
-def _describe(violation: Violation) -> str:
-    """Violation as one line of text."""
+def _line(violation: Violation, *, as_json: bool) -> str:
+    """Violation as one line of text, or of JSON in ASCII; file names that are not UTF-8 have their bytes as lone surrogates."""
     from synpick_warp.apps.validation.registry import load_rules
 
     cure = load_rules()[violation.rule].cure
+    if as_json:
+        return dumps({**violation._asdict(), "cure": cure})
     return one_line(f"{violation.level} {violation.file}: {violation.rule}: {violation.text}. To mend it: {cure}.")
 
 
-def _encode(violation: Violation) -> str:
-    """Violation as one line of JSON."""
-    from synpick_warp.apps.validation.registry import load_rules
-
-    return _dump({**violation._asdict(), "cure": load_rules()[violation.rule].cure})
-
-
-def _dump(record: object) -> str:
-    """JSON in ASCII; file names that are not UTF-8 have their bytes as lone surrogates."""
-    from json import dumps
-
-    return dumps(record)
-
-
 def _print_rules(*, as_json: bool) -> None:
-    """Print all rules, as lines or JSON lines."""
     from synpick_warp.apps.validation.registry import load_rules
 
     for item in load_rules().values():
         record = {"rule": item.name, "level": item.level, "unit": item.unit, "sentence": item.sentence, "cure": item.cure}
-        print(_dump(record) if as_json else f"{item.name} ({item.level}): {item.sentence}")
+        print(dumps(record) if as_json else f"{item.name} ({item.level}): {item.sentence}")
 
 
 def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bool) -> None:
@@ -138,8 +120,8 @@ def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bo
     found = distributions(summary.deviations)
     if as_json:
         for item in found:
-            print(_dump({"deviation": item._asdict()}))
-        print(_dump({"totals": {name: value for name, value in vars(summary).items() if name != "deviations"}}))
+            print(dumps({"deviation": item._asdict()}))
+        print(dumps({"totals": {name: value for name, value in vars(summary).items() if name != "deviations"}}))
         return
     for name, count in counts.items():
         if limit and count > limit:
@@ -155,13 +137,8 @@ def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bo
     sys.stdout.flush()
 
 
-if TYPE_CHECKING:
-    from synpick_warp.cli.display import CountProgress
-    from synpick_warp.dataset.commit.verify import Verdict
-
-
 def verify(
-    folder: Annotated[Path | None, Parameter(name="DIR", help="A data set (default: the last one in the current folder).")] = None,
+    folder: DataSetArgument = None,
     /,
     *,
     threads: Annotated[WholeNumber, Parameter(help="Maximum number of processes; 0: one per core.")] = 0,
@@ -172,14 +149,17 @@ def verify(
     """
     check_range("--threads", threads, 0, MAX_THREADS)
     url = store_url(folder)
-    place = Path() if url is not None else find_data_set(folder, "synpick-warp verify DIR")
-    from rich.console import Console
-
-    from synpick_warp.cli.display import CountProgress
+    place = find_data_set(folder, "synpick-warp verify DIR") if url is None else Path()
+    from synpick_warp.cli.display import count_on_stderr
     from synpick_warp.dataset.commit.verify import verify as check
 
-    with CountProgress(Console(stderr=True, highlight=False)) as counter:
-        verdict = check(place, threads or None, counter.report) if url is None else _check_store(url, counter)
+    with count_on_stderr() as counter:
+        if url is None:
+            verdict = check(place, threads or None, counter.report)
+        else:
+            from synpick_warp.cloud.reading import verify_store
+
+            verdict = verify_store(url, counter.report)
     if verdict.problem:
         print(verdict.problem)
         return EXIT_INCOMPLETE
@@ -188,10 +168,3 @@ def verify(
     if not verdict.finished:
         print("the data set is not finished: the command that started it resumes it")
     return 0 if verdict.finished else EXIT_INCOMPLETE
-
-
-def _check_store(url: str, counter: CountProgress) -> Verdict:
-    """Verify a data set in an object store."""
-    from synpick_warp.cloud.reading import verify_store
-
-    return verify_store(url, counter.report)

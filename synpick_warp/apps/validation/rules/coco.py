@@ -8,8 +8,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.registry import Findings, rule
-from synpick_warp.apps.validation.scene_files import StoredMask
-from synpick_warp.apps.validation.schemas import Annotation
+from synpick_warp.apps.validation.scene_files import Annotation, StoredMask
 from synpick_warp.apps.validation.subjects import CocoFile, SceneSubject, ViewSubject
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 from synpick_warp.system.inputs.image_files import MAX_SIDE
@@ -107,10 +106,8 @@ def check_boxes(view: ViewSubject) -> Findings:
         if mask is not None and mask.box is not None and annotation.bbox != list(mask.box):
             x, y, width, height = mask.box
             hint = "; + 1 is missing" if annotation.bbox == [x, y, width - 1, height - 1] else ""
-            yield (
-                coco.file,
-                f"image {view.image}, annotation {annotation.id}: bbox is {annotation.bbox}, the mask's is {list(mask.box)}{hint}",
-            )
+            stated = f"bbox is {annotation.bbox}, the mask's is {list(mask.box)}{hint}"
+            yield coco.file, f"image {view.image}, annotation {annotation.id}: {stated}"
 
 
 @rule(ViewSubject, "coco-ignore", "set ignore by visib_fract")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from functools import cache, partial
 from itertools import chain
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from synpick_warp.apps.validation.model_files import ModelsFolder, ModelSubject
 from synpick_warp.apps.validation.registry import Findings, rule
-from synpick_warp.apps.validation.schemas import TruthSchema
+from synpick_warp.apps.validation.rules.models import ModelsFolder, ModelSubject
+from synpick_warp.apps.validation.scene_files import TruthSchema
 from synpick_warp.apps.validation.subjects import SceneSubject
 from synpick_warp.dataset.annotations import GraphEntry
 
@@ -48,7 +48,8 @@ def check_graph(scene: SceneSubject) -> Findings:
 @rule(SceneSubject, "support-touches", "check poses and the list's order: the ground-truth index is the position in scene_gt.json")
 def check_support(scene: SceneSubject) -> Findings:
     """An object touches what carries it, if both are still: their convex hulls are at most 5 mm apart."""
-    record, hulls = scene.record("graph"), _Hulls(scene)
+    record, folders = scene.record("graph"), [ModelsFolder(listing) for listing in scene.layout.models.values()]
+    find_hull = cache(partial(_find_hull, folders))
     images = sorted(image for image in record.entries if image in scene.truths and image - 1 in scene.truths)
     for image in images[:: -(-len(images) // IMAGES) or 1]:
         truths, before = scene.truths[image], {truth.instance_id: truth for truth in scene.truths[image - 1]}
@@ -57,7 +58,7 @@ def check_support(scene: SceneSubject) -> Findings:
                 continue
             upper, lower = truths[one], truths[other]
             last = before.get(upper.instance_id), before.get(lower.instance_id)
-            shapes = hulls.of(upper.obj_id), hulls.of(lower.obj_id)
+            shapes = find_hull(upper.obj_id), find_hull(lower.obj_id)
             if last[0] is None or last[1] is None or shapes[0] is None or shapes[1] is None:
                 continue
             pose = relative_pose(upper, lower)
@@ -71,28 +72,17 @@ def _supports(graph: GraphEntry) -> list[tuple[int, int, float]]:
     return graph.support or []
 
 
-class _Hulls:
-    """Cache of the convex hulls of a data set's models."""
-
-    def __init__(self, scene: SceneSubject) -> None:
-        self._folders = [ModelsFolder(listing) for listing in scene.layout.models.values()]
-        self._made: dict[int, _Hull | None] = {}
-
-    def of(self, obj_id: int) -> _Hull | None:
-        """Hull of a model; None: there is no such model, or it has no volume."""
-        if obj_id not in self._made:
-            self._made[obj_id] = next(self._make(obj_id), None)
-        return self._made[obj_id]
-
-    def _make(self, obj_id: int) -> Iterator[_Hull]:
-        for folder in self._folders:
-            vertices = ModelSubject(folder, obj_id).vertices if obj_id in folder.files else None
-            if vertices is not None:
-                try:
-                    hull = ConvexHull(vertices)
-                except (QhullError, ValueError):
-                    continue
-                yield vertices[hull.vertices], np.unique(hull.equations[:, :3].round(3), axis=0)
+def _find_hull(folders: list[ModelsFolder], obj_id: int) -> _Hull | None:
+    """Convex hull of a model; None: there is no such model, or it has no volume."""
+    for folder in folders:
+        vertices = ModelSubject(folder, obj_id).vertices if obj_id in folder.files else None
+        if vertices is not None:
+            try:
+                hull = ConvexHull(vertices)
+            except (QhullError, ValueError):
+                continue
+            return vertices[hull.vertices], np.unique(hull.equations[:, :3].round(3), axis=0)
+    return None
 
 
 def relative_pose(one: TruthSchema, other: TruthSchema) -> np.ndarray:

@@ -9,8 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
 from synpick_warp.apps.validation.rules.records import EMPTY, box_sides
-from synpick_warp.apps.validation.scene_files import StoredMask
-from synpick_warp.apps.validation.schemas import Info
+from synpick_warp.apps.validation.scene_files import Info, StoredMask
 from synpick_warp.apps.validation.subjects import ViewSubject
 
 MIN_KNOWN_DEPTH = 0.05
@@ -148,10 +147,8 @@ def check_visible_count(view: ViewSubject) -> Findings:
     """px_count_visib is the number of pixels of mask_visib."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if _differ(info.px_count_visib, mask.count):
-            yield (
-                _file(view),
-                f"image {view.image}, instance {index}: px_count_visib is {info.px_count_visib}, {mask.file} has {mask.count}",
-            )
+            stated = f"px_count_visib is {info.px_count_visib}"
+            yield _file(view), f"image {view.image}, instance {index}: {stated}, {mask.file} has {mask.count}"
 
 
 @rule(ViewSubject, "valid-count", "count the pixels of mask whose depth is not 0")
@@ -166,10 +163,8 @@ def check_valid_count(view: ViewSubject) -> Findings:
             left, top, width, height = mask.box
             count = int(np.count_nonzero(mask.crop & (depth[top : top + height, left : left + width] > 0)))
         if _differ(info.px_count_valid, count):
-            yield (
-                _file(view),
-                f"image {view.image}, instance {index}: px_count_valid is {info.px_count_valid}; in {mask.file} {count} have depth",
-            )
+            stated = f"px_count_valid is {info.px_count_valid}"
+            yield _file(view), f"image {view.image}, instance {index}: {stated}; in {mask.file} {count} have depth"
 
 
 @rule(ViewSubject, "amodal-count", "count the silhouette in the image and up to one image size beyond each border")
@@ -210,14 +205,11 @@ def _farthest_side(box: list[int], seen: tuple[int, int, int, int], sides: Itera
 
 
 def wrong_sides(box: list[int], mask: StoredMask) -> list[int]:
-    """Sides, as in `box_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
+    """Sides, as in `box_sides`, on which the amodal box of a silhouette contradicts its mask, the part of it inside the image, which is not
+    empty.
 
     A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
     only if its box stays within the image on the others: around a corner of the image it may reach farther than inside.
-
-    Args:
-        box: Amodal box in BOP's convention.
-        mask: Mask that is not empty.
     """
     if mask.box is None:
         return []

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import UNSET
 
 from synpick_warp.apps.validation.registry import Deviation, Findings, Level, rule
-from synpick_warp.apps.validation.schemas import Info, TruthSchema
+from synpick_warp.apps.validation.scene_files import Info, TruthSchema
 from synpick_warp.apps.validation.subjects import SceneSubject
 
 ROTATION_TOLERANCE = 1e-3

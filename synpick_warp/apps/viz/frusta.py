@@ -20,7 +20,7 @@ from synpick_warp.scenes.cameras import is_in_way, make_cameras
 from synpick_warp.scenes.types import Camera
 
 if TYPE_CHECKING:
-    from synpick_warp.apps.viz.cell.rendering import Picture
+    from synpick_warp.apps.viz.cell import Picture
 
 _STEP = 4.0
 """Length of the line segments whose visibility is tested [px]."""
