@@ -157,14 +157,15 @@ def draw_trial(view: View, trial: np.void, radius: float) -> Image:
 def choose_trial(picks: np.ndarray, candidate: int | None = None) -> np.void:
     """Choose a trial to explain: the unperturbed failure with the highest analytic score; without failures, the success with the lowest.
     With `candidate`, its first trial; raises DatasetError if there is no such candidate."""
+    rows: Any = picks  # NumPy's stubs take a row of a structured array for an array.
     if candidate is not None:
         own = np.flatnonzero(picks["candidate"] == candidate)
         if not len(own):
             raise DatasetError(f"the state has no candidate {candidate}; it has {len(np.unique(picks['candidate']))} candidates")
-        return picks[own[0]]
+        return rows[own[0]]
     plain = np.flatnonzero(picks["repeat"] == picks["repeat"].min())
     score, failed = picks["seal"][plain] * picks["wrench"][plain], ~picks["success"][plain]
-    return picks[plain[np.argmax(np.where(failed, score, -1.0)) if failed.any() else np.argmin(score)]]
+    return rows[plain[np.argmax(np.where(failed, score, -1.0)) if failed.any() else np.argmin(score)]]
 
 
 def write_pick_sheet(data_set: DataSet, out: Path, episode: int | None, state: int | None = None, candidate: int | None = None) -> Path:
