@@ -28,8 +28,8 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages import ticks, timing
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, failing_after, once
-from tests.harness.exporter_contract import digests
 from tests.worlds.sights import BRIEF
 from tests.worlds.small_worlds import QUICK, catalog, settings
 

@@ -27,8 +27,8 @@ from synpick_warp.scenes.embedded.solids import solids
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim import arrange
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import PICKING, bake_boxes, boxes, refusal
-from tests.harness.exporter_contract import digests
 from tests.twins import rng
 from tests.worlds.cells import make_camera
 from tests.worlds.kernel_worlds import arrangement_worlds

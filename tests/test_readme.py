@@ -25,11 +25,11 @@ import warp as wp
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.stages.launch import launch
+from synpick_warp.testing import box_views
+from synpick_warp.testing.exporters import export
 from tests.builders import PICKING, assignments, bake_boxes
 from tests.harness.environment import checkout_environment
-from tests.harness.exporter_contract import export
 from tests.test_bake import TINY
-from tests.worlds import box_views
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()

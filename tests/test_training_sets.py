@@ -20,11 +20,11 @@ from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.testing.box_views import batches, cameras, config
+from synpick_warp.testing.exporters import FRAMES, export
 from synpick_warp.views.layer_codec import decode_layer, encode_layer
-from tests.harness.exporter_contract import FRAMES, export
 from tests.twins.masks import masks_of_batch
 from tests.worlds.box_sets import EPISODES, write_set
-from tests.worlds.box_views import batches, cameras, config
 
 STUBS = Path(__file__).parent / "stubs"
 

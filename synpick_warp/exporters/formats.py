@@ -7,7 +7,7 @@ How to add a format:
    is a subpackage beside it: follow `usd/exporter.py`. Name the subpackage in the import contract of its folder in pyproject.toml.
 2. Add a row to FORMAT_TABLE, and its name to `FORMATS` in configs/schema.py: settings must not import exporters, and a test compares both.
    In a package of your own, name the row (a `Format`) as an entry point instead: see `system/plugins.py`.
-3. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+3. Let its test class inherit `ExporterContract` (synpick_warp/testing/exporters.py): determinism, atomic commits, resuming.
 
 Nothing else in the package lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Tests of
 the table, of conversion and of the command line name what they expect, and `tools/compare/guard_steps.py` what it bakes. Imports no

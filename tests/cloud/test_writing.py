@@ -154,6 +154,11 @@ def test_a_manifest_that_another_worker_wrote_meanwhile_is_compared(memory, know
             ledger.put_manifest(encode_manifest(ours))
     else:
         ledger.put_manifest(encode_manifest(ours))
+
+
+def test_settings_that_another_worker_wrote_meanwhile_are_compared(memory):
+    store = open_store(memory)
+    ledger = Ledger(store, tiny(), Probe(0.0, False))
     theirs = encode_manifest(make_manifest(tiny().with_values({"bake.seed": 8})))
     store.put("manifest.json", theirs)
     with pytest.raises(ConfigError, match=r"by another worker.*bake\.seed is 0, there 8"):

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -24,12 +26,13 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory.arrays import OBJECTS, STORE
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.testing import box_views
+from synpick_warp.testing.exporters import ExporterContract
 from tests.builders import PICKING, assignments, mistake, once, refusal
 from tests.builders import run as command
 from tests.harness import scripted_bake
 from tests.harness.environment import checkout_environment
 from tests.harness.scripted_bake import INPUTS, snapshot
-from tests.worlds import box_views
 
 
 def settings(*formats: str, jpg: bool = False, keypoints: int = 0) -> Config:
@@ -349,6 +352,19 @@ def test_a_package_of_others_bakes_its_format_with_its_gripper(tmp_path):
     assert run("verify", "DATA").returncode == 0
     assert len(list((tmp_path / "DATA" / "boxes").glob("*/*.json"))) > 10
     assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
+
+
+class TestFormatOfOthers(ExporterContract):
+    """As a package of others tests its format: `synpick_warp.testing`."""
+
+    @pytest.fixture(scope="class", autouse=True)
+    @classmethod
+    def installed(cls):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.syspath_prepend(PLUGINS)
+            patch.setenv("PYTHONPATH", str(PLUGINS), prepend=os.pathsep)
+            cls.exporter_class = importlib.import_module("synpick_extras.boxes").BoxesExporter
+            yield
 
 
 def test_a_new_format_is_converted_for_free(tmp_path, boxes, monkeypatch):

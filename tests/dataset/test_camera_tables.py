@@ -16,8 +16,8 @@ from synpick_warp.configs.schema import FORMATS
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.errors import DatasetError
+from synpick_warp.testing.exporters import digests
 from tests.builders import boxes, failing_after, once, run
-from tests.harness.exporter_contract import digests
 from tests.online.test_stream import taken
 from tests.worlds.cells import SIDE, bake_cell, camera_matrix, cell_config, check_same, check_valid, make_camera
 from tools.checks.dataset import check

@@ -12,8 +12,8 @@ import pytest
 import synpick_warp
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.view import View
+from synpick_warp.testing.exporters import digests
 from tests.builders import PICKING, STIRRING, bake_boxes, once
-from tests.harness.exporter_contract import digests
 
 WIDTH, HEIGHT = 96, 54
 TINY = STIRRING | {

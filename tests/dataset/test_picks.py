@@ -21,13 +21,13 @@ from synpick_warp.dataset.view import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files
+from synpick_warp.testing.box_views import cameras, config
+from synpick_warp.testing.exporters import export
+from synpick_warp.testing.picks import EACH, REPEATS, pick_batch
 from synpick_warp.views.picks import COLUMNS, STATES, are_sorted, make_rows, sort_rows
 from tests.builders import run
 from tests.harness import scripted_bake
-from tests.harness.exporter_contract import export
 from tests.worlds.box_sets import write_pick_set, write_set
-from tests.worlds.box_views import cameras, config
-from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 
 
 @pytest.fixture(scope="module")

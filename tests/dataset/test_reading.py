@@ -19,13 +19,14 @@ from synpick_warp.dataset.tracks import Tracks
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.testing import box_views
+from synpick_warp.testing.box_views import OBJECT_IDS, SIZES, batches
+from synpick_warp.testing.exporters import FRAMES, LENSES
 from synpick_warp.views.frames import FrameBatch
 from tests.harness.environment import checkout_environment
-from tests.harness.exporter_contract import FRAMES, LENSES
 from tests.twins.masks import masks_of_batch
-from tests.worlds import box_views, trajectories
+from tests.worlds import trajectories
 from tests.worlds.box_sets import ATTEMPT, EPISODES, LAYERS, write_set
-from tests.worlds.box_views import OBJECT_IDS, SIZES, batches
 
 TICKS = 5
 """Frames of the trajectories."""

@@ -22,9 +22,9 @@ from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
+from synpick_warp.testing.exporters import digests
 from tests.builders import mistake, run
 from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
-from tests.harness.exporter_contract import digests
 from tests.harness.processes import kill_after, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 20))

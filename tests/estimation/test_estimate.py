@@ -32,9 +32,9 @@ from synpick_warp.cli.commands.estimate import parse_indices
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.testing.box_views import SIZES
 from tests.builders import mistake, refusal, run
 from tests.worlds.box_sets import write_set
-from tests.worlds.box_views import SIZES
 
 PLAN = ScenePlan(0, 0, 0, (0, 1))
 

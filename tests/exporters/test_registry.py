@@ -26,12 +26,12 @@ from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_clas
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
 from synpick_warp.factory.attempts import AttemptRecord, ObservedInstance
 from synpick_warp.factory.episodes import EpisodeOutcome
+from synpick_warp.testing.box_views import config
+from synpick_warp.testing.exporters import ExporterContract, export
+from synpick_warp.testing.picks import EACH, REPEATS, pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from synpick_warp.views.layers import LAYER_TABLE
 from synpick_warp.views.picks import COLUMNS, ORDER, STATES, PickBatch, make_rows
-from tests.harness.exporter_contract import ExporterContract, export
-from tests.worlds.box_views import config
-from tests.worlds.pick_tables import EACH, REPEATS, pick_batch
 
 
 class Fake:

@@ -26,8 +26,8 @@ from synpick_warp.scenes.symmetries.groups import close_group
 from synpick_warp.stages.render.light_tables import precompute_environment
 from synpick_warp.system.hardware.device import start_warp
 from synpick_warp.system.linear_algebra import rotation
+from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, bake_boxes
-from tests.harness.exporter_contract import digests
 from tests.harness.made_once import written_here
 from tools.embedded_shapes import modelled_shape
 

@@ -21,10 +21,11 @@ from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
 from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
+from synpick_warp.testing import box_views
+from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
-from tests.worlds import box_views, trajectories
+from tests.worlds import trajectories
 from tests.worlds.attempt_records import seen_object
-from tests.worlds.pick_tables import pick_batch
 
 FRAMES = 2
 INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}

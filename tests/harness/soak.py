@@ -30,8 +30,9 @@ from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.testing import box_views
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
-from tests.worlds import box_views, trajectories
+from tests.worlds import trajectories
 
 WORLDS = 2
 FRAMES = 25

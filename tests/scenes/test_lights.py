@@ -279,7 +279,8 @@ SETS += [
 def test_sets_that_cannot_be_used_are_one_line(tmp_path, row):
     text, *words = SETS[row]
     folder = make_set(tmp_path / "set", text)
-    refused(folder, "room.ibl", *words)
+    if "names the file" not in words:  # Below, `link` leads to a map that can be used.
+        refused(folder, "room.ibl", *words)
     save(tmp_path / "map.hdr", picture())
     (folder / "link").symlink_to("..")
     refused(folder, "room.ibl", *words, strict=True)

@@ -22,10 +22,10 @@ from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system.hardware import device as devices
 from synpick_warp.system.hardware.device import describe_kinds, pick_devices
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import assignments, mistake, refusal
 from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.device_programs import program
-from tests.harness.exporter_contract import digests
 from tests.harness.processes import wait_for, wait_until_gone
 from tests.worlds.small_worlds import QUICK
 

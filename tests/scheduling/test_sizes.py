@@ -39,8 +39,8 @@ from synpick_warp.stages import view_ring
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, boxes
-from tests.harness.exporter_contract import digests
 from tests.twins.arrangement import sample_modes, sample_objects
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
 

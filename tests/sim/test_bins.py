@@ -22,8 +22,8 @@ from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import STIRRING, bake_boxes
-from tests.harness.exporter_contract import digests
 from tests.twins import rng
 from tests.worlds.bin_meshes import round_bin, sloped_bin, tote
 from tests.worlds.kernel_worlds import BIN, KernelWorlds

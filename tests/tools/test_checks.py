@@ -15,9 +15,9 @@ import pytest
 import trimesh
 
 from synpick_warp.exporters.bop.exporter import BopExporter
-from tests.harness.exporter_contract import export
-from tests.validation.planting import GT, INFO, moved, pixels, whole
-from tests.worlds.box_views import cameras, config
+from synpick_warp.testing.box_views import cameras, config
+from synpick_warp.testing.exporters import export
+from tests.validation.faults import GT, INFO, moved, pixels, whole
 from tools import docs, figures
 from tools.checks import dataset as tool
 from tools.checks.kernels import main

@@ -17,8 +17,8 @@ import synpick_warp
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.exporters.bop.exporter import BopExporter
-from tests.harness.exporter_contract import export
-from tests.worlds.box_views import cameras, config
+from synpick_warp.testing.box_views import cameras, config
+from synpick_warp.testing.exporters import export
 from tools.clients import __main__ as tool
 from tools.clients import base, environments
 from tools.clients.process import NOT_INSTALLED

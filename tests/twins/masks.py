@@ -6,28 +6,8 @@ from typing import Any
 
 import numpy as np
 
-ROWS = 32
-"""Rows of a word."""
-
-
-def pack_masks(masks: np.ndarray, margin: int = 1) -> dict[str, np.ndarray]:
-    """Pack masks (I, H, W) bool of one view into the mask fields of `FrameBatch`; boxes are bounding boxes enlarged by `margin` [px]."""
-    count, height, width = masks.shape
-    words = np.zeros(count * width * -(-height // ROWS), np.uint32)
-    first, box = np.zeros(count, np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (count, 1))
-    used = 0
-    for index, mask in enumerate(masks):
-        first[index] = used
-        rows, columns = np.nonzero(mask)
-        if not rows.size:
-            continue
-        left, top = max(0, columns.min() - margin), max(0, rows.min() - margin)
-        right, bottom = min(width - 1, columns.max() + margin), min(height - 1, rows.max() + margin)
-        box[index] = left, top, right, bottom
-        down, right_by = rows - top, columns - left
-        np.bitwise_or.at(words, used + down // ROWS * (right - left + 1) + right_by, np.uint32(1) << (down % ROWS).astype(np.uint32))
-        used += (right - left + 1) * -(-(bottom - top + 1) // ROWS)
-    return {"mask_words": words, "mask_first": first, "mask_box": box, "mask_length": np.array(used, np.int32)}
+from synpick_warp.codes import MASK_ROWS as ROWS
+from synpick_warp.testing.box_views import pack_masks
 
 
 def pack_into(buffers: Any, masks: np.ndarray) -> None:

@@ -15,9 +15,9 @@ import pytest
 
 from synpick_warp.apps.validation.registry import Violation
 from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
+from synpick_warp.testing import box_views
 from tests.harness import scripted_bake
 from tests.validation.faults import TARGETS, edit, read, write
-from tests.worlds import box_views
 
 WIDTH, HEIGHT = 200, 150
 

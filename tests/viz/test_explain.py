@@ -24,11 +24,11 @@ from synpick_warp.dataset.view import View
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.types import Camera
+from synpick_warp.testing.box_views import config
+from synpick_warp.testing.exporters import export
 from tests.builders import mistake, refusal
 from tests.harness.charts import near, picture_of
-from tests.harness.exporter_contract import export
 from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
-from tests.worlds.box_views import config
 from tests.worlds.cells import cell_config, make_camera
 
 EPISODES = (0, 1)

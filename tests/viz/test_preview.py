@@ -34,11 +34,11 @@ from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import write_layer
 from synpick_warp.exporters.bop.view import write_rendered_layer
+from synpick_warp.testing.box_views import cameras, config
+from synpick_warp.testing.exporters import export
 from tests.builders import mistake
-from tests.harness.exporter_contract import export
 from tests.harness.hostile import replaced
 from tests.harness.scripted_bake import bake, settings
-from tests.worlds.box_views import cameras, config
 
 FRAMES = 5
 LEGEND = COLUMN + 4

@@ -10,12 +10,12 @@ from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import PicksExporter
+from synpick_warp.testing.box_views import config
+from synpick_warp.testing.exporters import FRAMES, export
+from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from tests.harness.entries import episode_content
-from tests.harness.exporter_contract import FRAMES, export
 from tests.worlds import trajectories
-from tests.worlds.box_views import config
-from tests.worlds.pick_tables import pick_batch
 
 EPISODES = (0, 2)
 LAYERS = ("classes", "flow")

@@ -11,8 +11,8 @@ from synpick_warp.configs.files.table_lists import read_rows
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.system.progress import SilentProgress
+from synpick_warp.testing.exporters import digests
 from tests.builders import STIRRING, boxes, run
-from tests.harness.exporter_contract import digests
 from tests.worlds.small_worlds import settings
 
 Point = Sequence[float]

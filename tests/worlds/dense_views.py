@@ -12,8 +12,8 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import allocate_view_buffers, view_buffer_sizes
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.view_setup import first_views
+from synpick_warp.testing.box_views import catalog
 from synpick_warp.views.frames import FrameBatch
-from tests.worlds.box_views import catalog
 from tests.worlds.shapes import random_pile
 from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, snapshot
 

@@ -14,9 +14,9 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config, Trajectory
 from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, TrajectoryArray
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
+from synpick_warp.testing import box_views
+from synpick_warp.testing.exporters import exporting, finish
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
-from tests.harness.exporter_contract import exporting, finish
-from tests.worlds import box_views
 from tests.worlds.attempt_records import nothing_seen, record
 
 STEP_COUNT = 4

@@ -34,7 +34,7 @@ from synpick_warp.exporters.bop.shards.tar_files import key_lines
 from synpick_warp.exporters.trajectory.arrays import STEPS
 from synpick_warp.system.inputs.image_files import decode_image, image_size
 from synpick_warp.system.inputs.tar_files import list_members
-from tests.harness.exporter_contract import LENSES
+from synpick_warp.testing.exporters import LENSES
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import places, replaced
 from tests.worlds import trajectories

@@ -33,10 +33,10 @@ from synpick_warp.exporters.writing.files import open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
-from tests.harness.exporter_contract import FRAMES, ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
-from tests.worlds import box_views
+from synpick_warp.testing import box_views
+from synpick_warp.testing.box_views import SIZES, batches, cameras, catalog, config, poses
+from synpick_warp.testing.exporters import FRAMES, ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
 from tests.worlds.box_sets import EPISODES, write_set
-from tests.worlds.box_views import SIZES, batches, cameras, catalog, config, poses
 
 LENSES = cameras()
 VIEW = next(batches(1, (0,), 1, LENSES))

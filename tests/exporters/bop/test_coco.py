@@ -37,10 +37,10 @@ from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.rle import Masks, find_run_boundaries
-from tests.harness.exporter_contract import ExporterContract, digests, export, with_files, without_objects
+from synpick_warp.testing.box_views import SIZES, batches, cameras, config
+from synpick_warp.testing.exporters import ExporterContract, digests, export, with_files, without_objects
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.box_sets import write_set
-from tests.worlds.box_views import SIZES, batches, cameras, config
 
 LENSES = cameras()
 

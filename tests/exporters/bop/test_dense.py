@@ -19,11 +19,11 @@ from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.testing.box_views import cameras, ends, ticks
+from synpick_warp.testing.exporters import digests, exporting, finish
 from tests.harness.devices import default_device
-from tests.harness.exporter_contract import digests, exporting, finish
 from tests.twins.masks import masks_of_batch
 from tests.worlds import trajectories
-from tests.worlds.box_views import cameras, ends, ticks
 from tests.worlds.dense_views import dense_batch, dense_toy
 from tools.checks import dataset as check
 from tools.clients.base import pose_matrix

@@ -26,8 +26,8 @@ from synpick_warp.exporters.bop.shards import tar_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
-from tests.harness.exporter_contract import ExporterContract, export, export_context, exporting, finish, without_objects
-from tests.worlds.box_views import batches, cameras, config, ends
+from synpick_warp.testing.box_views import batches, cameras, config, ends
+from synpick_warp.testing.exporters import ExporterContract, export, export_context, exporting, finish, without_objects
 
 EPISODES = (0, 2)
 FRAMES = 3

@@ -32,9 +32,10 @@ from synpick_warp.exporters.lerobot import layout, video
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
 from synpick_warp.exporters.lerobot.part import describe_tasks
 from synpick_warp.exporters.registry import load_exporter_classes
-from tests.harness.exporter_contract import ExporterContract, digests, exporting, feed, finish
+from synpick_warp.testing import box_views
+from synpick_warp.testing.exporters import ExporterContract, digests, exporting, feed, finish
 from tests.harness.hostile import replaced
-from tests.worlds import box_views, trajectories
+from tests.worlds import trajectories
 
 EPISODES = (0, 2)
 FRAMES = 11

@@ -26,10 +26,11 @@ from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, spool_bytes
 from synpick_warp.exporters.trajectory.store import chunk_layout
 from synpick_warp.stages import ticks as stage_ticks
 from synpick_warp.stages.stream import FrameStream
+from synpick_warp.testing import box_views
+from synpick_warp.testing.exporters import ExporterContract, digests, exporting, finish
 from tests.builders import PICKING, bake_boxes, boxes, once
-from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
 from tests.harness.memory_tables import device_arrays
-from tests.worlds import box_views, small_worlds, trajectories
+from tests.worlds import small_worlds, trajectories
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
 
 EPISODES = (0, 4)

@@ -22,8 +22,8 @@ from synpick_warp.exporters.usd.parts import new_asset, save_layer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.testing.exporters import ExporterContract
 from tests.harness import scripted_bake
-from tests.harness.exporter_contract import ExporterContract
 from tests.worlds import small_worlds, usd_sets
 
 CATALOG = usd_sets.textured(small_worlds.catalog())

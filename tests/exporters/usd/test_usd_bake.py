@@ -14,9 +14,9 @@ from scipy.spatial import ConvexHull
 
 from synpick_warp.apps.conversion.run import convert
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from synpick_warp.testing.exporters import digests
 from tests.builders import STIRRING, bake_boxes
 from tests.exporters.usd.test_usd import validation_errors
-from tests.harness.exporter_contract import digests
 from tests.worlds import small_worlds
 
 CAMERAS = 3

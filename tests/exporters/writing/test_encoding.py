@@ -19,8 +19,8 @@ from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.exporters.writing import png
 from synpick_warp.exporters.writing.png import HEAD, Deflater, encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import RunBoundaries, Runs, find_run_boundaries, find_runs, split_listed_runs
+from synpick_warp.testing.box_views import pack_masks
 from synpick_warp.views.frames import most_words, unpack_mask
-from tests.twins.masks import pack_masks
 
 SIDE = st.integers(1, 40)
 GREY = st.tuples(SIDE, SIDE)

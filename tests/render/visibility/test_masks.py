@@ -30,11 +30,11 @@ from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratc
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing
+from synpick_warp.testing.box_views import batches, cameras, config, ends
+from synpick_warp.testing.exporters import digests, exporting, finish
 from synpick_warp.views.frames import most_words, paint_masks
 from tests.harness.aimed_views import aimed_views
-from tests.harness.exporter_contract import digests, exporting, finish
 from tests.twins.masks import masks_of_batch, pack_into
-from tests.worlds.box_views import batches, cameras, config, ends
 from tests.worlds.dense_views import dense_toy
 from tests.worlds.shapes import DOWN, camera
 from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, render_gbuffer, snapshot, with_render

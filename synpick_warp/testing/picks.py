@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Outcome, Share
+from synpick_warp.testing.box_views import OBJECT_IDS, SIZES, batches, cameras
 from synpick_warp.views.frames import FrameBatch
 from synpick_warp.views.picks import COLUMNS, PickBatch
-from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras
 
 REPEATS = 2
 EACH = 4

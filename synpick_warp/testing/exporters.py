@@ -25,10 +25,10 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
+from synpick_warp.testing import box_views
+from synpick_warp.testing.box_views import batches, cameras, catalog, ends, ticks
+from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
-from tests.worlds import box_views
-from tests.worlds.box_views import batches, cameras, catalog, ends, ticks
-from tests.worlds.pick_tables import pick_batch
 
 FRAMES = 3
 MOST_EPISODES = 100

@@ -9,11 +9,10 @@ from collections.abc import Iterator
 import numpy as np
 import trimesh
 
-from synpick_warp.codes import Effect, Ending, Segment
+from synpick_warp.codes import MASK_ROWS, Effect, Ending, Segment
 from synpick_warp.configs.schema import Bop, Cameras, Config, Render
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
-from tests.twins.masks import pack_masks
 
 ROOM = 5
 """Instance capacity of a world; instances 1 and 4 do not exist."""
@@ -217,3 +216,25 @@ def _box(mask: np.ndarray, left: int, top: int) -> list[int]:
     if not rows.size:
         return [0, 0, -1, -1]
     return [int(columns[0]) - left, int(rows[0]) - top, int(columns[-1]) - left, int(rows[-1]) - top]
+
+
+def pack_masks(masks: np.ndarray, margin: int = 1) -> dict[str, np.ndarray]:
+    """Pack masks (I, H, W) bool of one view into the mask fields of `FrameBatch`; boxes are bounding boxes enlarged by `margin` [px]."""
+    count, height, width = masks.shape
+    words = np.zeros(count * width * -(-height // MASK_ROWS), np.uint32)
+    first, box = np.zeros(count, np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (count, 1))
+    used = 0
+    for index, mask in enumerate(masks):
+        first[index] = used
+        rows, columns = np.nonzero(mask)
+        if not rows.size:
+            continue
+        left, top = max(0, columns.min() - margin), max(0, rows.min() - margin)
+        right, bottom = min(width - 1, columns.max() + margin), min(height - 1, rows.max() + margin)
+        box[index] = left, top, right, bottom
+        down, right_by = rows - top, columns - left
+        np.bitwise_or.at(
+            words, used + down // MASK_ROWS * (right - left + 1) + right_by, np.uint32(1) << (down % MASK_ROWS).astype(np.uint32)
+        )
+        used += (right - left + 1) * -(-(bottom - top + 1) // MASK_ROWS)
+    return {"mask_words": words, "mask_first": first, "mask_box": box, "mask_length": np.array(used, np.int32)}

@@ -1,0 +1,9 @@
+"""Tests for packages of others: contract tests of exporters, on views of boxes that are known analytically.
+
+    from synpick_warp.testing.exporters import ExporterContract
+
+    class TestBoxes(ExporterContract):      # a class of a pytest file
+        exporter_class = BoxesExporter
+
+Needs pytest. Nothing in synpick_warp imports this package.
+"""
