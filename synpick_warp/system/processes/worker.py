@@ -22,8 +22,8 @@ from typing import Any
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.descriptors import duplicate_above_streams
 
-END_TIMEOUT = 10.0
-"""How long an idle process may take to exit [s]."""
+END_TIMEOUT = 120.0
+"""How long an idle process may take to exit [s], also on a machine that is busy with others."""
 _ENVIRONMENT = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
