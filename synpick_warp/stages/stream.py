@@ -239,7 +239,7 @@ def describe_batches(
 ) -> Iterator[tuple[slice, bool, ViewExtrinsics]]:
     """The batches of `split_views`, and in each the views by `describe_views`, with their cameras in the tick before."""
     for part, wide in split_views(group, report, world, camera, cameras):
-        views = describe_views(report, world[part], camera[part], *known, cameras)
+        views = describe_views(report, world[part], camera[part], *known, cameras=cameras)
         last: dict[str, np.ndarray] = {}
         if cameras is not None:
             last = cameras.of_views(views["episode"], camera[part], report.snapshot.last_fixture_pose[world[part], SHAFT])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import pickle
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -23,7 +24,7 @@ FOCAL = 3.0
 """Focal length in image widths."""
 
 
-def config(layers: tuple[str, ...] = (), **bop: object) -> Config:
+def config(layers: tuple[str, ...] = (), **bop: Any) -> Config:
     """Settings of the BOP writers. `layers` may name those that `_layers` makes."""
     lens = cameras()[0]
     return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)), render=Render(layers=layers))
@@ -108,10 +109,11 @@ def ticks(worlds: int, episodes: tuple[int, ...], frames: int) -> Iterator[TickB
     order = [(episode, frame) for frame in range(frames) for episode in episodes]
     for start in range(0, len(order), worlds):
         rows = [_tick(episode, frame) for episode, frame in order[start : start + worlds]]
-        yield TickBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+        batch: dict[str, Any] = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        yield TickBatch(**batch)
 
 
-def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
+def _tick(episode: int, frame: int) -> dict[str, Any]:
     fixtures = np.zeros((3, 7), np.float32)
     fixtures[:, 6] = 1.0
     fixtures[1:, :3] = [[0.1 - 0.02 * frame, 0.05, 0.2], [0.1 - 0.02 * frame, 0.05, 0.05]]
@@ -135,12 +137,12 @@ def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHE
 
 
 @functools.lru_cache(maxsize=300)
-def _known_view(arguments: bytes) -> dict[str, np.ndarray]:
+def _known_view(arguments: bytes) -> dict[str, Any]:
     """A view by its pickled arguments: many tests export the same ones. Not to be changed."""
     return _view(*pickle.loads(arguments))
 
 
-def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, np.ndarray]:
+def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, Any]:
     pose = poses(episode, frame)
     depths = np.stack([_depth(SIZES[OBJECT_IDS[i]], pose[i], camera) if OBJECT_IDS[i] >= 0 else _nothing(camera) for i in range(ROOM)])
     inner = depths[:, camera.height : 2 * camera.height, camera.width : 2 * camera.width]

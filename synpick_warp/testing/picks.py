@@ -25,7 +25,7 @@ def pick_batch(episode: int, frames: tuple[int, ...] = (0, 2), own: bool = True)
     views = {int(batch.frame[0]): batch for batch in batches(1, (episode,), max(frames) + 1, cameras()[:1])}
     tables = [_trials(views[frame], state, generator, own) for state, frame in reversed(list(enumerate(frames)))]
     trials = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    size = views[frames[0]].instance.shape[1:]
+    size = views[frames[0]].instance[0].shape
     states = {
         "state": np.arange(len(frames)),
         "frame": np.array(frames),
@@ -103,7 +103,7 @@ def _surface(view: FrameBatch, pixels: np.ndarray, instance: np.ndarray) -> tupl
     point = (depth[:, None] * rays - camera.translation) @ camera.rotation
     rotation = Rotation.from_quat(view.pose[0][instance, 3:])
     inside = rotation.inv().apply(point - view.pose[0][instance, :3])
-    half = np.array([SIZES[OBJECT_IDS[index]] for index in instance]) / 2
+    half = np.array([SIZES[int(OBJECT_IDS[index])] for index in instance]) / 2
     axis = np.argmax(np.abs(inside) - half, axis=1)
     normal = np.zeros_like(inside)
     normal[np.arange(len(axis)), axis] = np.sign(inside[np.arange(len(axis)), axis])
