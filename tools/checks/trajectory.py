@@ -34,10 +34,10 @@ def make_measures() -> dict[str, MeasuredValue]:
         "labels": MeasuredValue("arrays without unit, description or dimension names", "", 0.0),
         "finite": MeasuredValue("objects: poses that are not finite", "", 0.0),
         "speed": MeasuredValue("objects: speed, by displacement over a tick", "m/s", MAX_SPEED),
-        "momentum": MeasuredValue("objects: change of momentum against contacts and weight", "ratio", 1e-3),
+        "momentum": MeasuredValue("objects: change of momentum against contacts and weight", "ratio", 2e-4),
         "rest": MeasuredValue("first frame: contacts of all objects against their weight", "ratio", 0.1),
         "displacement": MeasuredValue("objects: displacement in a step against speed", "m", 1e-4),
-        "force": MeasuredValue("gripper: force against its law", "N", 1e-2),
+        "force": MeasuredValue("gripper: force against its law", "N", 2e-3),
         "peak_force": MeasuredValue("seals: peak force of a tick's steps against the tick's", "N", 0.0),
         "attempts": MeasuredValue("seals: peak force of a tick's steps against the attempt's", "N", 1e-4),
     }
