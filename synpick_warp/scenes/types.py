@@ -223,7 +223,7 @@ class Camera:
         """Pinhole camera of an intrinsic matrix (3, 3) [px], with width and height [px], by its pose in the world (4, 4) [m]."""
         pose = np.asarray(pose, float).reshape(4, 4)
         rotation = pose[:3, :3].T
-        return cls(*resolution, np.asarray(matrix, float).reshape(3, 3), rotation, -rotation @ pose[:3, 3])
+        return cls(*resolution, np.asarray(matrix, float).reshape(3, 3), rotation, -dot(rotation, pose[:3, 3]))
 
     @property
     def resolution(self) -> tuple[int, int]:
