@@ -5,16 +5,21 @@ from __future__ import annotations
 import networkx as nx
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import MAX_INSTANCES
+from synpick_warp.kernels.perception.clutter_graph import edge_weight
 from synpick_warp.stages.arrays import count_words, unpack_words
+from tests.harness.devices import default_device
+from tests.harness.probe import probe
 from tests.twins import planning
 from tests.twins.planning import PlannerHarness
 
 LEAST = planning.SETTINGS["min_votes"]
 EXACT = planning.SETTINGS["exact_cycle"]
+weigh = probe(edge_weight)
 Pairs = dict[tuple[int, int], float]
 
 
@@ -32,6 +37,17 @@ def graphs(device, votes: np.ndarray, **settings) -> list[tuple[nx.DiGraph, nx.D
         np.testing.assert_array_equal(paths, expected)
         found.append((whole, kept))
     return found
+
+
+def test_opposite_votes_below_the_least_do_not_count():
+    """Weights of the edge 1 → 0 by votes for and against it."""
+    found = [float(weigh(votes_of(*votes), 0, 0, 1, LEAST)) for votes in ((6, 4), (6, 5), (5, 6), (4, 0))]
+    assert found == [6.0, 1.0, 0.0, 0.0]
+
+
+def votes_of(votes: float, opposite: float) -> wp.array:
+    """Votes (1, 2, 2) of two instances."""
+    return wp.array([[[0.0, votes], [opposite, 0.0]]], dtype=float, device=default_device())
 
 
 def weight(whole: nx.DiGraph, kept: nx.DiGraph) -> float:
