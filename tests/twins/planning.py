@@ -113,7 +113,7 @@ class PlannerHarness:
         self.planner.bound_contours(self.scene, self.worlds.state, self.observation)
         self.planner.count_votes(self.scene, self.observation)
         self.planner.weigh_votes(self.scene, self.observation)
-        return self["votes"]
+        return self.observation.votes.numpy()
 
     def graph(self, votes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Edges and paths of the clutter graph (view, instance, instance) bool: [v, i, j] means j above i."""
