@@ -121,12 +121,12 @@ class EncodedView(Protocol):
 
     @property
     def gt(self) -> list[dict[str, Any]]:
-        """Entry in scene_gt.json: one per instance."""
+        """Entry in scene_gt.json: one per instance, with the keys of README.md; in sets of others `instance_id` may be missing."""
         ...
 
     @property
     def gt_info(self) -> list[dict[str, Any]]:
-        """Entry in scene_gt_info.json: one per instance, in the same order."""
+        """Entry in scene_gt_info.json: one per instance, in the same order; in sets of others `visib_fract` may be NaN."""
         ...
 
     @property

@@ -4,10 +4,13 @@ How to add a format:
 
 1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (`staging.py`) stages and commits for it. A format of views is a
    `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a subpackage of `bop/`: follow `bop/yolo/`. A format of ticks
-   is a subpackage beside it: follow `usd/exporter.py`. Name the subpackage in the import contract of its folder in pyproject.toml.
+   is a subpackage beside it: follow `usd/exporter.py`. Views come in any order, from several processes: for one file a scene, append
+   records, and sort and count them in the commit task, as `bop/coco/` does. Name the subpackage in the import contract of its folder in
+   pyproject.toml.
 2. Add a row to FORMAT_TABLE, and its name to `FORMATS` in configs/schema.py: settings must not import exporters, and a test compares both.
    In a package of your own, name the row (a `Format`) as an entry point instead: see `system/plugins.py`.
-3. Let its test class inherit `ExporterContract` (synpick_warp/testing/exporters.py): determinism, atomic commits, resuming.
+3. Let its test class inherit `ExporterContract` (synpick_warp/testing/exporters.py): determinism, atomic commits, resuming, names of files.
+   Bake once, and run `verify`.
 
 Nothing else in the package lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Tests of
 the table, of conversion and of the command line name what they expect, and `tools/compare/guard_steps.py` what it bakes. Imports no
@@ -17,13 +20,15 @@ format and no NumPy.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from typing import Literal, NamedTuple
 
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Bop
+from synpick_warp.configs.schema import FORMATS, Bop
+from synpick_warp.errors import ConfigError
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
-from synpick_warp.system.plugins import load_plugin, plugin_names
+from synpick_warp.system.plugins import load_plugin
 
 Content = Literal["views", "masks", "poses", "gripper"]
 """Content of a stored data set: images with annotations, their masks, poses of a trajectory, states and commands of the gripper."""
@@ -80,13 +85,13 @@ class Format(NamedTuple):
     exporter: str
     """Class in it."""
     constants: str
-    """Names of the files that all episodes share, as a regular expression."""
+    """Names of the files that all episodes share, as a regular expression; "": none."""
     episode: Callable[[DataLayout, int], str]
     """Names of the files of an episode, as a regular expression."""
     sources: Callable[[Bop], tuple[Content, ...]] | None = None
     """What a stored data set must have for `convert` to make this format of it; None: no data set has it."""
     part: PartFiles | None = None
-    """How its episodes are found; None: the reader reads the format (bop, shards, zarr), and finds them itself."""
+    """How `open` and `stats` find the episodes of a set of this format alone; None: the reader reads the format (bop, shards, zarr)."""
     packages: tuple[str, ...] = ()
     """Packages of this format alone whose versions its output depends on."""
     indexed: str = r"(?!)"
@@ -230,29 +235,41 @@ FORMAT_TABLE: dict[str, Format] = {
 """Format of this package -> its row."""
 
 
-def format_table() -> dict[str, Format]:
-    """Rows of all formats: of this package, then of others (see `system/plugins.py`)."""
-    return FORMAT_TABLE | {name: load_plugin("formats", name) for name in plugin_names("formats")}
+def format_names() -> tuple[str, ...]:
+    """Names of all formats: of this package, then of others."""
+    return tuple(dict.fromkeys((*FORMAT_TABLE, *FORMATS)))
+
+
+def find_format(name: str) -> Format:
+    """Row of a format of this package or of others (see `system/plugins.py`); raises ConfigError if that of others cannot be loaded."""
+    return FORMAT_TABLE.get(name) or load_plugin("formats", name, *Format._fields)
 
 
 def indexed_files(names: Collection[str]) -> re.Pattern[str]:
     """Regular expression of the files that these formats read to write indices over all episodes."""
-    return re.compile("|".join(f"(?:{row.indexed})" for name, row in format_table().items() if name in names) or r"(?!)")
+    return re.compile("|".join(f"(?:{find_format(name).indexed})" for name in format_names() if name in names) or r"(?!)")
 
 
 def convertible() -> tuple[str, ...]:
-    """Names of the formats that `convert` writes."""
-    return tuple(name for name, row in format_table().items() if row.sources is not None)
+    """Names of the formats that `convert` writes; those of other packages without a look at them."""
+    return tuple(name for name in format_names() if name not in FORMAT_TABLE or FORMAT_TABLE[name].sources is not None)
+
+
+def loadable_formats() -> Iterator[Format]:
+    """Rows of all formats but those of packages that cannot be loaded: data sets without these must not suffer."""
+    for name in format_names():
+        with suppress(ConfigError):
+            yield find_format(name)
 
 
 def part_files(cameras: int | None) -> list[PartFiles]:
     """Part files of all formats that have them; `cameras`: their number, None: unknown, and formats with a file per scene are left out."""
-    parts = [row.part for row in format_table().values() if row.part is not None]
+    parts = [row.part for row in loadable_formats() if row.part is not None]
     whole = [part for part in parts if not part.per_scene]
     return whole if cameras is None else whole + [part._replace(cameras=cameras) for part in parts if part.per_scene]
 
 
 def contents_of(name: str, bop: Bop) -> tuple[Content, ...]:
     """Content that a stored data set with these settings must have for `convert` to make a format of it."""
-    sources = format_table()[name].sources
+    sources = find_format(name).sources
     return () if sources is None else sources(bop)

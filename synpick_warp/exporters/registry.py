@@ -1,4 +1,4 @@
-"""Exporters of the formats in `formats.format_table`, and all exporters of a bake as one."""
+"""Exporters of the formats in `formats.FORMAT_TABLE`, and all exporters of a bake as one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles, StoredScene
-from synpick_warp.exporters.formats import format_table
+from synpick_warp.exporters.formats import find_format, format_names
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.views.picks import PickBatch
@@ -26,12 +26,12 @@ def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
         ConfigError: A format's module, or a package that it needs, is not installed.
     """
     wanted = set(names)
-    return tuple(_load(name) for name in format_table() if name in wanted)
+    return tuple(_load(name) for name in format_names() if name in wanted)
 
 
 def _load(name: str) -> type[Exporter]:
     """Import the exporter class of a format; raises ConfigError with a remedy if a package is missing."""
-    row = format_table()[name]
+    row = find_format(name)
     try:
         return getattr(importlib.import_module(row.module, __package__), row.exporter)
     except ImportError as error:

@@ -13,7 +13,7 @@ from synpick_warp.codes import Mode
 from synpick_warp.configs.episodes.manipulation import Move
 from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.formats import format_table
+from synpick_warp.exporters.formats import find_format
 from synpick_warp.factory.order import predict_frames
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import Catalog
@@ -56,7 +56,7 @@ def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> 
     frames = round(predict_length(config, catalog, episodes[:: len(episodes) // SAMPLED + 1]) * len(episodes))
     # Of each camera: views a frame, and pixels of a view.
     cameras = [(1.0 / every, width * height) for (width, height), every in zip(config.rig.sizes, config.rig.every, strict=True)]
-    formats = [format_table()[name] for name in config.bake.formats]
+    formats = [find_format(name) for name in config.bake.formats]
     view, tick = sum(each.view_bytes for each in formats), sum(each.frame_bytes for each in formats)
     size = frames * (tick + view * sum(share * (pixels / FULL_HD) ** SIZE_EXPONENT for share, pixels in cameras))
     seconds = frames * sum(share * (VIEW_TIME[0] + VIEW_TIME[1] * pixels) for share, pixels in cameras)

@@ -6,8 +6,8 @@
     [project.entry-points."synpick_warp.grippers"]
     triangle = "my_package.triangle"          # a module with make_head(gripper) and BEHAVIOR
 
-Names are known without an import of the package; a module is imported when its name is first used. A file of its own, since settings,
-scenes, stages and exporters all read it.
+Names are known without an import of the package; a module is imported when its name is first used. Names of this package stay its own. A
+file of its own, since settings, scenes, stages and exporters all read it.
 """
 
 from __future__ import annotations
@@ -22,20 +22,27 @@ Group = Literal["formats", "grippers"]
 
 
 @functools.cache
-def plugin_names(group: Group) -> tuple[str, ...]:
-    """Names of a group's plug-ins, sorted."""
-    return tuple(sorted(metadata.entry_points(group=f"synpick_warp.{group}").names))
+def plugin_names(group: Group, own: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of a group's plug-ins, sorted, without those of this package."""
+    return tuple(sorted(metadata.entry_points(group=f"synpick_warp.{group}").names - set(own)))
 
 
 @functools.cache
-def load_plugin(group: Group, name: str) -> Any:
-    """Import a plug-in.
+def load_plugin(group: Group, name: str, *members: str) -> Any:
+    """Import a plug-in, which must have these members.
 
     Raises:
-        ConfigError: Its package cannot be imported.
+        ConfigError: Its package cannot be imported, two packages have one of this name, or it is something else.
     """
+    known = f'"{name}" of the entry points synpick_warp.{group}'
+    entries = metadata.entry_points(group=f"synpick_warp.{group}", name=name)
+    if len(entries) != 1:
+        raise ConfigError(f"{known} is in {len(entries)} packages; remove all but one")
+    (entry,) = entries
     try:
-        (entry,) = metadata.entry_points(group=f"synpick_warp.{group}", name=name)
-        return entry.load()
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f'"{name}" of the entry points synpick_warp.{group} cannot be loaded: {error}') from None
+        plugin = entry.load()
+    except Exception as error:  # Whatever the code of others raises.
+        raise ConfigError(f"{known} cannot be loaded: {type(error).__name__}: {error}") from None
+    if missing := [member for member in members if not hasattr(plugin, member)]:
+        raise ConfigError(f"{known} is {entry.value}, which has no {' and no '.join(missing)}; see synpick_warp/system/plugins.py")
+    return plugin

@@ -3,7 +3,8 @@
     from synpick_warp.testing.exporters import ExporterContract
 
     class TestBoxes(ExporterContract):      # a class of a pytest file
-        exporter_class = BoxesExporter
+        exporter_class, row = BoxesExporter, FORMAT
 
-Needs pytest. Nothing in synpick_warp imports this package.
+Needs pytest. Writer processes import your module: install your package, or put its folder on PYTHONPATH, not on sys.path alone. Nothing
+in synpick_warp imports this package.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,9 +16,11 @@ import pytest
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.formats import Format
 from synpick_warp.exporters.picks import PicksExporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.png import encode_png
@@ -155,9 +158,11 @@ def expand(out: Path, paths: list[Path]) -> set[str]:
 
 
 class ExporterContract:
-    """Inherit, and set `exporter_class`."""
+    """Inherit, and set `exporter_class` and `row`."""
 
     exporter_class: ClassVar[type[Exporter]]
+    row: ClassVar[Format | None] = None
+    """Row of the format, whose regular expressions must match the files; None: not compared."""
 
     @classmethod
     def config(cls) -> Config:
@@ -191,6 +196,11 @@ class ExporterContract:
                 assert files == sorted(files) != []
             index_files = expand(tmp_path, finish(exporter))
             parts = [constants, expand(tmp_path, first), expand(tmp_path, second), index_files]
+        if self.row is not None:
+            layout = DataLayout.of(self.config())
+            patterns = (self.row.constants, self.row.episode(layout, 0), self.row.episode(layout, 2))
+            for pattern, names in zip(patterns, parts, strict=False):
+                assert [name for name in names if not re.fullmatch(pattern, name)] == [], pattern
         assert set().union(*parts) == set(reference)
         assert sum(map(len, parts)) == len(reference)
 

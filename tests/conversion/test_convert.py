@@ -354,6 +354,31 @@ def test_a_package_of_others_bakes_its_format_with_its_gripper(tmp_path):
     assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
 
 
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        (None, "cannot be loaded: ModuleNotFoundError"),
+        ("FORMAT =", "cannot be loaded: SyntaxError"),
+        ("class FORMAT: ...", "is broken_extras:FORMAT, which has no module"),
+    ],
+)
+def test_a_package_of_others_that_is_broken_harms_only_its_own_format(tmp_path, sets, module, said):
+    folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
+    folder.mkdir(parents=True)
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-extras\nVersion: 1.0\n")
+    (folder / "entry_points.txt").write_text("[synpick_warp.formats]\nbroken = broken_extras:FORMAT\nbop = broken_extras:FORMAT\n")
+    if module is not None:
+        (folder.parent / "broken_extras.py").write_text(module)
+    environment = checkout_environment()
+    environment["PYTHONPATH"] += f":{folder.parent}"
+    for arguments, code in ((("verify", sets["source"]), 0), (("bake", "--config", "smoke", "--formats", "broken", "--dry-run"), 2)):
+        command = [sys.executable, "-m", "synpick_warp", *map(str, arguments)]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 class TestFormatOfOthers(ExporterContract):
     """As a package of others tests its format: `synpick_warp.testing`."""
 
@@ -363,7 +388,8 @@ class TestFormatOfOthers(ExporterContract):
         with pytest.MonkeyPatch.context() as patch:
             patch.syspath_prepend(PLUGINS)
             patch.setenv("PYTHONPATH", str(PLUGINS), prepend=os.pathsep)
-            cls.exporter_class = importlib.import_module("synpick_extras.boxes").BoxesExporter
+            module = importlib.import_module("synpick_extras.boxes")
+            cls.exporter_class, cls.row = module.BoxesExporter, module.FORMAT
             yield
 
 

@@ -135,7 +135,7 @@ def test_all_that_writers_produce_is_described():
 
 
 class TestPicksContract(ExporterContract):
-    exporter_class = PicksExporter
+    exporter_class, row = PicksExporter, FORMAT_TABLE["picks"]
 
 
 def test_tables_hold_the_trials_in_order_with_units(tmp_path):

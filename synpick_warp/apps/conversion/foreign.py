@@ -32,7 +32,7 @@ from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS
-from synpick_warp.exporters.formats import contents_of, convertible
+from synpick_warp.exporters.formats import FORMAT_TABLE, contents_of, convertible
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL, Buffer, check_output_folder, output_error, output_errors, write_atomically
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE
@@ -224,7 +224,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
     if len(found.splits) > 1:
         raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
     bop = dataclasses.replace(load_config().bop, coco=False)
-    contents = {name: set(contents_of(name, bop)) for name in convertible()}
+    contents = {name: set(contents_of(name, bop)) for name in convertible() if name in FORMAT_TABLE or name in formats}
     for name in formats:
         if name not in contents:
             raise ConfigError(f"--to names {name}; allowed: {', '.join(each for each in contents if contents[each] <= _IMAGES)}")

@@ -15,7 +15,7 @@ from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.exporters.formats import Content, contents_of, convertible, format_table
+from synpick_warp.exporters.formats import Content, contents_of, convertible, find_format, format_names
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
@@ -102,8 +102,8 @@ def check_formats(names: Sequence[str], layout: str, present: Collection[str], f
     if layout != CLASSIC:
         raise ConfigError(f'{folder} has bop.layout = "{layout}", which convert does not read; bake the other formats')
     for name in names:
-        if name not in convertible():
-            why = f"; no other format has the physics of {name}" if name in format_table() else ""
+        if name not in convertible() or find_format(name).sources is None:
+            why = f"; no other format has the physics of {name}" if name in format_names() else ""
             raise ConfigError(f"--to names {name}; allowed: {', '.join(convertible())}{why}")
         if name in present:
             raise ConfigError(f"--to names {name}, which {folder} has already; copy the folder")

@@ -15,7 +15,7 @@ from synpick_warp.system.plugins import plugin_names
 
 SUCTION1 = "suction1"
 SUCTION_ARRAY = "suction_array"
-GRIPPERS = (SUCTION1, SUCTION_ARRAY, *plugin_names("grippers"))
+GRIPPERS = (SUCTION1, SUCTION_ARRAY, *plugin_names("grippers", (SUCTION1, SUCTION_ARRAY)))
 """Kinds of gripper: of this package, and of others."""
 EACH = "each"
 COMMON = "common"

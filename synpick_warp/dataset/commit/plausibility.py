@@ -1,7 +1,7 @@
 """Plausibility of a data set's own records: names in checksum lists, and numbers of frames.
 
 A list in a folder that somebody else made could name `.git/hooks/post-checkout` or `Makefile`; files are copied by lists, so a list is
-compared with the names in `format_table` first: only those that its formats write. They follow from the settings alone.
+compared with the names in FORMAT_TABLE first: only those that its formats write. They follow from the settings alone.
 
 A record states how many frames an episode has, and may be edited or damaged; arrays, loops and tasks follow from the number. So it is
 compared with the sizes of the files that are there before anything is made of it.
@@ -20,7 +20,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MAX_SHOWN, entry_advice
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.formats import format_table, part_files
+from synpick_warp.exporters.formats import find_format, format_names, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.system.inputs.files import describe_bytes
 
@@ -35,7 +35,7 @@ _TIME = 0.125
 @functools.lru_cache(maxsize=4)
 def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
     """Regular expression of the file names that the formats write in an entry: of an episode, or the constants."""
-    formats = [format_table()[name] for name in dict.fromkeys(layout.formats)]
+    formats = [find_format(name) for name in dict.fromkeys(layout.formats)]
     names = (row.constants if entry == CONSTANTS else row.episode(layout, int(entry.name)) for row in formats)
     return re.compile("|".join(dict.fromkeys(names)))
 
@@ -73,9 +73,9 @@ def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -
     """
     strays = []
     known = set(episodes)
-    for name, row in format_table().items():
-        part = row.part
-        if part is not None and part.joined and name in layout.formats and (folder / part.folder).is_dir():
+    for name in (name for name in format_names() if name in layout.formats):
+        part = find_format(name).part
+        if part is not None and part.joined and (folder / part.folder).is_dir():
             count = layout.cameras if part.per_scene else 1
             parts = {f"{number:06d}{part.suffix}" for episode in known for number in range(count * episode, count * (episode + 1))}
             strays += sorted(f"{part.folder}/{entry.name}" for entry in os.scandir(folder / part.folder) if entry.name not in parts)

@@ -18,7 +18,7 @@ HEADS: Mapping[str, Callable[[Gripper], Head]] = {SUCTION1: suction1.make_head, 
 
 def make_head(gripper: Gripper) -> Head:
     """Build the head of the gripper that the settings name."""
-    build = HEADS.get(gripper.kind) or load_plugin("grippers", gripper.kind).make_head
+    build = HEADS.get(gripper.kind) or load_plugin("grippers", gripper.kind, "make_head", "BEHAVIOR").make_head
     return build(gripper)
 
 

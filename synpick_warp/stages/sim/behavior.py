@@ -57,4 +57,4 @@ BEHAVIORS: Mapping[str, Behavior] = {
 
 def behavior_of(kind: str) -> Behavior:
     """Behaviour of a kind of gripper, of this package or of a plug-in (`system/plugins.py`)."""
-    return BEHAVIORS.get(kind) or load_plugin("grippers", kind).BEHAVIOR
+    return BEHAVIORS.get(kind) or load_plugin("grippers", kind, "make_head", "BEHAVIOR").BEHAVIOR

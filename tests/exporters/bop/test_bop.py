@@ -29,6 +29,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.shared.models import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.files import open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
@@ -233,7 +234,7 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
 
 
 class TestContract(ExporterContract):
-    exporter_class = BopExporter
+    exporter_class, row = BopExporter, FORMAT_TABLE["bop"]
 
     @classmethod
     def config(cls) -> Config:

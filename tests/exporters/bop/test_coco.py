@@ -46,7 +46,7 @@ LENSES = cameras()
 
 
 class TestCocoContract(ExporterContract):
-    exporter_class = CocoExporter
+    exporter_class, row = CocoExporter, FORMAT_TABLE["coco"]
 
 
 def read(out: Path, split: str = "train_pbr") -> COCO:
@@ -206,7 +206,7 @@ SIZE = np.array([LENSES[0].width, LENSES[0].height])
 
 
 class TestYoloContract(ExporterContract):
-    exporter_class = YoloExporter
+    exporter_class, row = YoloExporter, FORMAT_TABLE["yolo"]
 
 
 def rows(file: Path) -> list[tuple[int, np.ndarray]]:

@@ -25,6 +25,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import tar_files
 from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.testing.box_views import batches, cameras, config, ends
 from synpick_warp.testing.exporters import ExporterContract, export, export_context, exporting, finish, without_objects
@@ -38,7 +39,7 @@ ENTRIES = ("rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "ma
 
 
 class TestShardsContract(ExporterContract):
-    exporter_class = ShardsExporter
+    exporter_class, row = ShardsExporter, FORMAT_TABLE["shards"]
 
     @classmethod
     def config(cls) -> Config:

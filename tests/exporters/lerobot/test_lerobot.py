@@ -44,7 +44,7 @@ LENSES = box_views.cameras()
 
 
 class TestLerobotContract(ExporterContract):
-    exporter_class = LerobotExporter
+    exporter_class, row = LerobotExporter, FORMAT_TABLE["lerobot"]
 
 
 def write(out: Path, settings: Config, episodes: tuple[int, ...] = EPISODES, processes: int = 0) -> Path:

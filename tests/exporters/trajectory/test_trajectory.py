@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import synpick_warp
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory import arrays as tables
 from synpick_warp.exporters.trajectory.episode import make_attempt_arrays
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
@@ -40,7 +41,7 @@ INSTANCES = 4
 
 
 class TestContract(ExporterContract):
-    exporter_class = TrajectoryExporter
+    exporter_class, row = TrajectoryExporter, FORMAT_TABLE["zarr"]
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, U
 from synpick_warp.configs.cell.bins import BinRow, Bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import new_asset, save_layer
@@ -30,7 +31,7 @@ CATALOG = usd_sets.textured(small_worlds.catalog())
 
 
 class TestContract(ExporterContract):
-    exporter_class = UsdExporter
+    exporter_class, row = UsdExporter, FORMAT_TABLE["usd"]
 
 
 @pytest.fixture(scope="module")
