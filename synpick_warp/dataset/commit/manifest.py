@@ -36,7 +36,7 @@ from synpick_warp.configs.files.table_lists import given_values
 from synpick_warp.configs.schema import CLASSIC, COLUMN, WITHIN, Config
 from synpick_warp.dataset.records import Entry, IndicesEntry, Manifest, RecordedEpisode, read_record
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.formats import find_format
+from synpick_warp.exporters.formats import find_format, format_names
 from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
 from synpick_warp.system.inputs.files import check_regular_file, read_file
@@ -149,7 +149,7 @@ class _Format(msgspec.Struct):
 def make_manifest(config: Config) -> dict[str, Any]:
     """Build the manifest of a data set with these settings, in types of JSON."""
     settings = fixed_settings(config)
-    rows = [find_format(name) for name in sorted(set(config.bake.formats))]
+    rows = [find_format(name) for name in sorted(set(config.bake.formats).intersection(format_names()))]
     packages = (*PACKAGES, *(name for row in rows for name in row.packages))
     content = {
         "format": FORMAT,
