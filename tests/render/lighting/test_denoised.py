@@ -356,6 +356,13 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     np.testing.assert_allclose((value[ground] < middle).sum(), (ground & (inside > 0.0)).sum(), rtol=0.12)
 
 
+def test_a_map_turned_by_its_yaw_lights_sides_as_one_that_is_painted_so(device):
+    objects = [(box(0.2, 0.16, 0.12), surface(HALF), (0.0, 0.0, 0.0, *np.array([0.3, 0.2, 0.1, 0.9]) / np.sqrt(0.95)))]
+    turned = denoise_objects(device, *objects, lights=(sun((1.0, 0.5, 0.5)),), light_yaw=np.pi / 2).radiance[0]
+    painted = denoise_objects(device, *objects, lights=(sun((-0.5, 1.0, 0.5)),)).radiance[0]
+    assert np.abs(turned - painted).mean() < 0.02 * painted.mean()
+
+
 @pytest.mark.parametrize("turn", [0.0, 0.15])
 def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
     """A sunlit sheet floats 16 px above its shadow. Shadowed pixels beside it: some have no shadow ray on their surface near."""
