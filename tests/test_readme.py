@@ -122,7 +122,7 @@ def test_paths_in_documents_exist(document):
 
 def test_the_levels_of_contributing_are_those_of_the_import_contract():
     layers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
-    shown = re.search(r"^    cli .*?(?=\n\n)", (ROOT / ".github" / "CONTRIBUTING.md").read_text(), re.DOTALL | re.MULTILINE)
+    shown = re.search(r"^    \(cli .*?(?=\n\n)", (ROOT / ".github" / "CONTRIBUTING.md").read_text(), re.DOTALL | re.MULTILINE)
     assert shown
     levels = [re.findall(r"\w+", level) for level in shown[0].split("►")]
     assert levels == [re.findall(r"\w+", layer) for layer in layers]
