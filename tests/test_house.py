@@ -86,7 +86,7 @@ def test_every_package_is_found():
 
 
 def test_every_room_keeps_its_budget_of_lines():
-    """No room grows, and what a cut frees does not come back unseen: budgets follow at once."""
+    """No room exceeds its budget, and a budget follows each cut, so that freed lines cannot be used unnoticed."""
     budget: dict[str, int] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["synpick-warp"]["lines"]
     lines = dict.fromkeys(budget, 0)
     for path in sources():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 DEFAULT_NAME = "synpick-data"
 """Folder of a bake without --out."""
 OWN_SUFFIXES = (".png", ".jpg", ".jpeg", ".html", ".htm", ".csv")
-"""Suffixes of pictures, pages and tables, which no format has in the data set's own folder: there, outputs may have them."""
+"""File suffixes of pictures, pages and tables. No format writes them directly into the data set's folder, so outputs may."""
 
 
 def is_data_set(folder: Path | str) -> bool:
@@ -32,7 +32,7 @@ def is_data_set(folder: Path | str) -> bool:
 
 
 def _has(path: str, kind: Callable[[int], bool]) -> bool:
-    """Whether there is an entry at the path, links not followed, whose mode is of this kind."""
+    """Whether the path exists and has this file type; symbolic links are not followed."""
     try:
         return kind(os.lstat(path).st_mode)
     except (OSError, ValueError):
@@ -57,7 +57,7 @@ def find_data_set(named: Path | None, usage: str) -> Path:
 
 
 _fetched: dict[Path, tuple[str, TemporaryDirectory[str]]] = {}
-"""Temporary copies of data sets in object stores: folder -> URL, and what deletes it."""
+"""Temporary copies of data sets in object stores: folder -> URL and its finalizer."""
 
 
 def _fetch(url: str) -> Path:
@@ -80,7 +80,7 @@ def drop_fetched() -> None:
 
 
 def name_fetched(text: str) -> str:
-    """Message with the URLs of data sets in place of their copies' folders."""
+    """Replace folders of temporary copies in a message by the URLs of their data sets."""
     for folder, (url, _) in _fetched.items():
         text = text.replace(str(folder), url)
     return text
@@ -125,7 +125,7 @@ def check_output_file(
 
 
 def check_new_folder(folder: Path, option: str) -> None:
-    """Raise OutputError unless a folder is new or empty, and below a folder; whether it can be written is not tested."""
+    """Check that an output folder is new or empty and that its parent exists; raises OutputError. Permissions are not tested."""
     try:
         if os.path.lexists(folder) and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputError(f"{option} is {folder}; allowed: a new or an empty folder")

@@ -16,21 +16,21 @@ from synpick_warp.system.inputs.urls import check_engine, store_url
 EXIT_INCOMPLETE = 1
 """Exit code if a data set is incomplete or damaged."""
 MAX_DIGITS = 100
-"""Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
+"""Maximum number of digits of an integer option; its range is checked by the setting."""
 MAX_THREADS = 1024
 """Upper bound of options such as --threads, in processes or threads."""
 MAX_WORKERS, MAX_PRICE = 100_000, 1e6
 """Upper bounds of --workers and --price."""
 MAX_LINE = 2000
-"""Longest message [characters]: names of files and keys may be of any length."""
+"""Length to which messages are truncated [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
 _SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
 _RESOLUTION = re.compile(r"([0-9]{1,9})[xX]([0-9]{1,9})")
 
 
 def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
-    """Parse the value of an integer option: decimal digits only, since what is rounded or read in another base is a guess. Raises
-    ConfigError if the text has another form."""
+    """Parse an integer option, written in decimal digits; raises ConfigError for any other form, such as 1e3 or 0x10, instead of
+    converting it."""
     text = tokens[0].value
     if _WHOLE.fullmatch(text) is None:
         option = tokens[0].keyword or "the number"
@@ -39,7 +39,7 @@ def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
 
 
 def parse_count(kind: Any, tokens: Sequence[Token]) -> int:
-    """Parse the value of a count option: a whole number, or `auto`, which is 0. Errors as in `parse_whole_number`."""
+    """Parse a count option: an integer, or `auto`, which is 0. Errors as in `parse_whole_number`."""
     return 0 if tokens[0].value == "auto" else parse_whole_number(kind, tokens)
 
 
@@ -60,13 +60,13 @@ PaperOption = Annotated[
 
 
 def one_line(text: str) -> str:
-    """Join the lines of a message, escape what does not print, such as terminal sequences in file names, and truncate."""
+    """Format a message as one line: lines joined, unprintable characters escaped (terminal sequences in file names), truncated."""
     line = escape(" ".join(text.split()))
     return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 1]}…"
 
 
 def describe_misuse(error: CycloptsError) -> str:
-    """Message of a command line that does not parse; names the word that is too many, the option that is missing, or has no value."""
+    """Error message for a command line that does not parse: names the unexpected word, or the option that is missing or lacks a value."""
     command, words = " ".join(error.command_chain or ()), list(error.unused_tokens or [])
     extra = f"{format_value(words[0])} is neither an option nor the value of one" if words else ""
     if isinstance(error, UnusedCliTokensError) and words:
@@ -128,7 +128,7 @@ def check_engine_options(engine: str | None, workers: int, price: float, out: Pa
 
 
 def check_store_options(out: Path | None, *, claim: bool, shard: str | None, profile: bool) -> None:
-    """Raise ConfigError if options do not go with a folder, or with a prefix in an object store."""
+    """Check that options fit the output, a folder or a prefix in an object store; raises ConfigError."""
     url = store_url(out)
     if claim and url is None:
         raise ConfigError("--claim shares out the episodes of a prefix in an object store; name one by --out, as s3://bucket/prefix")
@@ -188,7 +188,7 @@ _NO_THREAD = "can't start new thread"
 
 
 def describe_limit(error: BaseException) -> str | None:
-    """Say which resource an error, or one that it follows from, is about, and what to do; None: it is about none."""
+    """Describe the resource that ran out, according to an error or its causes, and the remedy; None: none did."""
     for each in _chain(error):
         text = " ".join(str(each).split())
         low = text.lower()

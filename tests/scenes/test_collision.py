@@ -300,7 +300,7 @@ def ladle(rng: np.random.Generator) -> np.ndarray:
 
 
 def wedge(rng: np.random.Generator) -> np.ndarray:
-    """A long body that tapers to an edge, with rough sides."""
+    """Elongated wedge with rough sides."""
     width, edge = rng.uniform(0.3, 1.0, 2), rng.uniform(0.001, 0.05)
     corners = [(x * width[0], y * width[1], 0.0) for x in (-1, 1) for y in (-1, 1)]
     corners += [(x * edge, y * rng.uniform(0.2, 1.0) * width[1], 3.0) for x in (-1, 1) for y in (-1, 1)]

@@ -49,7 +49,7 @@ def picture() -> bytes:
 
 
 def read(name: str, content: bytes, more: dict[str, bytes], check: Callable[[Path], None], error: type[SynpickError]) -> None:
-    """Write the files into a folder, check what is read of one, and that an error is one line, nothing is written and time is short."""
+    """Load files from a folder and check one of them; an error must be one line, write nothing, and come within SECONDS."""
     with tempfile.TemporaryDirectory() as parent:
         folder = Path(parent) / "models"
         folder.mkdir()

@@ -172,7 +172,7 @@ OUTPUTS = {
     ],
 )
 def test_outputs_are_compared_by_pixels_or_values(mode, name, changes, expected):
-    """Share of values that differ [%], mean and largest difference, and share beyond the tolerance [%]; in either order."""
+    """Percentage of differing values, mean and maximum difference, and percentage beyond the tolerance; symmetric in both inputs."""
     a, b = OUTPUTS[name], OUTPUTS[name].copy()
     for index, value in changes.items():
         b[index] = value

@@ -25,7 +25,7 @@ from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import CORNERS, AttemptState, SealState, WorldState, world_sizes
 
 GROUPS = ("scene", "state", "attempts", "seals", "observation", "plan", "physics")
-"""Groups of arrays that stages take."""
+"""Attributes that `run` passes to a stage by parameter name."""
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
 BIN = BinSizes("box", "bin", Tote(), outer=(0.55, 0.35), floor=(0.8, 0.4), opening=(0.5, 0.3), height=0.2, base=-0.005)
@@ -79,14 +79,14 @@ def cup_places(cups: Sequence[tuple[float, float]], device: Any, tcp_offset: flo
 
 @dataclass
 class KernelWorlds:
-    """State and constants of worlds, which stages take by GROUPS; arrays are read and written by name."""
+    """State and constants of worlds for running single stages; arrays are read and written by name."""
 
     device: Any
     worlds: int
     objects: int = 1
     """Number of single objects of volume 1 m³ and radius 1 m, where `volume`, `compound` and `radius` do not say otherwise."""
     instances: int = 0
-    """Of a world; 0: as many as objects. `single_slots` are as many as instances unless given."""
+    """Instance capacity of a world; 0: the number of objects. `single_slots` defaults to the number of instances."""
     single_slots: int | None = None
     compound_slots: int = 0
     volume: Any = None
@@ -100,9 +100,9 @@ class KernelWorlds:
     places: Bins = field(default_factory=Bins)
     randomize: Randomize = field(default_factory=Randomize)
     distractors: int = 0
-    """The last of the objects, without labels."""
+    """Number of distractors: the last objects, without labels."""
     counts: Sequence[tuple[int, int]] = ()
-    """Least and largest number of each object; empty: not set."""
+    """Minimum and maximum number of each object; empty: drawn by volume."""
     cups: Sequence[tuple[float, float]] = ((0.0, 0.0),)
     """Places of the cups in the plane of the TCP [m]."""
     parts: Sequence[tuple[int, int, bool]] = tuple((shape, 0, True) for shape in GUIDES)
@@ -202,7 +202,7 @@ class KernelWorlds:
         return self.array(name).numpy()
 
     def row(self, *names: str, world: int = 0) -> list[Any]:
-        """What arrays have of a world, as Python numbers and lists."""
+        """Rows of arrays for one world, as Python numbers and lists."""
         return [self[name][world].tolist() for name in names]
 
     def put(self, **values: Any) -> None:

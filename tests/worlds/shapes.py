@@ -140,5 +140,5 @@ def random_pose(rng: np.random.Generator, low: Any = (-0.1, -0.1, -0.1), high: A
 
 
 def random_pile(rng: np.random.Generator, meshes: int, count: int, low: Any, high: Any) -> list[tuple[int, tuple[float, ...]]]:
-    """Objects (index of a mesh, pose) between two corners [m]."""
+    """Random objects, as mesh index and pose, in an axis-aligned box given by two corners [m]."""
     return [(int(rng.integers(meshes)), pose) for pose in (random_pose(rng, low, high) for _ in range(count))]

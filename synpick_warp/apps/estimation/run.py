@@ -34,23 +34,23 @@ from synpick_warp.system.processes.isolation import Failure, run_isolated
 from synpick_warp.system.progress import Report, ignore_progress
 
 SPACING = 0.003
-"""Grid that both clouds are thinned to [m]: some 1,000 points on a visible side of a can."""
+"""Voxel size for downsampling both point clouds [m]: some 1,000 points on the visible side of a can."""
 SAMPLES = 20_000
-"""Points that are sampled on a model before thinning: several in each cell of the grid, up to 0.1 m² of surface."""
+"""Number of points sampled on a model before downsampling: several per voxel, up to 0.1 m² of surface."""
 NEIGHBORS = 10
 """Points from which small_gicp estimates a covariance: its default."""
 MAX_DISTANCE = 0.03
-"""Largest distance of corresponding points [m]: the 2 cm that a start is off, and what 15° add at 4 cm from the origin."""
+"""Maximum correspondence distance [m]: the 2 cm offset of disturbed starts, plus what 15° add at 4 cm from the origin."""
 ITERATIONS = 50
 EPSILON = 1e-5
 """Convergence: change of the translation [m], and of the rotation [rad]."""
 MIN_POINTS = 20
-"""Observed points below which there is no estimate: covariances of NEIGHBORS points need more than that."""
+"""Minimum number of observed points for an estimate: covariances of NEIGHBORS points need more."""
 DEPTH_OF_CENTER = 0.5
 """Distance of a start's centre behind the centroid of the observed points, in radii of the model: of a sphere's visible half."""
 _MILLIMETRE = 1e-3
 _METALLIC, _ROUGHNESS = 0.0, 0.5
-"""Of materials, which PLY files do not state; colours are compared, not highlights."""
+"""Material of PLY models, which state none; only base colours are compared."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class EstimationOptions:
     """Key of DEPTHS."""
     min_visibility: float = 0.1
     seed: int = 0
-    """Of disturbed starts."""
+    """Seed of the disturbed initial poses."""
     threads: int = field(default_factory=count_cores)
 
 
@@ -218,7 +218,7 @@ def read_scenes(
 
 
 def ask(scene: EstimationScene, method: str, min_visibility: float, objects: Sequence[frozenset[int] | None]) -> EstimationScene:
-    """Select the instances to estimate in each frame, by a method of METHODS.
+    """Select the instances whose poses a method of METHODS estimates in each frame.
 
     Tracks are asked in all frames from the first one on in which the instance is visible enough, as long as the image has it. Other methods
     are asked where it is visible enough, and of an object that counts: `objects` are the obj_ids of each planned frame, None: all.

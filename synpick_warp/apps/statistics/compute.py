@@ -41,7 +41,7 @@ VIEWS_PER_PROCESS = 5000
 REST_EPISODES = 256
 """Episodes whose step log is read, spread evenly: some 2 MB each."""
 _DEPTH = 2
-"""Unanswered tasks per process: one is worked on, the other waits."""
+"""Tasks in flight per process: one runs, the other is queued."""
 _KIBIBYTE = 1024
 """Unit of `ru_maxrss` on Linux."""
 
@@ -57,13 +57,13 @@ class SceneTask(NamedTuple):
 
 @dataclass
 class Collected:
-    """All counts of a data set."""
+    """Counts of a data set."""
 
     counts: Counts = field(default_factory=Counts)
     views: int = 0
     """Views that were counted."""
     missing: list[str] = field(default_factory=list)
-    """What the data set does not have, a sentence each."""
+    """Sentences about data that the data set lacks."""
     memory: int = 0
     """Peak memory of all processes together [B]."""
 
@@ -176,12 +176,12 @@ def _count(data_set: DataSet, tasks: Iterator[SceneTask], processes: int, report
 
 
 def _peak_memory() -> int:
-    """Peak resident memory of this process [B]."""
+    """Peak resident set size of this process [B]."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _KIBIBYTE
 
 
 class _Counter:
-    """State of a process: a data set, and what the process has counted of it."""
+    """State of a worker process: a data set and the counts so far."""
 
     def __init__(self, data_set: DataSet | Path) -> None:
         self._data_set = DataSet(data_set) if isinstance(data_set, Path) else data_set
@@ -193,14 +193,14 @@ class _Counter:
         return task.frames
 
     def finish(self) -> tuple[Counts, int]:
-        """Task: return all that was counted, and the peak memory of the process."""
+        """Task: return the accumulated counts and the peak memory of the process."""
         return self._counts, _peak_memory()
 
 
 OTHER_OBJECTS = "the objects are not those of the paper, so their distributions are not compared"
-"""What is missing of data sets of other objects."""
+"""Note for data sets with objects other than the paper's."""
 NOT_BAKED = "this data set is from another source: its scenes count as episodes, without modes, endings, attempts and times"
-"""What is missing of data sets of other programs."""
+"""Note for data sets that other programs have written."""
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""
 DEPTH_QUANTILES = (0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
@@ -257,7 +257,7 @@ def assemble(data_set: DataSet, collected: Collected) -> figures.Statistics:
 
 
 def _group(counts: Counts, split: str, mode: str, groups: Collection[Group]) -> figures.GroupStatistics:
-    """Statistics of some groups together, under the name of a split and a mode."""
+    """Aggregated statistics of several groups, labelled with a split and a mode."""
     parts = episode_figures(counts, groups), annotation_figures(counts, groups), timeline_figures(counts, groups)
     return figures.GroupStatistics(split, mode, *parts)
 
@@ -350,7 +350,7 @@ def light_figures(counts: Counts) -> figures.LightFigures | None:
 
 
 def look_figures(counts: Counts) -> tuple[figures.LookStatistics, ...]:
-    """What was drawn of each part and parameter, sorted; none: looks are not randomized."""
+    """Randomized appearance parameters by part, sorted; empty: appearance is not randomized."""
     drawn: dict[tuple[str, str], dict[float, int]] = {}
     for (part, parameter, value), count in counts.of("looks").items():
         drawn.setdefault((part, parameter), {})[value] = count
@@ -403,7 +403,7 @@ _Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class PaperGroup(msgspec.Struct, frozen=True):
-    """Row of the paper's table, of a split and mode."""
+    """Statistics that the paper publishes for one split and mode."""
 
     split: str
     mode: str
@@ -421,7 +421,7 @@ class PaperGroup(msgspec.Struct, frozen=True):
 
 
 class Paper(msgspec.Struct, frozen=True):
-    """Statistics that the paper publishes of its data set."""
+    """Statistics of the SynPick data set, as published."""
 
     cameras: int
     total_views: int
@@ -440,7 +440,7 @@ def read_paper() -> Paper:
 
 
 def compare(groups: Sequence[GroupStatistics], kinds: Mapping[str, str], names: Mapping[int, str], cameras: int) -> tuple[Comparison, ...]:
-    """Compare every group that the paper has, too, with the paper's numbers. `kinds`: split -> train, val or test; `names`: by obj_id."""
+    """Compare the groups that the paper also reports with its numbers. `kinds`: split -> train, val or test; `names`: by obj_id."""
     paper, rows = read_paper(), []
     for group in groups:
         ours, sequences = group.annotations, group.episodes.episodes
@@ -456,7 +456,7 @@ def compare(groups: Sequence[GroupStatistics], kinds: Mapping[str, str], names: 
 
 
 def _numbers(group: PaperGroup, cameras: int) -> Numbers:
-    """Numbers of a row of the paper, to stand beside ours; frames are those of a sequence."""
+    """Published figures of a split and mode in the layout of our statistics; frames are counted per sequence."""
     frames = group.views / (group.sequences * cameras)
     return Numbers(group.sequences, group.views, frames, group.visibility, group.instances / group.views)
 

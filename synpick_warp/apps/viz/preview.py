@@ -43,13 +43,13 @@ _PANEL_WIDTH = 480
 _MAX_PANEL_HEIGHT = 1920
 """Maximum height of one image on the sheet [px]: tall images become narrower."""
 MAX_VIEWS = 200
-"""Maximum number of views on a sheet: some 76,000 rows of pixels."""
+"""Maximum number of views on a sheet, some 76,000 pixels high."""
 _CAPTION = 20
 """Height of the caption above an image [px]."""
 _GAP = 4
 """Gap between images [px]."""
 _WIDEST_ARROW = 4
-"""Force at which an arrow of the support graph becomes no wider [N]."""
+"""Force at which the width of an arrow in the support graph saturates [N]."""
 _MIN_LEGEND = 120
 """Minimum height of a row without its caption [px], for the legend of low images."""
 
@@ -80,7 +80,7 @@ class _View:
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
-    """Draw views of a data set, one per row, at most so many, spread over all its splits, cameras, scenes and time, and write a PNG or JPEG
+    """Draw up to `views` views of a data set, one per row, spread over all its splits, cameras, scenes and time, and write a PNG or JPEG
     file, whose folder is created. Raises DatasetError if the folder is not a data set, or a file is missing or damaged, and OutputError if
     the image cannot be written, or has more than MAX_VIEWS views."""
     check_picture_name(out)
@@ -108,7 +108,7 @@ class Baked(NamedTuple):
     """obj_id -> name of an object."""
 
     def facts(self, scene: SheetScene, frame: int, camera: Mapping[str, Any]) -> list[str]:
-        """Facts on a view for its legend: scene, episode, mode, time, light."""
+        """Legend entries of a view: scene, episode, mode, time, light."""
         lines = [f"{scene.folder.parent.name}/{scene.folder.name}{scene.sensor.replace('_', ' ', 1)}, image {frame}"]
         if self.config is not None:
             episode, physics = DataLayout.of(self.config).scene_episode(int(scene.folder.name)), self.config.physics
@@ -258,7 +258,7 @@ def _darkened_grey(color: Image) -> Image:
 
 
 def _placeholder(color: Image, text: str) -> Image:
-    """Picture of a text on the darkened grey image, where a panel has no picture."""
+    """Placeholder for a panel without data: a text on the darkened grey image."""
     drawn = _darkened_grey(color)
     put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
@@ -311,7 +311,7 @@ LABEL = 0.42
 _PAD = 2
 """Margin of a label's text [px]."""
 _STEP = 6
-"""Distance of the places that are tried where none in or around the box is free [px]."""
+"""Grid spacing of further label positions, tried if none in or around the box is free [px]."""
 _TEXT = 0.42
 """Font scale of the legend."""
 _SPACE = 8
@@ -327,7 +327,7 @@ _COLUMNS = 2
 _FACTS = 2
 """Lines above the objects: episode, mode, time; light."""
 _SHADE = 0.85
-"""Brightness of a label's ground, of the instance's colour: with contrast to the box's line."""
+"""Brightness of a label's background relative to the instance's colour, for contrast with the box."""
 PAPER, SOFT = (230, 230, 230), (150, 150, 150)
 
 
@@ -399,13 +399,13 @@ def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors
 
 
 def _ground(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Darkened colour (BGR), as ground of a label."""
+    """Darkened colour (BGR) for the background of a label."""
     blue, green, red = (round(_SHADE * value) for value in color)
     return blue, green, red
 
 
 def _put_label(image: Image, text: str, place: Box, color: tuple[int, int, int]) -> None:
-    """Draw text into a box of the darkened colour."""
+    """Draw text on a filled rectangle of the darkened colour, in place."""
     low = round(place.x), round(place.y)
     high = round(place.x + place.width) - 1, round(place.y + place.height) - 1
     cv2.rectangle(image, low, high, _ground(color), -1)

@@ -282,7 +282,7 @@ def test_the_shadows_of_many_lamps_show_no_lattice(device, size, periods):
 
 @pytest.mark.parametrize("size", [1, 2, 4])
 def test_a_bevel_in_the_shadow_of_a_wall_is_dark(device, size):
-    """A lamp stands behind a wall, which does not face it; the bevel between wall and floor does, but lies in the wall's shadow."""
+    """The wall faces away from the lamp; the bevel between wall and floor faces it, but is in the shadow of the wall."""
     profile = np.array([(-0.4, 0.0), (0.195, 0.0), (0.205, 0.01), (0.215, 0.15)])
     vertices = np.array([(x, y, z) for y in (-0.4, 0.4) for x, z in profile])
     faces = np.array([face for i in range(3) for face in ((i, i + 1, i + 5), (i, i + 5, i + 4))])
