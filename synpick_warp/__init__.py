@@ -367,7 +367,12 @@ def evaluate(
 
     from synpick_warp.apps.evaluation.run import score_files
     from synpick_warp.apps.evaluation.tables import render as render_table
+    from synpick_warp.apps.evaluation.tracking import check_alpha
+    from synpick_warp.cli.commands.evaluate import check_options
 
+    check_options(list(map(Path, results)), "json", None, min_visibility, "exact", top, vertices)
+    if alpha is not None:
+        check_alpha(alpha)
     data_set = open(data) if split is None else open(data).split(split)
     chosen = None if targets is None else Path(targets)
     scored = score_files(data_set, list(map(Path, results)), min_visibility, top, vertices, alpha, chosen)
@@ -393,13 +398,18 @@ def validate(
 
     Raises:
         DatasetError: The folder is not a BOP data set.
+        ConfigError: A value is out of range.
     """
-    from synpick_warp.apps.validation.registry import Tolerance
+    from synpick_warp.apps.validation.registry import parse_tolerance
     from synpick_warp.apps.validation.run import Summary, ValidationOptions
     from synpick_warp.apps.validation.run import validate as check
+    from synpick_warp.cli.options import MAX_THREADS, check_range
+    from synpick_warp.configs.fields import INT32_MAX
     from synpick_warp.system.hardware.cores import count_cores
 
-    bounds = None if tolerance is None else Tolerance(*tolerance)
+    check_range("sample", sample or 0, 0, INT32_MAX)
+    check_range("threads", threads, 0, MAX_THREADS)
+    bounds = None if tolerance is None else parse_tolerance(",".join(map(str, tolerance)))
     return list(check(Path(data), ValidationOptions(sample, images, threads or count_cores(), bounds), Summary()))
 
 
@@ -407,7 +417,7 @@ def convert(data: Path | str, out: Path | str, formats: Sequence[str], *, split:
     """Convert a data set to other formats, into a data set of its own. `synpick-warp convert` does the same.
 
     Args:
-        data: A data set; its committed episodes are converted.
+        data: Folder of a data set; its committed episodes are converted.
         out: Folder of the converted one: new, empty, or of an interrupted conversion.
         formats: Names of formats, such as ("coco", "shards").
         split: Split to convert, of a BOP data set from another source; None: the only one.
@@ -417,6 +427,8 @@ def convert(data: Path | str, out: Path | str, formats: Sequence[str], *, split:
         SynpickError: An error that the user can correct. The same call resumes the conversion.
     """
     from synpick_warp.apps.conversion.run import convert as run_conversion
+    from synpick_warp.cli.options import MAX_THREADS, check_range
     from synpick_warp.system.progress import ignore_progress
 
+    check_range("threads", threads, 0, MAX_THREADS)
     return run_conversion(Path(data), Path(out), formats, threads, ignore_progress, split)

@@ -89,3 +89,19 @@ def test_a_shard_without_episodes_leaves_no_folder(tmp_path):
         with pytest.raises(synpick_warp.ConfigError, match=said):
             synpick_warp.bake("smoke", tmp_path / "set", shard=shard)
     assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: synpick_warp.evaluate("none", ["a.csv"], min_visibility=2.0), "--visib-min is 2"),
+        (lambda: synpick_warp.evaluate("none", [], top=-2), "--results has no value"),
+        (lambda: synpick_warp.evaluate("none", ["a.csv"], alpha=0.0), "alpha"),
+        (lambda: synpick_warp.validate("none", sample=-1), "sample is -1"),
+        (lambda: synpick_warp.validate("none", tolerance=(0.0, 3.0)), "tolerance"),
+        (lambda: synpick_warp.convert("none", "out", ("coco",), threads=-1), "threads is -1"),
+    ],
+)
+def test_values_out_of_range_are_refused_before_anything_is_read(call, said):
+    with pytest.raises(synpick_warp.ConfigError, match=said):
+        call()
