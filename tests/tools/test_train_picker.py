@@ -43,7 +43,7 @@ def draw_samples(states: int, tried: int = 40):
         rows += [(state, y, x, inside[state, y, x]) for y, x in places[rng.choice(len(places), tried, replace=False)].tolist()]
     columns = dict(zip(("state", "y", "x", "success"), map(np.array, zip(*rows, strict=True)), strict=True))
     columns |= {"intended": columns["success"], "weight": np.ones(len(rows), np.float32)}
-    return picker.Samples(torch.from_numpy(depth), torch.from_numpy(depth < 1.0), 60.0, np.arange(states), columns)
+    return picker.PickSamples(torch.from_numpy(depth), torch.from_numpy(depth < 1.0), 60.0, np.arange(states), columns)
 
 
 def test_a_network_learns_where_picks_succeed():
