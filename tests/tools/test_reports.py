@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 import time
 from types import SimpleNamespace
 
@@ -12,21 +11,18 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.reading import open_data_set
 from tests.builders import FEW_STEPS, ONE_OBJECT, PICKING, assignments, refusal
 from tests.harness.environment import ROOT
-from tests.worlds.evaluation_set import SPEED, VISIBILITY, write_evaluation_set
 from tools.bench import __main__ as bench
 from tools.bench import run, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.figures import read_runs
-from tools.reports import difficulty, sequence, symmetries
 from tools.reports import rest as rest_report
+from tools.reports import sequence
 from tools.reports.real_frames import read_frames, write_data_set
 from tools.reports.sequence import GAP, LINE, Pair, ReferenceStore, Shot, draw_sheet, summarize_pairs
 
@@ -159,44 +155,12 @@ def test_a_stopwatch_sums_calls(device):
         ),
         *((compare, arguments, " is no comparison; ") for arguments in ([], ["dance"])),
         (compare, ["guard", str(ROOT), "/nowhere"], " is no checkout"),
-        (difficulty, ["/nowhere"], "reports.difficulty: "),
     ],
 )
-def test_a_mistake_is_one_line(tool, arguments, said, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["tool", *arguments])
-    assert (tool.main() if tool is difficulty else tool.main(arguments)) == 2
+def test_a_mistake_is_one_line(tool, arguments, said, capsys):
+    assert tool.main(arguments) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
-
-
-# ---- difficulty of data sets ----
-
-
-def test_known_difficulty(tmp_path, monkeypatch, capsys):
-    """Four instances in each view, at four visible fractions; one moves faster than MOVING."""
-    folder = write_evaluation_set(tmp_path / "set")
-    found = difficulty.measure_difficulty(read_truth(open_data_set(folder)))
-    assert list(found) == ["all", "move", "pick"]
-    for name, values in found.items():
-        assert values == pytest.approx(
-            {
-                "episodes": 2 if name == "all" else 1,
-                "instances a view": 4,
-                "mean visibility": sum(VISIBILITY) / 4,
-                "below 0.5 [%]": 50,
-                "above 0.05 m/s [%]": 25,
-                "median speed of these [m/s]": max(SPEED),
-                "95th percentile of speed [m/s]": max(SPEED),
-            }
-        )
-    file = tmp_path / "run.json"
-    monkeypatch.setattr(sys, "argv", ["difficulty", str(folder), "--json", str(file)])
-    assert difficulty.main() == 0
-    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
-    assert rows["move: instances a view"] == 4
-    printed = capsys.readouterr().out
-    assert "metallic 0.25, roughness 0.45 on average" in printed
-    assert "median speed of these [m/s]" in printed
 
 
 # ---- frames of episodes ----
@@ -295,35 +259,6 @@ def test_histories_bring_frames_nearer_to_the_reference():
         ((_, found),) = sequence.compare_frames(config, (12,))
         quality[history] = found.quality
     assert quality[16] > quality[0]
-
-
-# ---- symmetries of real objects ----
-
-
-SAME, MORE = "the same", "more than stated: shape alone, which texture tells apart"
-LACKS = "lacks what is stated: {} % are more than 3 %"
-ROWS = dict.fromkeys((4, 10, 11, 12, 14, 15, 17), ((0, 0), (0, 0), SAME))  # The dent of 4 is 3.5 % deep.
-ROWS |= dict.fromkeys((13, 18), ((0, 1), (0, 1), SAME))
-ROWS |= dict.fromkeys((2, 3, 7, 8), ((0, 0), (3, 0), MORE))  # Boxes, which differ by their print.
-ROWS |= dict.fromkeys((5, 9), ((0, 0), (1, 0), MORE))
-ROWS |= {
-    1: ((1, 0), (1, 1), MORE),  # Cans are round, and most the same upside down.
-    6: ((0, 0), (1, 1), MORE),
-    16: ((7, 0), (7, 0), SAME),
-    19: ((1, 0), (0, 0), LACKS.format(3.8)),
-    20: ((1, 0), (0, 0), LACKS.format(3.3)),
-    21: ((1, 0), (1, 0), SAME),
-}
-"""obj_id -> numbers of discrete and continuous symmetries, stated and detected, and the verdict."""
-QUICK = (2, 13, 17, 19, 20)
-
-
-@pytest.mark.parametrize("obj_id", [row if row in QUICK else pytest.param(row, marks=pytest.mark.slow) for row in ROWS])
-def test_the_real_objects(real_models, obj_id):
-    stated, detected, verdict = ROWS[obj_id]
-    (row,) = symmetries.compare(real_models, [obj_id], 0.03)
-    assert (row.stated, row.detected, row.verdict) == (stated, detected, verdict)
-    assert row.detected_off <= 0.03
 
 
 # ---- photographs as a data set ----
