@@ -1,4 +1,4 @@
-"""Program of a claiming worker that bakes without simulation: URL, number of episodes, lease [s]."""
+"""Program of a claiming worker that bakes without simulation: URL, number of episodes, lease [s]. Prints a line when it starts."""
 
 from __future__ import annotations
 
@@ -12,4 +12,5 @@ from tests.harness import scripted_bake
 
 if __name__ == "__main__":
     given = {"bake": partial(scripted_bake.bake_episodes, grows=True), "claim": True, "lease": float(sys.argv[3])}
+    print("claiming", flush=True)
     run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), **given)

@@ -105,7 +105,8 @@ def test_no_two_presets_to_evaluate_on_or_to_train_on_share_random_numbers():
 )
 def test_data_sets_of_other_presets_can_still_be_resumed(name, checksum):
     """Their manifests have the checksum of their settings. A new setting changes it: then say so in the changelog, and here."""
-    assert make_manifest(load_config(name))["settings_checksum"].startswith(checksum)
+    found = make_manifest(load_config(name))["settings_checksum"]
+    assert found.startswith(checksum), f"bakes of {name} no longer resume: {found[:16]}; if meant, put it here and into CHANGELOG.md"
 
 
 def test_a_table_object_rows_changes_every_row_of_the_preset(tmp_path):
