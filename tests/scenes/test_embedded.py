@@ -14,10 +14,10 @@ from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes import modelling
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.catalog import shape_recipe
+from synpick_warp.scenes.catalog import read_objects, shape_recipe
 from synpick_warp.scenes.collision import shapes
 from synpick_warp.scenes.collision.decomposition import decompose
-from synpick_warp.scenes.collision.shapes import embedded_shape
+from synpick_warp.scenes.collision.shapes import shipped_shape
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.embedded import objects
 from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
@@ -252,6 +252,7 @@ def test_textures_follow_from_their_index_and_differ():
 
 NAMED = {raw.name: raw for raw in ALL.values()}
 SETTINGS = load_config("synpick").objects
+YCBV_OBJECTS = 21
 
 
 def piece_corners(shape):
@@ -263,7 +264,7 @@ def piece_corners(shape):
 def test_each_object_has_its_shape(name):
     """`python -m tools.embedded_shapes` computes it again where an object has changed. Releases of NumPy differ by 5e-14 m at zero."""
     raw, recipe = NAMED[name], shape_recipe(NAMED[name], SETTINGS)
-    shape = embedded_shape(raw.mesh, recipe)
+    shape = shipped_shape(raw.mesh, recipe)
     assert shape is not None
     if name in PIECES:
         assert piece_corners(shape) == piece_corners(modelled_shape(name, recipe))
@@ -283,7 +284,7 @@ def test_a_decomposition_is_that_of_its_object():
     raw, recipe = NAMED["drill"], shape_recipe(NAMED["drill"], SETTINGS)
     found, computed = (
         [(piece.vertices.tolist(), piece.faces.tolist()) for piece in shape]
-        for shape in (embedded_shape(raw.mesh, recipe), decompose(raw.mesh, recipe))
+        for shape in (shipped_shape(raw.mesh, recipe), decompose(raw.mesh, recipe))
     )
     assert found == computed
 
@@ -292,7 +293,15 @@ def test_rounding_errors_do_not_hide_shapes_and_changes_do():
     raw = NAMED["mug"]
     recipe = shape_recipe(raw, SETTINGS)
     rounded = replace(raw.mesh, vertices=np.nextafter(raw.mesh.vertices, np.float32(1.0)))
-    assert embedded_shape(rounded, recipe) is not None
-    assert embedded_shape(replace(raw.mesh, vertices=raw.mesh.vertices * np.float32(1.01)), recipe) is None
-    assert embedded_shape(raw.mesh, replace(recipe, pieces=recipe.pieces - 1)) is None
-    assert len(shapes.read_embedded_shapes()) == len(NAMED)
+    assert shipped_shape(rounded, recipe) is not None
+    assert shipped_shape(replace(raw.mesh, vertices=raw.mesh.vertices * np.float32(1.01)), recipe) is None
+    assert shipped_shape(raw.mesh, replace(recipe, pieces=recipe.pieces - 1)) is None
+    assert len(shapes.read_shipped_shapes()) == len(NAMED) + YCBV_OBJECTS
+
+
+def test_the_models_of_ycb_video_have_their_shapes(real_models):
+    config = load_config("synpick", {"bake.models": str(real_models)})
+    raws = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins)
+    assert len(raws) == YCBV_OBJECTS
+    for raw in raws:
+        assert shipped_shape(raw.mesh, shape_recipe(raw, config.objects)) is not None, f"{raw.name}: run tools.embedded_shapes --models"

@@ -1,7 +1,8 @@
 """Collision shapes of a catalog's objects, with a disk cache keyed by content (mesh, recipe, CoACD version).
 
-Those of the embedded objects are shipped, so that a first bake does not wait for convex decomposition. They are keyed by mesh and recipe:
-with other settings, or after a change, objects are decomposed as any others. `python -m tools.embedded_shapes` computes them again.
+Those of the embedded objects and of the models of YCB-Video are shipped, so that a first bake does not wait for convex decomposition. They
+are keyed by mesh and recipe: with other settings, or after a change, objects are decomposed as any others. `tools.embedded_shapes` computes
+them again.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ HULL_LIMITS = Limits(120.0, 2**32)
 """Limits of the simplification of a convex hull: 120 s of processor time and 4 GiB; a scan with two million vertices takes seconds."""
 _REMEDY = "repair the mesh, or set concave = false"
 _LATE = "decimate the mesh, raise objects.decomposition_time, or set concave = false"
-EMBEDDED_FILE = Path(__file__).with_name("embedded_shapes.npz")
-"""Arrays of `pack_pieces` for each key, named KEY.vertices, KEY.faces and KEY.counts."""
+EMBEDDED_FILE, YCBV_FILE = (Path(__file__).with_name(f"{name}_shapes.npz") for name in ("embedded", "ycbv"))
+"""Arrays of `pack_pieces` for each key, named KEY.vertices, KEY.faces and KEY.counts: of embedded objects, of models of YCB-Video."""
 # Meshes follow from sines and cosines, whose last bits depend on NumPy and the processor; so vertices count to 10 micrometres [m].
 _GRID = 1e-5
 # Sizes are multiples of 0.1 mm: away from the grid's limits by this fraction of a cell, rounding errors do not change a key.
@@ -63,7 +64,7 @@ def collision_shapes(
 ) -> list[Shape | CatalogError]:
     """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
-    Those of the embedded objects come with the program. Others are computed in isolated processes (`run_isolated`).
+    Those of known objects come with the program. Others are computed in isolated processes (`run_isolated`).
     What CoACD crashes on or cannot decompose gets its convex hull instead, and a line says so. If time or memory of this machine does not
     suffice, that is an error: elsewhere, or under other load, the same settings would give another shape.
 
@@ -84,7 +85,7 @@ def collision_shapes(
     jobs = [
         _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
     ]
-    shapes: list[Shape | CatalogError | None] = [embedded_shape(job.mesh, job.recipe) or _load(job.file) for job in jobs]
+    shapes: list[Shape | CatalogError | None] = [shipped_shape(job.mesh, job.recipe) or _load(job.file) for job in jobs]
     save, stopped = _Saver(report), []
     slow = {index: job for index, job in enumerate(jobs) if shapes[index] is None and job.recipe.concave}
     for index, result in _decompose_all(slow, seconds, report):
@@ -215,14 +216,17 @@ def shape_key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
     return digest.hexdigest()
 
 
-def embedded_shape(mesh: TriangleMesh, recipe: ShapeRecipe) -> Shape | None:
-    """Collision shape of an embedded object, from the file of the package; None for other meshes and recipes."""
-    return read_embedded_shapes().get(shape_key(mesh, recipe))
+def shipped_shape(mesh: TriangleMesh, recipe: ShapeRecipe) -> Shape | None:
+    """Collision shape of an embedded object or a model of YCB-Video, from the files of the package; None for other meshes and recipes."""
+    return read_shipped_shapes().get(shape_key(mesh, recipe))
 
 
 @cache
-def read_embedded_shapes() -> dict[str, Shape]:
-    """Read the embedded collision shapes, by their keys."""
-    with np.load(EMBEDDED_FILE, allow_pickle=False) as data:
-        keys = {name.partition(".")[0] for name in data.files}
-        return {key: unpack_pieces(*(data[f"{key}.{name}"] for name in ("vertices", "faces", "counts"))) for key in keys}
+def read_shipped_shapes() -> dict[str, Shape]:
+    """Read the shipped collision shapes, by their keys."""
+    found = {}
+    for file in (EMBEDDED_FILE, YCBV_FILE):
+        with np.load(file, allow_pickle=False) as data:
+            keys = {name.partition(".")[0] for name in data.files}
+            found |= {key: unpack_pieces(*(data[f"{key}.{name}"] for name in ("vertices", "faces", "counts"))) for key in keys}
+    return found
