@@ -44,16 +44,8 @@ class ExportContext:
         pool: WriterPool,
         looks: Looks | None = None,
     ) -> None:
-        """
-        Args:
-            out: Folder of the data set. It exists and contains the folder `PARTIAL`.
-            settings: Settings of the data set.
-            catalog: The objects.
-            cameras: The cameras.
-            lights: The environment maps.
-            pool: Writes all files of episodes. Exporters neither close nor abort it.
-            looks: What episodes draw their looks from; None: nothing.
-        """
+        """Context of a folder `out` that exists and contains the folder `PARTIAL`. The pool writes all files of episodes; exporters neither
+        close nor abort it. `looks`: what episodes draw their looks from; None: nothing."""
         self.out, self.settings, self.cameras, self.pool = out, settings, cameras, pool
         self.layout = settings.layout
         self._catalog, self._lights, self._looks = catalog, lights, looks
@@ -79,11 +71,7 @@ class ExportContext:
         return {entry.obj_id: entry.name for entry in self.catalog.entries}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """Copy the files of these names, or those in folders, from the data set that is converted; returns whether there is one.
-
-        Raises:
-            OSError: A file cannot be written.
-        """
+        """Copy the files of these names, or those in folders, from the data set that is converted; returns whether there is one."""
         return False
 
 
@@ -230,43 +218,28 @@ class Exporter(ABC):
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write the index files that span episodes, and wait for them.
+        """Write the index files that span the committed episodes, sorted, and wait for them; returns these files, relative to the data set.
 
-        Args:
-            out: Folder of the data set.
-            settings: Its settings.
-            pool: Writer processes.
-            episodes: The committed episodes, sorted; those that were given up have no files. Files of others, which nobody committed, are
-                in no index.
-
-        Returns:
-            These files, relative to the data set.
+        Episodes that were given up have no files. Files of others, which nobody committed, are in no index.
         """
         return []
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Yield the lines that an episode adds to index files; `finalize` concatenates them where `out` has the folder LINES.
+        """Yield the lines that a committed episode adds to index files, (path relative to LINES, complete lines), by the names of its files
+        of all formats, relative to `out`; `finalize` concatenates them where `out` has the folder LINES.
 
-        Args:
-            out: Folder of the data set, with the committed episode.
-            settings: Its settings.
-            names: Files of the episode, of all formats, relative to `out`.
-
-        Returns:
-            Pairs of a path relative to LINES and complete lines. Lines of the same path are appended to one file, in order of the episodes.
+        Lines of the same path are appended to one file, in order of the episodes.
         """
         return iter(())
 
     @abstractmethod
     def write_constants(self) -> list[Path]:
-        """Write the files that all episodes share, such as models; replaces what a killed bake may have left.
+        """Write the files that all episodes share, such as models; replaces what a killed bake may have left. Returns these files, or
+        folders that hold nothing else, relative to the data set.
 
         Called at most once, before all other calls. Needs no atomic rename: the bake commits them with a manifest entry. Formats of views
         without BOP's notes write those of `writing/notes.py`.
-
-        Returns:
-            These files, or folders that hold nothing else, relative to the data set.
         """
 
     def write_views(self, batch: FrameBatch) -> None:
@@ -276,13 +249,9 @@ class Exporter(ABC):
         """
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Enqueue all views of an episode of a data set that is converted, in place of `write_views`.
+        """Enqueue all views of an episode of a data set that is converted, the scene of each camera, in place of `write_views`.
 
         Files are those of a bake: images are copied where the format holds such, and annotations written as a bake writes them.
-
-        Args:
-            episode: Index of the episode.
-            scenes: The scene of each camera.
         """
 
     def write_ticks(self, batch: TickBatch) -> None:
@@ -298,9 +267,7 @@ class Exporter(ABC):
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """Complete and commit the episode's files, or discard them if its ending delivers nothing; it may then restart at frame 0.
 
-        Args:
-            end: Result of the episode.
-            on_committed: Callback; called exactly once, now or by a later call of the pool, when all files are committed or discarded.
+        `on_committed` is called exactly once, now or by a later call of the pool, when all files are committed or discarded.
         """
 
     @abstractmethod
@@ -320,13 +287,7 @@ class Exporter(ABC):
 
 
 def view_bytes(resolution: tuple[int, int], objects: int, has_layers: bool) -> int:
-    """Maximum size of a view's images, or of one of its layers, in the pool's shared memory [B].
-
-    Args:
-        resolution: Width and height [px].
-        objects: Most objects of an episode.
-        has_layers: Whether layers are rendered.
-    """
+    """Maximum size of a view's images, or of one of its layers, in the pool's shared memory [B]; `objects`: most of an episode."""
     width, height = resolution
     layer = (height * width * LAYER_BYTES,) if has_layers else ()
     color, depth, instance = (height * width * size for size in PIXEL_BYTES)

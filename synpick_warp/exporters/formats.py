@@ -45,9 +45,8 @@ _STORE = r"trajectory\.zarr"
 
 
 class PartFiles(NamedTuple):
-    """Files that a format has once an episode or once a scene, by which the reader finds the episodes of formats that it reads
-    no further.
-    """
+    """Files that a format has once an episode or once a scene, by which the reader finds the episodes of formats that it reads no
+    further."""
 
     folder: str
     """Folder of the files, relative to the data set."""
@@ -76,9 +75,7 @@ class PartFiles(NamedTuple):
 
 
 class Format(NamedTuple):
-    """Row of the table of formats: exporter class, regular expressions of its file names (relative to the data set), what `convert` and the
-    reader need, and packages.
-    """
+    """Row of the table of formats; names of files are relative to the data set."""
 
     module: str
     """Module of its exporter, with a dot in front relative to `synpick_warp.exporters`; imported when the format is used."""
@@ -118,21 +115,6 @@ def _shards(layout: DataLayout, episode: int) -> str:
     """Regular expression that matches the paths of an episode's shards, relative to the data set."""
     # Further shards of a scene have its id plus a multiple of a million.
     return rf"{re.escape(layout.folder(episode))}_web/shard-[0-9]{{0,12}}(?:{_scenes(layout, episode)})\.tar"
-
-
-def _usd(_: DataLayout, episode: int) -> str:
-    """Regular expression that matches the paths of an episode's USD file."""
-    return rf"usd/{episode:06d}\.usdc"
-
-
-def _zarr(_: DataLayout, episode: int) -> str:
-    """Regular expression that matches the paths of an episode's files in the zarr store."""
-    return rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))"
-
-
-def _picks(_: DataLayout, episode: int) -> str:
-    """Regular expression that matches the paths of an episode's tables of picks."""
-    return rf"picks/(?:states/)?{episode:06d}\.parquet"
 
 
 def _lerobot(layout: DataLayout, episode: int) -> str:
@@ -180,7 +162,7 @@ FORMAT_TABLE: dict[str, Format] = {
         ".usd.exporter",
         "UsdExporter",
         r"usd/assets/(?:[a-z_0-9]+\.usdc|lights/light_[0-9]{3,6}\.exr|textures/[a-z_0-9]+\.png)",
-        _usd,
+        lambda _, episode: rf"usd/{episode:06d}\.usdc",
         sources=lambda _: ("poses",),
         part=PartFiles("usd", ".usdc", 1),
         packages=("openexr",),
@@ -189,14 +171,14 @@ FORMAT_TABLE: dict[str, Format] = {
         ".trajectory.exporter",
         "TrajectoryExporter",
         rf"{_STORE}/(?:(?:episodes/)?zarr\.json|(?:objects|cameras)/(?:zarr\.json|{_ZARR_ARRAY}))",
-        _zarr,
+        lambda _, episode: rf"{_STORE}/episodes/{episode:06d}/(?:zarr\.json|[a-z_]+/(?:zarr\.json|{_ZARR_ARRAY}))",
         frame_bytes=50e3,
     ),
     "picks": Format(
         ".picks",
         "PicksExporter",
         r"(?!)",  # None.
-        _picks,
+        lambda _, episode: rf"picks/(?:states/)?{episode:06d}\.parquet",
         part=PartFiles("picks", ".parquet", 0),
         packages=("pyarrow",),
         remedy="install it by pip install 'synpick-warp[picks]'",

@@ -43,13 +43,13 @@ class PicksExporter(EpisodeExporter[_Tables]):
         return []
 
     def write_picks(self, batch: PickBatch) -> None:
-        content = self._staged(batch.episode, _make_content).content
+        content = self._staged(batch.episode, lambda _: []).content
         content.append((make_rows(COLUMNS, batch.trials), make_rows(STATES, batch.states)))
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`: an episode without trials is written, too."""
         if Ending(end.ending).delivers:
-            self._staged(end.episode, _make_content)
+            self._staged(end.episode, lambda _: [])
         super().end_episode(end, on_committed)
 
     def places(self, episode: int) -> tuple[Path, Path]:
@@ -59,10 +59,6 @@ class PicksExporter(EpisodeExporter[_Tables]):
     def _commit(self, episode: StagedEpisode[_Tables], end: EpisodeEnd) -> WriteTask:
         out, places = self._context.out, pick_files(end.episode)
         return WriteTask(write_tables, (), (episode.folder, episode.content, out, places), out / places[0])
-
-
-def _make_content(_: Path) -> _Tables:
-    return []
 
 
 def pick_files(episode: int) -> tuple[Path, Path]:
@@ -105,11 +101,8 @@ def table_schema(columns: Sequence[PickColumn], kind: np.dtype) -> pa.Schema:
 
 
 def check_schema(schema: pa.Schema, columns: Sequence[PickColumn]) -> np.dtype:
-    """Structured dtype of a stored table's rows.
-
-    Raises:
-        ValueError: A column is missing, unknown, twice there, or of another type than that of `columns`.
-    """
+    """Structured dtype of a stored table's rows; raises ValueError if a column is missing, unknown, twice there, or of another type than
+    that of `columns`."""
     sizes = [item.type.list_size for item in schema if item.name == "visible" and pa.types.is_fixed_size_list(item.type)]
     kind = row_type(columns, *sizes[:1])
     known = table_schema(columns, kind)
@@ -122,11 +115,7 @@ def check_schema(schema: pa.Schema, columns: Sequence[PickColumn]) -> np.dtype:
 
 
 def from_table(table: pa.Table, columns: Sequence[PickColumn], kind: np.dtype) -> np.recarray:
-    """Rows of an Arrow table; the inverse of `make_table`.
-
-    Raises:
-        ValueError: A value is missing.
-    """
+    """Rows of an Arrow table; the inverse of `make_table`. Raises ValueError if a value is missing."""
     rows = np.empty(table.num_rows, kind).view(np.recarray)
     for column in columns:
         values = table[column.name].combine_chunks()

@@ -20,11 +20,8 @@ from synpick_warp.views.picks import PickBatch
 
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
-    """Import the classes that write these formats, each once, in the order of FORMAT_TABLE.
-
-    Raises:
-        ConfigError: A format's module, or a package that it needs, is not installed.
-    """
+    """Import the classes that write these formats, each once, in the order of FORMAT_TABLE; raises ConfigError if a format's module, or a
+    package that it needs, is not installed."""
     wanted = set(names)
     return tuple(_load(name) for name in format_names() if name in wanted)
 
@@ -40,7 +37,7 @@ def _load(name: str) -> type[Exporter]:
 
 @dataclass(frozen=True)
 class Needs:
-    """Needs of a bake's formats: their exporter classes, in the order of FORMAT_TABLE, and the largest size of a task's images [B]."""
+    """Needs of a bake's formats."""
 
     classes: tuple[type[Exporter], ...]
     """Their exporters, in the order of FORMAT_TABLE."""
@@ -85,22 +82,18 @@ class Exporters:
         return list(dict.fromkeys(path for exporter in self._all for path in exporter.write_constants()))
 
     def write_views(self, batch: FrameBatch) -> None:
-        """Pass a batch of views to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_views(batch)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Pass an episode's stored scenes to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_stored(episode, scenes)
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Pass a batch of ticks to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_ticks(batch)
 
     def write_picks(self, batch: PickBatch) -> None:
-        """Pass grasp trials to all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.write_picks(batch)
 
@@ -121,12 +114,10 @@ class Exporters:
         return sorted(path for exporter in self._all for path in exporter.files(episode))
 
     def close(self) -> None:
-        """Close all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.close()
 
     def abort(self) -> None:
-        """Abort all formats. See `Exporter`."""
         for exporter in self._all:
             exporter.abort()
 

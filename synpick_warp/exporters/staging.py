@@ -25,12 +25,9 @@ _Content = TypeVar("_Content")
 
 @dataclass(eq=False)
 class StagedEpisode(Generic[_Content]):
-    """Arrangement of an episode whose files are being written: staging folder, content kept in memory, unfinished tasks, and its end (None:
-    still running).
-    """
+    """Arrangement of an episode whose files are being written."""
 
     index: int
-    """Episode index."""
     folder: Path
     """Staging folder, of this arrangement only."""
     content: _Content
@@ -38,6 +35,7 @@ class StagedEpisode(Generic[_Content]):
     pending: int = 0
     """Number of unfinished tasks."""
     end: EpisodeEnd | None = None
+    """None: it is still running."""
     on_committed: Callable[[], None] | None = None
     """Set together with `end`."""
 
@@ -92,12 +90,10 @@ class EpisodeExporter(Exporter, Generic[_Content]):
         return sorted(place for place in set(self.places(episode)) if os.path.lexists(self._context.out / place))
 
     def close(self) -> None:
-        """Forget all episodes in progress. See `Exporter`."""
+        """Forget all episodes in progress; their staged files remain. See `Exporter`."""
         self._episodes.clear()
 
-    def abort(self) -> None:
-        """Forget all episodes in progress; staged files remain. See `Exporter`."""
-        self._episodes.clear()
+    abort = close
 
     def _staged(self, index: int, make_content: Callable[[Path], _Content]) -> StagedEpisode[_Content]:
         """Current arrangement of an episode; a new one gets a staging folder, and its content by `make_content` of that folder."""
@@ -141,16 +137,11 @@ class EpisodeExporter(Exporter, Generic[_Content]):
             task = self._commit(episode, end)
             task = dataclasses.replace(task, function=commit_staged, arguments=(episode.folder, task.function, *task.arguments))
         else:
-            task = WriteTask(discard_staged, (), (episode.folder,), episode.folder)
+            task = WriteTask(shutil.rmtree, (), (episode.folder,), episode.folder)
         self._context.pool.submit_all((dataclasses.replace(task, on_done=episode.on_committed),))
 
 
 def commit_staged(folder: Path, commit: Callable[..., None], *arguments: Any) -> None:
     """Task: commit an episode, and remove its staging folder."""
     commit(*arguments)
-    shutil.rmtree(folder)
-
-
-def discard_staged(folder: Path) -> None:
-    """Task: remove the staging folder of a discarded arrangement."""
     shutil.rmtree(folder)

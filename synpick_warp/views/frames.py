@@ -121,11 +121,7 @@ class SelectedRows(Mapping[str, np.ndarray]):
     """Rows of named arrays, gathered anew by each read: what no exporter reads is never copied."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
-        """
-        Args:
-            arrays: Arrays by name; rows of an earlier selection are composed with these.
-            rows: Indices along the first dimension (row) int.
-        """
+        """Select rows by their indices along the first dimension (row) int; those of an earlier selection are composed with these."""
         if isinstance(arrays, SelectedRows):
             arrays, rows = arrays._arrays, arrays._rows[rows]
         self._arrays, self._rows = arrays, rows
@@ -237,13 +233,8 @@ def paint_masks(words: np.ndarray, first: np.ndarray, box: np.ndarray, width: in
 
 
 def unpack_mask(words: np.ndarray, first: int, box: np.ndarray) -> np.ndarray:
-    """Mask of an instance within its box (rows, columns) bool.
-
-    Args:
-        words: Words of the view (W) uint32.
-        first: Index of the first of this mask.
-        box: x_min, y_min, x_max, y_max, inclusive [px]; x_max < x_min: empty.
-    """
+    """Mask of an instance within its box, x_min, y_min, x_max, y_max, inclusive [px], x_max < x_min: empty, (rows, columns) bool, from the
+    words of the view (W) uint32 and the index of its first."""
     columns, rows = (max(0, int(past) - int(start) + 1) for start, past in zip(box[:2], box[2:], strict=True))
     bands = -(-rows // MASK_ROWS)
     own = words[first : first + bands * columns].astype("<u4", copy=False).reshape(bands, columns, 1)

@@ -28,13 +28,9 @@ def encode_layer(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
-    """Undo `encode_layer`, up to rounding.
-
-    Returns:
-        Values of the type, components, unit and meaning that `LAYER_TABLE` states: normals, nocs and scene_flow (H, W, 3) float32, flow
-        (H, W, 2) float32, suction_seal and suction_wrench (H, W) float32, albedo (H, W, 3) uint8, classes, depth_sensor and depth_stereo
-        (H, W) uint16, ir_left and ir_right (H, W) uint8.
-    """
+    """Undo `encode_layer`, up to rounding. Returns values of the type, components, unit and meaning that `LAYER_TABLE` states: normals,
+    nocs and scene_flow (H, W, 3) float32, flow (H, W, 2) float32, suction_seal and suction_wrench (H, W) float32, albedo (H, W, 3) uint8,
+    classes, depth_sensor and depth_stereo (H, W) uint16, ir_left and ir_right (H, W) uint8."""
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
 
 
@@ -68,12 +64,8 @@ def _any_channel(image: np.ndarray) -> np.ndarray:
 
 
 def _quantize_signed(values: np.ndarray, scale: float, min_code: int) -> tuple[np.ndarray, np.ndarray]:
-    """Codes rint(scale · value) + ZERO_CODE of signed values (H, W, C).
-
-    Returns:
-        The codes (H, W, C) uint16, 0 in pixels with a component that is NaN or out of range, and the mask of the other pixels
-        (H, W, 1) bool.
-    """
+    """Codes rint(scale · value) + ZERO_CODE of signed values (H, W, C). Returns the codes (H, W, C) uint16, 0 in pixels with a component
+    that is NaN or out of range, and the mask of the other pixels (H, W, 1) bool."""
     # float32 holds codes of 16 bits to 1/256 of a step.
     code = np.rint(np.float32(scale) * values + np.float32(ZERO_CODE))
     # Comparisons with NaN are False.

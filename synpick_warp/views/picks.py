@@ -124,11 +124,8 @@ STATES = (
 
 @dataclass(frozen=True, eq=False)
 class PickBatch:
-    """Record batch: all trials of one or more states of an episode, in any order. Exporters copy what they keep.
-
-    Raises:
-        ValueError: Columns are missing, unknown, or of other shapes.
-    """
+    """Record batch: all trials of one or more states of an episode, in any order. Exporters copy what they keep. Raises ValueError if
+    columns are missing, unknown, or of other shapes."""
 
     episode: int
     """Episode index."""

@@ -38,12 +38,8 @@ class FrameSupport:
 
 
 def find_supports(batch: TickBatch, weights: Mapping[int, float]) -> list[FrameSupport]:
-    """Find the support edges of each frame of a batch: contact forces of at least SUPPORT_FRACTION of the object's weight.
-
-    Args:
-        batch: The frames, with support forces in their ticks.
-        weights: Weight of an object [N] by obj_id.
-    """
+    """Find the support edges of each frame of a batch, which has support forces: contact forces of at least SUPPORT_FRACTION of the
+    object's weight, in `weights` [N] by obj_id."""
     frames = zip(batch.object_id, batch.tick["support"], batch.tick["static_support"], strict=True)
     return [_find_edges(*frame, weights) for frame in frames]
 
@@ -90,14 +86,9 @@ def _list_runs(parts: Sequence[Runs], masks: Sequence[Masks]) -> tuple[np.ndarra
 def find_unstacking_order(nodes: int, supports: Iterable[tuple[int, int]]) -> list[list[int]]:
     """Unstacking order: a topological order of the support graph's condensation, the least index first wherever several may follow.
 
-    From the transitive closure, by repeated squaring of the adjacency matrix: bins have few enough objects.
-
-    Args:
-        nodes: Number of nodes.
-        supports: Edges (object, supporter); those to WITHOUT_LABEL are left out.
-
-    Returns:
-        Strongly connected components, none of which carries a later one. One of several objects is a cycle: they carry each other.
+    From the transitive closure, by repeated squaring of the adjacency matrix: bins have few enough objects. Edges are (object, supporter);
+    those to WITHOUT_LABEL are left out. Returns strongly connected components, none of which carries a later one; one of several objects
+    is a cycle: they carry each other.
     """
     reach = np.eye(nodes, dtype=np.float32)
     for one, other in supports:

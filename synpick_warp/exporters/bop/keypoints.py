@@ -32,9 +32,7 @@ _POSITION_DECIMALS = 4
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Keypoints of one object: positions in the model's frame [mm], in the order in which they were sampled, and skeleton edges (pairs of
-    indices).
-    """
+    """Keypoints of one object, in the order in which they were sampled."""
 
     positions: np.ndarray
     """In the model's frame (K, 3) float64 [mm]."""
@@ -43,12 +41,8 @@ class Keypoints:
 
 
 def sample_keypoints(vertices: np.ndarray, count: int) -> Keypoints:
-    """Farthest point sampling of vertices: the first is farthest from the centre of the box, each next one from all before it.
-
-    Args:
-        vertices: (V, 3) [m].
-        count: Maximum number of keypoints; objects with fewer different vertices have as many as these.
-    """
+    """Farthest point sampling of vertices (V, 3) [m]: the first is farthest from the centre of the box, each next one from all before it.
+    Objects with fewer than `count` different vertices have as many keypoints as these."""
     points = np.round(MILLIMETERS * vertices.astype(np.float64), _POSITION_DECIMALS)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     chosen = [int(np.argmax(np.linalg.norm(points - centre, axis=1)))]
@@ -79,11 +73,8 @@ def project_keypoints(
 ) -> list[dict[str, Any]]:
     """Keys of COCO annotations: `keypoints` as x, y, v for each, pixel centres at + 0.5, and `num_keypoints`, the number with v > 0.
 
-    Args:
-        entries: The view's entry in scene_gt.json.
-        camera: Its camera in scene_camera.json.
-        depth: Depth image (H, W) uint16, in units of `depth_scale`; 0: no surface, which hides nothing.
-        keypoints: Keypoints by obj_id.
+    `entries` and `camera` are the view's in scene_gt.json and scene_camera.json, `keypoints` are by obj_id; depth (H, W) uint16 is in units
+    of `depth_scale`, 0: no surface, which hides nothing.
     """
     matrix, lens = np.reshape(camera["cam_K"], (3, 3)), read_lens(camera, depth.shape[::-1])
     return [_project(entry, matrix, lens, depth, camera["depth_scale"], keypoints[entry["obj_id"]].positions) for entry in entries]

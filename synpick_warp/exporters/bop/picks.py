@@ -35,13 +35,8 @@ def spool_picks(batch: PickBatch, scenes: tuple[Path, ...]) -> None:
 
 
 def format_picks(spool: Path, camera: Callable[[int], dict[str, Any] | None], size: tuple[int, int]) -> Iterator[str]:
-    """Format scene_picks.json, as lines of text: a list of candidates by frame.
-
-    Args:
-        spool: The spool file.
-        camera: Entry of an image in scene_camera.json; None: there is no such image.
-        size: Width and height of the images [px].
-    """
+    """Format scene_picks.json, as lines of text: a list of candidates by frame. `camera` gives an image's entry in scene_camera.json, None:
+    there is no such image; `size`: width and height of the images [px]."""
     rows = sort_rows(np.fromfile(spool, row_type(COLUMNS)))
     yield "{"
     begin = "\n"

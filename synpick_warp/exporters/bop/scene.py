@@ -34,7 +34,7 @@ DATE = "1970-01-01 00:00:00"
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """Settings common to all scenes of an episode: folder of the split, im_ids, image size [px], suffixes, COCO annotations or not."""
+    """What completes a scene."""
 
     split: str
     """Name of the split's folder."""
@@ -174,11 +174,7 @@ class AnnotationBlocks:
         self.frames.sort()
 
     def check_frames(self, scene: Path, images: Sequence[int]) -> None:
-        """Check that there is one block of each image.
-
-        Raises:
-            OutputError: There is not.
-        """
+        """Raise OutputError unless there is one block of each image."""
         if self.frames != list(images):
             raise OutputError(f"{scene} has {len(self.frames)} of {len(images)} frames; this is an error of synpick-warp, please report it")
 
@@ -254,11 +250,6 @@ def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: tuple[S
     layout, bring them together in one folder, with folders and annotation files for each camera, and rename it to its place.
 
     The rename of the folder is the commit: a killed bake leaves nothing at `place`.
-
-    Args:
-        scenes: Staging folder of each camera.
-        place: Folder of the scene.
-        settings: Settings of each scene, with its sensor.
     """
     whole = scenes[0].with_name(f"{scenes[0].name}-sensors")
     whole.mkdir()

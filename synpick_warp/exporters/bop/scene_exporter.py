@@ -15,7 +15,7 @@ from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.graph import FrameSupport, find_supports
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
-from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models_folders
+from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
 from synpick_warp.exporters.bop.view import (
     ViewSettings,
@@ -134,11 +134,10 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 return list(names)
             texts = {
                 NOTES_FILE: describe_dataset(context.settings, context.catalog, self._cameras),
-                PARAMS_FILE: format_dataset_params(
-                    context.layout, self._bop.color_format, context.catalog, self._cameras, context.settings.rig
-                ),
+                PARAMS_FILE: format_dataset_params(context.settings, context.catalog, self._cameras),
             }
-            write_models_folders(self._out, context.catalog, mechanics=self._bop.graph)
+            for name in MODEL_FOLDERS:
+                write_models(self._out / name, context.catalog, self._bop.graph)
             write_cameras(self._out, context.layout, self._cameras, self._bop.depth_scale)
             for name, text in texts.items():
                 (self._out / name).write_text(text, encoding="utf-8", newline="\n")

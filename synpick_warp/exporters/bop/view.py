@@ -47,9 +47,7 @@ JPEG_QUALITY = "jpeg_quality"
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """Settings common to all views of a camera: which files are written, image size and formats, keypoints, constant part of the camera
-    entry.
-    """
+    """Settings common to all views of a camera."""
 
     color_suffix: str
     """.jpg or .png."""
@@ -83,9 +81,7 @@ class ViewSettings:
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
-    """Ground truth of a view: its row of `FrameBatch`, reduced to the N instances in the scene: ids, object-to-world poses [m], pixel
-    counts, boxes [px]; and where its crops lie in the image.
-    """
+    """Ground truth of a view: its row of `FrameBatch`, reduced to the N instances in the scene, and where its crops lie in the image."""
 
     scene: int
     """BOP scene_id."""
@@ -119,17 +115,12 @@ class ViewTruth:
 
 
 class RenderedView:
-    """`EncodedView` of a rendered view, from the arrays and the ground truth that `make_view_task` collects."""
+    """`EncodedView` of a rendered view, from the arrays (colour, depth and the two mask sources) and the ground truth that `make_view_task`
+    collects."""
 
     graph = None
 
     def __init__(self, images: Sequence[np.ndarray], settings: ViewSettings, truth: ViewTruth) -> None:
-        """
-        Args:
-            images: Colour, depth and the two mask sources.
-            settings: Settings of the camera's views.
-            truth: Ground truth of the view.
-        """
         self._color, self._depth, self._visible, self._amodal = images
         self._settings, self._truth = settings, truth
         self.scene, self.frame = truth.scene, truth.frame
@@ -360,11 +351,8 @@ def _bop_box(box: list[int]) -> list[int]:
 
 
 def make_keypoints(view: EncodedView, keypoints: Mapping[int, Keypoints]) -> list[dict[str, Any]]:
-    """Keys of keypoints in the COCO annotations of a view's instances, by `project_keypoints`; none without keypoints.
-
-    Raises:
-        DatasetError: A stored view has an object that the bake had not.
-    """
+    """Keys of keypoints in the COCO annotations of a view's instances, by `project_keypoints`; none without keypoints. Raises DatasetError
+    if a stored view has an object that the bake had not."""
     if not keypoints:
         return [{} for _ in view.gt]
     if unknown := {row["obj_id"] for row in view.gt} - keypoints.keys():

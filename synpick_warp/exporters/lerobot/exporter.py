@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.codes import Ending, Task
+from synpick_warp.codes import Task
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Physics
 from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
-from synpick_warp.exporters.lerobot.episode import LerobotContent, LerobotSettings, commit_episode, frame_path, group_path
+from synpick_warp.exporters.lerobot.episode import TICK, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.layout import (
     CARD,
@@ -28,12 +26,11 @@ from synpick_warp.exporters.lerobot.layout import (
     PARTS,
     STATS,
     TASKS,
-    frame_rate,
     part_path,
     video_folders,
     video_path,
+    video_rate,
 )
-from synpick_warp.exporters.lerobot.part import TICK
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
@@ -44,8 +41,6 @@ from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 
 _CUP = 2
 """Index of the cup in `TickBatch.fixture_pose`."""
-_MAX_DENOMINATOR = 100_000
-"""Frame rates are taken for fractions of at most this denominator, such as 500/33 Hz."""
 
 
 @dataclass(eq=False)
@@ -74,9 +69,7 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     def __init__(self, context: ExportContext) -> None:
         super().__init__(context)
-        settings, rig = context.settings, context.settings.rig
-        known = (video_rate(settings.physics), context.names, settings.bins[0].noun)
-        self._settings = LerobotSettings(context.out, rig.names, rig.sizes, *known)
+        self._rig, self._rate, self._names = context.settings.rig, video_rate(context.settings.physics), context.names
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
@@ -100,13 +93,13 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         """See `Exporter`: camera and notes."""
         context = self._context
         with output_errors(context.out):
-            return write_notes(context.out, context.settings, self._settings.objects, context.cameras)
+            return write_notes(context.out, context.settings, self._names, context.cameras)
 
     def write_views(self, batch: FrameBatch) -> None:
         tasks = []
         for view in range(len(batch)):
             index, camera, frame = (int(column[view]) for column in (batch.episode, batch.camera, batch.frame))
-            episode = self._staged(index, _make_content)
+            episode = self._episode(index)
             path = frame_path(episode.folder, camera, frame)
             then = partial(self._frame_spooled, episode, camera, frame // GROUP)
             tasks.append(self._task((episode,), write_frame, (batch.color[view],), (path,), path, then))
@@ -114,20 +107,23 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
         """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
-        staged, tasks = self._staged(episode, _make_content), []
+        staged, tasks = self._episode(episode), []
         for camera, scene in enumerate(scenes):
             for group in range(-(-scene.frames // GROUP)):
                 path = group_path(staged.folder, camera, group)
-                tasks.append(self._task((staged,), write_stored_group, (), (scene, group * GROUP, self._settings.rate, path), path))
+                tasks.append(self._task((staged,), write_stored_group, (), (scene, group * GROUP, self._rate, path), path))
         self._context.pool.submit_all(tasks)
 
     def write_ticks(self, batch: TickBatch) -> None:
         for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
-            self._staged(index, _make_content).content.ticks += row.tobytes()
+            self._episode(index).content.ticks += row.tobytes()
+
+    def _episode(self, index: int) -> _Staged:
+        return self._staged(index, lambda _: _LerobotContent())
 
     def places(self, episode: int) -> list[Path]:
         """Part and videos. See `EpisodeExporter`."""
-        return [part_path(episode), *(video_path(camera, episode) for camera in self._settings.cameras)]
+        return [part_path(episode), *(video_path(camera, episode) for camera in self._rig.names)]
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
         for camera, group in list(episode.content.spooled):
@@ -145,7 +141,7 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         del episode.content.spooled[camera, group]
         frames = [frame_path(episode.folder, camera, frame) for frame in range(group * GROUP, group * GROUP + size)]
         path = group_path(episode.folder, camera, group)
-        arguments = (frames, self._settings.sizes[camera], self._settings.rate, path)
+        arguments = (frames, self._rig.sizes[camera], self._rate, path)
         self._context.pool.submit_all((self._task((episode,), write_spooled_group, (), arguments, path),))
 
     def _commit(self, episode: _Staged, end: EpisodeEnd) -> WriteTask:
@@ -154,21 +150,9 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
             raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {count} came")
         if groups := len(episode.content.spooled):
             raise ValueError(f"episode {end.episode} ended, but views of {groups} groups of pictures are missing")
-        content = make_content(end, bytes(episode.content.ticks))
-        place = self._context.out / part_path(end.episode)
-        return WriteTask(commit_episode, (), (episode.folder, content, self._settings), place)
-
-
-def _make_content(_: Path) -> _LerobotContent:
-    return _LerobotContent()
-
-
-def make_content(end: EpisodeEnd, ticks: bytes) -> LerobotContent:
-    """What the part of an episode is made of."""
-    row = end.row
-    return LerobotContent(
-        end.episode, str(row.get("mode", "")), Ending(end.ending).name.lower(), int(row.get("picked", 0)), ticks, end.attempts
-    )
+        out = self._context.out
+        arguments = (episode.folder, end, bytes(episode.content.ticks), self._names, out, self._context.settings)
+        return WriteTask(commit_episode, (), arguments, out / part_path(end.episode))
 
 
 def make_ticks(batch: TickBatch) -> np.ndarray:
@@ -179,8 +163,3 @@ def make_ticks(batch: TickBatch) -> np.ndarray:
     rows["suction"] = "task" in batch.tick and batch.tick["task"] == Task.LIFT
     rows["attached"] = "attached" in batch.tick and np.any(batch.tick["attached"], axis=1)
     return rows
-
-
-def video_rate(physics: Physics) -> Fraction:
-    """Frames per second as a fraction."""
-    return Fraction(frame_rate(physics)).limit_denominator(_MAX_DENOMINATOR)

@@ -1,6 +1,8 @@
 """Tables over all episodes of a LeRobot data set: data, episodes, tasks, statistics, info.json and dataset card, from the parts.
 
-Parts are read one after the other, so memory does not grow with the number of frames; only the list of episodes is held.
+Parts are read one after the other, so memory does not grow with the number of frames; only the list of episodes is held. Statistics of
+numbers are merged as LeRobot does it: quantiles of all are means of the episodes', weighted by frames. Those of colours follow from
+histograms, which add up exactly.
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from synpick_warp.codes import Outcome, names
 from synpick_warp.configs.cell.rig import Size
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.lerobot.episode import make_folders
+from synpick_warp.exporters.lerobot.episode import LerobotPart, make_folders
 from synpick_warp.exporters.lerobot.layout import (
     CARD,
     CHUNK,
@@ -41,23 +44,24 @@ from synpick_warp.exporters.lerobot.layout import (
     part_path,
     split_name,
 )
-from synpick_warp.exporters.lerobot.part import LerobotPart, outcome_names
-from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
 from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.system.inputs.json import read_json
 from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.linear_algebra import dot
 
 ROW_GROUP = 20_000
 """Frames of a row group of the data: about 2 MB."""
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+"""LeRobot's names and values."""
+_WHITE = 255.0
+Statistics = dict[str, np.ndarray]
 _ADVICE = "remove it, its episode's videos and two files in manifest/, and resume the bake"
 
 
 @dataclass(eq=False)
 class _Totals:
-    """Totals over all episodes read so far: sentences with their index, statistics, colour histograms, frames, rows of the table of
-    episodes.
-    """
+    """Totals over all episodes read so far."""
 
     tasks: dict[str, int] = field(default_factory=dict)
     """Sentence -> index, in order of appearance."""
@@ -70,12 +74,8 @@ class _Totals:
 
 
 def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
-    """Write the tables over the committed episodes, sorted; returns them, relative to the data set.
-
-    Raises:
-        DatasetError: A part is damaged.
-        OSError: A file cannot be written.
-    """
+    """Write the tables over the committed episodes, sorted; returns them, relative to the data set. Raises DatasetError if a part is
+    damaged, and OSError if a file cannot be written."""
     rig, rate, totals = settings.rig, frame_rate(settings.physics), _Totals()
     totals.levels = {name: np.zeros((3, 256), np.int64) for name in rig.names}
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
@@ -90,7 +90,7 @@ def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) 
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
     splits = [row["source/split"] for row in totals.rows]
     info = make_info(rig, rate, splits, totals.frames, len(totals.tasks))
-    info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
+    info["features"]["attempt.outcome"]["info"] = {"codes": list(names(Outcome))}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
         _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
@@ -180,6 +180,57 @@ def _add_episode(source: int, part: LerobotPart, columns: dict[str, np.ndarray],
         totals.statistics[name] = merge_numbers(totals.statistics[name], values) if name in totals.statistics else values
     totals.rows.append(row)
     totals.frames += part.frames
+
+
+def describe_numbers(values: np.ndarray) -> Statistics:
+    """Statistics of each component of values (frame, component), over frames."""
+    numbers = values.astype(np.float64)
+    quantiles = np.quantile(numbers, list(QUANTILES.values()), axis=0)
+    return {
+        "min": numbers.min(axis=0),
+        "max": numbers.max(axis=0),
+        "mean": numbers.mean(axis=0),
+        "std": numbers.std(axis=0),
+        "count": np.array([len(numbers)]),
+        **dict(zip(QUANTILES, quantiles, strict=True)),
+    }
+
+
+def merge_numbers(total: Statistics, more: Statistics) -> Statistics:
+    """Statistics of two sets of frames together; quantiles are weighted means."""
+    count = total["count"] + more["count"]
+    share = more["count"] / count
+    mean = total["mean"] + share * (more["mean"] - total["mean"])
+    spread = total["std"] ** 2 * (1 - share) + more["std"] ** 2 * share + share * (1 - share) * (more["mean"] - total["mean"]) ** 2
+    return {
+        "min": np.minimum(total["min"], more["min"]),
+        "max": np.maximum(total["max"], more["max"]),
+        "mean": mean,
+        "std": np.sqrt(spread),
+        "count": count,
+        **{name: (1 - share) * total[name] + share * more[name] for name in QUANTILES},
+    }
+
+
+def describe_levels(levels: np.ndarray, frames: int) -> Statistics:
+    """Statistics of a video's channels, from 0 to 1 and of shape (3, 1, 1), from their histograms (3, 256); quantiles are levels."""
+    values = np.arange(levels.shape[1]) / _WHITE
+    weights = levels / levels.sum(axis=1, keepdims=True)
+    mean = dot(weights, values)
+    reached = np.cumsum(levels, axis=1)
+    channels = {
+        "min": values[np.argmax(levels > 0, axis=1)],
+        "max": values[levels.shape[1] - 1 - np.argmax(levels[:, ::-1] > 0, axis=1)],
+        "mean": mean,
+        "std": np.sqrt(np.sum(weights * (values - mean[:, None]) ** 2, axis=1)),
+        **{name: values[np.argmax(reached >= fraction * reached[:, -1:], axis=1)] for name, fraction in QUANTILES.items()},
+    }
+    return {**{name: value.reshape(-1, 1, 1) for name, value in channels.items()}, "count": np.array([frames])}
+
+
+def to_json(statistics: Statistics) -> dict[str, Any]:
+    """Statistics as lists, for JSON."""
+    return {name: value.tolist() for name, value in statistics.items()}
 
 
 def _batch_tables(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:

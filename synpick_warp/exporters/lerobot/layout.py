@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,8 @@ CHUNK = 1000
 VERSION = "v3.0"
 ROBOT = "suction_gripper"
 CODEC, PIXEL_FORMAT = "h264", "yuv420p"
+_MAX_DENOMINATOR = 100_000
+"""Frame rates are taken for fractions of at most this denominator, such as 500/33 Hz."""
 _CHUNKED = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _SIZES = {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
 """LeRobot's defaults, for recorders that append to the data set [MB]."""
@@ -43,7 +46,6 @@ class Feature(NamedTuple):
 
     dtype: str
     names: tuple[str, ...] = ()
-    """Empty: a single number."""
 
 
 FRAME_FEATURES = {
@@ -103,6 +105,11 @@ def frame_rate(physics: Physics) -> float | int:
     """Frames per second of simulated time [Hz]; whole numbers as integers."""
     rate = 1.0 / physics.tick_time
     return round(rate) if abs(rate - round(rate)) < 1e-9 else rate
+
+
+def video_rate(physics: Physics) -> Fraction:
+    """Frames per second as a fraction."""
+    return Fraction(frame_rate(physics)).limit_denominator(_MAX_DENOMINATOR)
 
 
 def split_name(layout: DataLayout, episode: int) -> str:

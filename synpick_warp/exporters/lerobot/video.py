@@ -40,14 +40,8 @@ LEVELS = 256
 
 
 def split_planes(color: np.ndarray) -> np.ndarray:
-    """Convert an RGB image to planar YUV 4:2:0 (I420; BT.601, limited range).
-
-    Args:
-        color: Image (H, W, 3) uint8; H and W are even.
-
-    Returns:
-        Planes Y, U and V, one after the other (3 H / 2, W) uint8.
-    """
+    """Convert an RGB image (H, W, 3) uint8, H and W even, to planar YUV 4:2:0 (I420; BT.601, limited range): planes Y, U and V, one after
+    the other (3 H / 2, W) uint8."""
     return cv2.cvtColor(color, cv2.COLOR_RGB2YUV_I420)
 
 

@@ -30,7 +30,7 @@ LABELS = {
 
 @dataclass(frozen=True)
 class TrajectoryArray:
-    """Schema of one array of the store: dimensions, type, unit (1: none), description, names of the values of an enumeration."""
+    """Schema of one array of the store."""
 
     dims: tuple[str, ...]
     """Names of its dimensions."""
@@ -184,3 +184,5 @@ CAMERAS = GroupSpec(
 )
 CONSTANT_GROUPS = {"objects": OBJECTS, "cameras": CAMERAS}
 """Groups of the store that all episodes share."""
+CONSTANT_FILES = (STORE / "zarr.json", *(STORE / name for name in CONSTANT_GROUPS), STORE / EPISODES / "zarr.json")
+"""Files and folders of the store that all episodes share, relative to the data set."""

@@ -12,83 +12,68 @@ import numpy as np
 import zarr
 
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.schema import Trajectory
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE_GROUPS
-from synpick_warp.exporters.trajectory.spool import ROWS, field_name, read_rows
-from synpick_warp.exporters.trajectory.store import add_array, add_group, chunk_layout
+from synpick_warp.exporters.trajectory.spool import ROWS, field_name
+from synpick_warp.exporters.trajectory.store import add_array, add_group, add_table, chunk_layout
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
 
 GROUP = "group"
 """Name of the group in an episode's staging folder."""
 
 
-@dataclass(frozen=True)
-class TrajectorySettings:
-    """Settings common to all episodes: trajectory settings, duration of a step [s], steps per tick, masses [kg] by obj_id."""
+@dataclass(eq=False)
+class SpooledEpisode:
+    """What is kept of an episode whose ticks are being spooled: all that its group holds besides these and its attempts."""
 
-    trajectory: Trajectory
-    step: float
-    """Duration of a physics step [s]."""
-    steps_per_tick: int
-    masses: Mapping[int, float]
-    """obj_id -> mass [kg]."""
-
-
-@dataclass(frozen=True, eq=False)
-class EpisodeContent:
-    """Content of an episode's group besides the spooled ticks: attributes, obj_ids, drop poses (None: not recorded), attempts."""
-
-    attributes: Mapping[str, Any]
+    row: np.dtype
+    """Type of a row of its spool file."""
+    attributes: dict[str, Any]
     """Attributes of its group."""
     object_id: np.ndarray
     """obj_id of each instance at the first frame (instance) int32."""
     drop_pose: np.ndarray | None
     """Poses at which the objects were dropped (instance, 7) float32; None: not recorded."""
-    attempts: Sequence[str]
-    """Lines of attempts.jsonl."""
+    count: int = 0
+    """Number of ticks so far."""
 
 
-def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content: EpisodeContent, settings: TrajectorySettings) -> None:
-    """Task: write an episode's group and rename it to its place.
+def write_episode(
+    folder: Path, episode: SpooledEpisode, attempts: Sequence[str], place: Path, masses: Mapping[int, float], settings: ExportSettings
+) -> None:
+    """Task: write an episode's group, of the rows in its staging folder and its lines of attempts.jsonl, and rename it to its place.
 
-    Args:
-        folder: The episode's staging folder with its spool file.
-        row: Structured type of a spooled row.
-        count: Number of rows.
-        place: Final path of the group.
-        content: Content besides the rows.
-        settings: Settings common to all episodes.
+    `masses` [kg] are by obj_id.
     """
-    group = zarr.create_group(folder / GROUP, attributes=dict(content.attributes))
+    group = zarr.create_group(folder / GROUP, attributes=episode.attributes)
     level = settings.trajectory.level
-    rows = read_rows(folder / ROWS, row, count)
-    _write_rows(group, rows, settings)
-    _write_arrangement(group, content, settings)
-    arrays = make_attempt_arrays([json.loads(line) for line in content.attempts], len(content.object_id))
-    arrays["record"] = np.frombuffer("".join(content.attempts).encode(), np.uint8)
-    attempts = add_group(group, "attempts", ATTEMPTS)
-    for name, spec in ATTEMPTS.arrays.items():
-        add_array(attempts, name, spec, arrays[name], level)
-    del rows
+    _write_rows(group, np.memmap(folder / ROWS, episode.row, "r", shape=(episode.count,)), settings)
+    missing = np.full((len(episode.object_id), 7), np.nan, np.float32)
+    arrangement = {
+        "object_id": episode.object_id,
+        "mass": np.array([masses.get(int(obj_id), np.nan) for obj_id in episode.object_id]),
+        "drop_pose": missing if episode.drop_pose is None else episode.drop_pose,
+    }
+    add_table(group, "arrangement", ARRANGEMENT, arrangement, level)
+    arrays = make_attempt_arrays([json.loads(line) for line in attempts], len(episode.object_id))
+    arrays["record"] = np.frombuffer("".join(attempts).encode(), np.uint8)
+    add_table(group, "attempts", ATTEMPTS, arrays, level)
     for path in sorted((folder / GROUP).rglob("*")):
-        if path.is_dir():
-            sync_folder(path)
-        else:
-            sync_file(path)
+        (sync_folder if path.is_dir() else sync_file)(path)
     sync_folder(folder / GROUP)
     (folder / GROUP).rename(place)
     sync_folder(place.parent)
 
 
-def _write_rows(group: zarr.Group, rows: np.ndarray, settings: TrajectorySettings) -> None:
+def _write_rows(group: zarr.Group, rows: np.ndarray, settings: ExportSettings) -> None:
     """Write the groups `ticks` and `steps`, one array after the other to bound memory."""
-    steps = settings.steps_per_tick
+    steps = settings.physics.steps_per_tick
     for name, rows_per_tick in (("ticks", 1), ("steps", steps)):
         names = rows.dtype.names or ()
         given = {array: rows[field_name(name, array)] for array in EPISODE_GROUPS[name].arrays if field_name(name, array) in names}
         if name == "steps" and given:
             # The time at each step's end, counted back from the tick's time.
-            given["time"] = rows["ticks/time"][:, None] - settings.step * np.arange(steps - 1, -1, -1)
+            given["time"] = rows["ticks/time"][:, None] - settings.physics.step * np.arange(steps - 1, -1, -1)
         if not given:
             continue
         target = add_group(group, name, EPISODE_GROUPS[name])
@@ -115,19 +100,6 @@ class _FlattenedSteps:
     def __getitem__(self, part: slice) -> np.ndarray:
         values = self._values[part.start // self._rows : part.stop // self._rows]
         return values.reshape(-1, *self.shape[1:])
-
-
-def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: TrajectorySettings) -> None:
-    """Write the group of an episode's objects: obj_id, mass and drop pose; NaN where unknown."""
-    arrangement = add_group(group, "arrangement", ARRANGEMENT)
-    drop_pose = content.drop_pose
-    values = {
-        "object_id": content.object_id,
-        "mass": np.array([settings.masses.get(int(obj_id), np.nan) for obj_id in content.object_id]),
-        "drop_pose": drop_pose if drop_pose is not None else np.full((len(content.object_id), 7), np.nan, np.float32),
-    }
-    for name, spec in ARRANGEMENT.arrays.items():
-        add_array(arrangement, name, spec, values[name].astype(spec.dtype), settings.trajectory.level)
 
 
 def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -> dict[str, np.ndarray]:

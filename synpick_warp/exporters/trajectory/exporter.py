@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,34 +14,19 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
-from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
-from synpick_warp.exporters.trajectory.episode import EpisodeContent, TrajectorySettings, write_episode
-from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
-from synpick_warp.exporters.trajectory.store import constant_places, write_constants
+from synpick_warp.exporters.trajectory.arrays import CONSTANT_FILES, EPISODES, STORE
+from synpick_warp.exporters.trajectory.episode import SpooledEpisode, write_episode
+from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, batch_type, make_rows, spool_bytes, write_rows
+from synpick_warp.exporters.trajectory.store import write_constants
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.system.processes.shared_memory import shared_bytes
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
-
-@dataclass(eq=False)
-class _Content:
-    """What is kept of an episode whose ticks are being spooled."""
-
-    row: np.dtype
-    """Type of a row of its spool file."""
-    initial: dict[str, Any]
-    """Attributes known from its first tick."""
-    object_id: np.ndarray
-    drop_pose: np.ndarray | None
-    count: int = 0
-    """Number of ticks so far."""
+_Staged = StagedEpisode[SpooledEpisode]
 
 
-_Staged = StagedEpisode[_Content]
-
-
-class TrajectoryExporter(EpisodeExporter[_Content]):
+class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
     """`Exporter` of zarr. Episode k becomes the group `episodes/k` of one store.
 
     Ticks are spooled to a hidden file, from which a writer process makes the group when the episode has ended. A task spools one tick of
@@ -54,13 +38,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
 
     def __init__(self, context: ExportContext) -> None:
         super().__init__(context)
-        settings = context.settings
-        self._settings = TrajectorySettings(
-            trajectory=settings.trajectory,
-            step=settings.physics.step,
-            steps_per_tick=settings.physics.steps_per_tick,
-            masses={body.obj_id: body.mass for body in context.catalog.bodies},
-        )
+        self._masses = {body.obj_id: body.mass for body in context.catalog.bodies}
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
@@ -70,18 +48,13 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
+        return SharedFiles(CONSTANT_FILES, (), (STORE / EPISODES, STORE))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: the store with its groups of objects and cameras."""
-        context, store = self._context, self._context.out / STORE
-        with output_errors(store):
-            store.mkdir(exist_ok=True)
-            (store / EPISODES).mkdir(exist_ok=True)
-            settings, level = context.settings, context.settings.trajectory.level
-            assets = (context.catalog, context.cameras, context.lights)
-            written = write_constants(store, settings.bins[0].noun, settings.bake.seed, settings.physics, level, *assets)
-        return [path.relative_to(context.out) for path in written]
+        with output_errors(self._context.out / STORE):
+            write_constants(self._context)
+        return list(CONSTANT_FILES)
 
     def write_ticks(self, batch: TickBatch) -> None:
         indices = batch.episode.tolist()
@@ -92,9 +65,10 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         """The group. See `EpisodeExporter`."""
         return (STORE / EPISODES / f"{episode:06d}",)
 
-    def _make_content(self, batch: TickBatch, world: int, _: Path) -> _Content:
+    def _make_content(self, batch: TickBatch, world: int, _: Path) -> SpooledEpisode:
         """What the first tick of an episode tells, that of a world of a batch."""
-        instances = count_instances(batch, world)
+        present = np.flatnonzero(batch.object_id[world] != -1)
+        instances = int(present[-1]) + 1 if present.size else 0
         light = int(batch.light[world])
         initial: dict[str, Any] = {
             "light": {
@@ -113,16 +87,11 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         object_id = batch.object_id[world, :instances].copy()
         if drop_pose is not None:
             drop_pose[object_id == -1] = np.nan
-        row = batch_type(batch, instances, self._settings.steps_per_tick)
-        return _Content(row, initial, object_id, drop_pose)
+        row = batch_type(batch, instances, self._context.settings.physics.steps_per_tick)
+        return SpooledEpisode(row, initial, object_id, drop_pose)
 
     def _spool(self, batch: TickBatch, episodes: Sequence[_Staged]) -> Iterator[WriteTask]:
-        """Tasks that spool a batch, each the frames of at most SPOOL_ROWS episodes whose rows have the same type.
-
-        Args:
-            batch: The batch.
-            episodes: Episode of each of its frames.
-        """
+        """Tasks that spool a batch, each the frames of at most SPOOL_ROWS of its `episodes` (frame) whose rows have the same type."""
         groups: dict[int, list[int]] = {}
         for frame, episode in enumerate(episodes):
             groups.setdefault(len(episode.content.object_id), []).append(frame)
@@ -131,7 +100,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
                 part = frames[first : first + SPOOL_ROWS]
                 owners = [episodes[frame] for frame in part]
                 rows = make_rows(batch.select(np.array(part)), owners[0].content.row, instances)
-                places = [Place(episode.folder.name, episode.content.count * rows.itemsize) for episode in owners]
+                places = [(episode.folder.name, episode.content.count * rows.itemsize) for episode in owners]
                 for episode in owners:
                     episode.content.count += 1
                 image = rows.view(np.uint8).reshape(len(rows), rows.itemsize)
@@ -142,7 +111,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
         if kept.count != end.frames:
             raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {kept.count} came")
         ending = Ending(end.ending)
-        attributes = {
+        kept.attributes = {
             "episode": end.episode,
             "arrangement": end.arrangement,
             "frames": end.frames,
@@ -150,8 +119,7 @@ class TrajectoryExporter(EpisodeExporter[_Content]):
             "sentence": ending.sentence,
             "seed": self._context.settings.bake.seed,
             **end.row,
-            **kept.initial,
+            **kept.attributes,
         }
-        content = EpisodeContent(attributes, kept.object_id, kept.drop_pose, end.attempts)
         place = self._context.out / self.places(end.episode)[0]
-        return WriteTask(write_episode, (), (episode.folder, kept.row, kept.count, place, content, self._settings), place)
+        return WriteTask(write_episode, (), (episode.folder, kept, end.attempts, place, self._masses, self._context.settings), place)

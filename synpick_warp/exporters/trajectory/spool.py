@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,15 +28,6 @@ def field_name(group: str, name: str) -> str:
     return f"{group}/{name}"
 
 
-class Place(NamedTuple):
-    """Location of a row on disk: staging folder of the episode, and byte offset in its spool file."""
-
-    folder: str
-    """Name of the episode's staging folder."""
-    offset: int
-    """Byte offset of the row in the episode's spool file."""
-
-
 @cache
 def row_type(ticks: tuple[str, ...], steps: tuple[str, ...], instances: int, steps_per_tick: int) -> np.dtype:
     """Structured type of a row: one tick of the named arrays of `TICKS` and `STEPS`, in this order."""
@@ -52,28 +42,14 @@ def row_type(ticks: tuple[str, ...], steps: tuple[str, ...], instances: int, ste
 
 
 def spool_bytes(instances: int, steps_per_tick: int, has_steps: bool) -> int:
-    """Maximum size of the rows of one task [B].
-
-    Args:
-        instances: Instance capacity of a world.
-        steps_per_tick: Number of physics steps in a tick.
-        has_steps: Whether steps are recorded.
-    """
+    """Maximum size of the rows of one task [B]; `instances`: capacity of a world, `has_steps`: whether steps are recorded."""
     steps = tuple(STEPS.arrays) if has_steps else ()
     return SPOOL_ROWS * row_type(tuple(TICKS.arrays), steps, instances, steps_per_tick).itemsize
 
 
 def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtype:
-    """Structured type of rows that hold a batch's arrays.
-
-    Args:
-        batch: The batch.
-        instances: Number of instances of an episode.
-        steps_per_tick: Number of physics steps in a tick.
-
-    Raises:
-        ValueError: The batch has arrays of steps that the schema lacks; such arrays of ticks are left out.
-    """
+    """Structured type of rows that hold a batch's arrays, of an episode with this number of instances; raises ValueError if the batch has
+    arrays of steps that the schema lacks; such arrays of ticks are left out."""
     ticks = tuple(name for name in TICKS.arrays if name in _OWN or name in batch.tick)
     steps = tuple(name for name in STEPS.arrays if name in batch.steps)
     if len(steps) != len(batch.steps):
@@ -82,13 +58,8 @@ def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtyp
 
 
 def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
-    """Rows of the frames of a batch (frame).
-
-    Args:
-        batch: Frames of episodes that have the same number of instances.
-        row: Their type, by `batch_type`.
-        instances: That number; the capacity of a world may be larger.
-    """
+    """Rows (frame) of the type `row`, by `batch_type`, of a batch of episodes that have the same number of instances; the capacity of a
+    world may be larger."""
     rows = np.empty(len(batch), row)
     for name in row.names or ():
         group, _, array = name.partition("/")
@@ -103,16 +74,13 @@ def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
     return rows
 
 
-def write_rows(rows: np.ndarray, staging: Path, places: Sequence[Place]) -> None:
-    """Task: write rows to the spool files of their episodes. Tasks may run in any order.
+def write_rows(rows: np.ndarray, staging: Path, places: Sequence[tuple[str, int]]) -> None:
+    """Task: write rows as bytes (row, byte) uint8 to the spool files of their episodes. Tasks may run in any order.
 
-    Args:
-        rows: Rows as bytes (row, byte) uint8.
-        staging: Folder of the episodes' staging folders.
-        places: Place of each row.
+    `places` are the staging folder of each row's episode, by name in `staging`, and the row's offset in the spool file there [B].
     """
-    for row, place in zip(rows, places, strict=True):
-        _write_row(row, os.path.join(staging, place.folder, ROWS), place.offset)
+    for row, (folder, offset) in zip(rows, places, strict=True):
+        _write_row(row, os.path.join(staging, folder, ROWS), offset)
 
 
 def _write_row(row: np.ndarray, path: str, offset: int) -> None:
@@ -127,14 +95,3 @@ def _write_row(row: np.ndarray, path: str, offset: int) -> None:
         raise OSError(error.errno, error.strerror, path) from error
     finally:
         os.close(handle)
-
-
-def read_rows(path: Path, row: np.dtype, count: int) -> np.ndarray:
-    """Memory-map all rows of a spool file (tick)."""
-    return np.memmap(path, row, "r", shape=(count,))
-
-
-def count_instances(batch: TickBatch, world: int) -> int:
-    """Size of a world's instance dimension: 1 + the largest index of an instance at its first frame."""
-    present = np.flatnonzero(batch.object_id[world] != -1)
-    return int(present[-1]) + 1 if present.size else 0

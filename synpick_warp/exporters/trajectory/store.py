@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,20 @@ import zarr
 from zarr.codecs import ZstdCodec
 
 from synpick_warp.configs.cell.cameras import WORLD
-from synpick_warp.configs.schema import Physics, Trajectory
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, GroupSpec, TrajectoryArray
-from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Catalog, EnvironmentMap
+from synpick_warp.configs.schema import Trajectory
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.trajectory.arrays import (
+    CAMERAS,
+    CONSTANT_FILES,
+    EPISODES,
+    FORMAT,
+    LABELS,
+    OBJECTS,
+    STORE,
+    GroupSpec,
+    TrajectoryArray,
+)
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog
 from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
@@ -26,17 +36,19 @@ def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping
     return parent.create_group(name, attributes={"description": doc.description, **coordinates, **(attributes or {})})
 
 
-def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
-    """Write an array.
+def add_table(
+    parent: zarr.Group, name: str, doc: GroupSpec, columns: Mapping[str, Any], level: int, attributes: Mapping[str, Any] | None = None
+) -> None:
+    """Create a group and write its arrays, `columns` by name, in the schema's types; `level`: compression level of zstd."""
+    group = add_group(parent, name, doc, attributes)
+    for column, spec in doc.arrays.items():
+        add_array(group, column, spec, np.asarray(columns[column], spec.dtype), level)
 
-    Args:
-        group: Parent group.
-        name: Name in the group.
-        spec: Schema of the array.
-        data: Values, of the schema's shape; sliced one shard at a time.
-        level: Compression level of zstd.
-        chunk: Rows per chunk (compressed together); 0: all.
-        shard: Rows per shard (file), a multiple of `chunk`; 0: the array is not sharded.
+
+def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
+    """Write an array of values, of the schema's shape, which are sliced one shard at a time; `level`: compression level of zstd.
+
+    `chunk`: rows per chunk (compressed together), 0: all; `shard`: rows per shard (file), a multiple of `chunk`, 0: it is not sharded.
     """
     attributes: dict[str, Any] = {"units": spec.unit, "description": spec.description}
     labels = {dim: list(LABELS[dim]) for dim in spec.dims if dim in LABELS}
@@ -85,38 +97,12 @@ def _describe_distractors(catalog: Catalog) -> dict[str, Any]:
     return {"description": text, "names": {str(body.obj_id): body.name for body in catalog.distractors}}
 
 
-def constant_places(store: Path) -> list[Path]:
-    """Files and folders of the store that all episodes share."""
-    return [store / "zarr.json", *(store / name for name in CONSTANT_GROUPS), store / EPISODES / "zarr.json"]
-
-
-def write_constants(
-    store: Path,
-    noun: str,
-    seed: int,
-    physics: Physics,
-    level: int,
-    catalog: Catalog,
-    cameras: tuple[Camera, ...],
-    lights: tuple[EnvironmentMap, ...],
-) -> list[Path]:
-    """Write the store's root, the groups of objects and cameras, and the empty group of episodes, replacing existing ones.
-
-    Args:
-        store: Existing folder that contains a folder for the episodes.
-        noun: What objects are in or on, such as tote.
-        seed: Seed of the bake.
-        physics: Time step and gravity.
-        level: Compression level of zstd.
-        catalog: The objects.
-        cameras: The cameras.
-        lights: The environment maps.
-
-    Returns:
-        Files and folders that were written.
-    """
-    places = constant_places(store)
-    for place in places:
+def write_constants(context: ExportContext) -> None:
+    """Write the store's root, the groups of objects and cameras, and the group of episodes, replacing existing ones (CONSTANT_FILES)."""
+    store, physics, level = context.out / STORE, context.settings.physics, context.settings.trajectory.level
+    for folder in (store, store / EPISODES):
+        folder.mkdir(exist_ok=True)
+    for place in (context.out / name for name in CONSTANT_FILES):
         if place.is_dir():
             shutil.rmtree(place)
         else:
@@ -124,29 +110,24 @@ def write_constants(
     root = zarr.create_group(
         store,
         attributes={
-            "description": f"Physics of a synpick-warp data set. SI units; the world's origin is the centre of the {noun}'s inner floor,"
-            f" z up. Episodes are in {EPISODES}, named by number.",
+            "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the"
+            f" {context.settings.bins[0].noun}'s inner floor, z up. Episodes are in {EPISODES}, named by number.",
             "format": FORMAT,
-            "seed": seed,
+            "seed": context.settings.bake.seed,
             "step": physics.step,
             "steps_per_tick": physics.steps_per_tick,
             "gravity": physics.gravity,
             "units": {"step": "s", "gravity": "m/s²"},
-            "lights": [light.name for light in lights],
-            **({"distractors": _describe_distractors(catalog)} if catalog.distractors else {}),
+            "lights": [light.name for light in context.lights],
+            **({"distractors": _describe_distractors(context.catalog)} if context.catalog.distractors else {}),
         },
     )
-    entries = catalog.entries
-    objects = add_group(root, "objects", OBJECTS, {"names": [entry.name for entry in entries]})
-    for name, spec in OBJECTS.arrays.items():
-        values = [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries]
-        add_array(objects, name, spec, np.array(values, spec.dtype), level)
+    entries, cameras = context.catalog.entries, context.cameras
+    columns = {name: [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries] for name in OBJECTS.arrays}
+    add_table(root, "objects", OBJECTS, columns, level, {"names": [entry.name for entry in entries]})
     known = {"fixed_to": [camera.fixed_to for camera in cameras], "distortion": [camera.distortion or None for camera in cameras]}
     usual = {"fixed_to": WORLD, "distortion": None}
-    told = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
-    group = add_group(root, "cameras", CAMERAS, told)
-    for name, spec in CAMERAS.arrays.items():
-        values = [getattr(camera, name) for camera in cameras]
-        add_array(group, name, spec, np.array(values, spec.dtype), level)
+    unusual = {name: values for name, values in known.items() if any(value != usual[name] for value in values)}
+    columns = {name: [getattr(camera, name) for camera in cameras] for name in CAMERAS.arrays}
+    add_table(root, "cameras", CAMERAS, columns, level, unusual)
     add_group(root, EPISODES, GroupSpec("One group an episode, named by its number with six digits."))
-    return places

@@ -13,7 +13,8 @@ import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
 from synpick_warp.codes import LookPart
-from synpick_warp.configs.schema import Gripper, Physics, Render
+from synpick_warp.configs.schema import Physics, Render
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
     add_body,
@@ -28,36 +29,26 @@ from synpick_warp.exporters.usd.parts import (
     write_texture,
 )
 from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, bin_asset, drawn_texture, object_asset
-from synpick_warp.scenes.bins import Bin
+from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.grippers.head import rod_inertia
 from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
 from synpick_warp.scenes.grippers.registry import make_head
-from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
 from synpick_warp.scenes.tote import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
+from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, Fixture, Material, TriangleMesh
 
 
-def write_library(
-    library: Path,
-    bins: Sequence[Bin],
-    gripper: Gripper,
-    physics: Physics,
-    render: Render,
-    catalog: Catalog,
-    lights: tuple[EnvironmentMap, ...],
-    looks: Looks | None,
-) -> None:
-    """Write all assets into an existing folder, replacing existing ones; with `looks`, the textures that episodes draw from, too.
+def write_library(library: Path, context: ExportContext) -> None:
+    """Write all assets into an existing folder, replacing existing ones; if looks are drawn, the textures that they are drawn from, too.
 
-    Raises:
-        OSError: A file cannot be written.
-        OutputError: A file cannot be written, as reported by USD.
+    Raises OSError, or OutputError as reported by USD, if a file cannot be written.
     """
+    settings, looks = context.settings, context.looks
+    bins, gripper, physics, table = make_bins(settings.bins), settings.gripper, settings.physics, settings.bins[0].ground
     for name in (TEXTURES, "lights"):
         (library / name).mkdir(exist_ok=True)
-    write_light_maps(library, lights)
-    for entry in catalog.bodies:
+    write_light_maps(library, context.lights)
+    for entry in context.catalog.bodies:
         _write_object(library, physics, entry)
     for one in bins:
         if one.sizes.is_visible:
@@ -75,11 +66,11 @@ def write_library(
     _save(library, "cup", cup)
     textures = {} if looks is None else looks.textures
     if textures.get(LookPart.BACKGROUND):
-        _write_floor(library, bins[0].sizes.ground - FLOOR_DROP)
+        _write_floor(library, table - FLOOR_DROP)
     for part, images in textures.items():
         for index, texture in enumerate(images):
             write_texture(library, drawn_texture(part, index), texture)
-    _write_table(library, physics, bins[0].sizes.ground, render, bool(textures.get(LookPart.TABLE)))
+    _write_table(library, physics, table, settings.render, bool(textures.get(LookPart.TABLE)))
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
@@ -119,15 +110,8 @@ def _add_shapes(
 
 
 def _write_table(library: Path, physics: Physics, height: float, render: Render, has_textures: bool) -> None:
-    """Write the table under the bins: a collision box, and a visible top side.
-
-    Args:
-        library: Folder of the assets.
-        physics: Friction and contact gap.
-        height: z of the top side [m].
-        render: Whether the table is rendered, its size and colour.
-        has_textures: Whether texture coordinates are metres; else they span the table.
-    """
+    """Write the table under the bins: a collision box, and a visible top side at this height [m], whose texture coordinates are metres if
+    it has textures; else they span the table."""
     stage = new_asset("table", "table")
     root, friction = _add_contact_material(stage, physics)
     if render.table:

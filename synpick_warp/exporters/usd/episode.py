@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.usd.types import EpisodeMetadata, UsdSettings
+from synpick_warp.exporters.usd.types import UsdSettings
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
-from synpick_warp.views.frames import TickBatch
+from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 TICKS = 64
 """Number of ticks that are buffered in memory: about 50 kB per world."""
@@ -22,14 +22,9 @@ _FIELDS = ("frame", "bin", "object_id", "pose", "fixture_pose", "fixture_visible
 
 
 class TickSpool:
-    """Buffered writer of one arrangement's ticks."""
+    """Buffered writer of one arrangement's ticks, which appends to a file, TICKS rows at a time; `instances`: capacity of a world."""
 
     def __init__(self, path: Path, instances: int) -> None:
-        """
-        Args:
-            path: File that it appends to, TICKS rows at a time.
-            instances: Instance capacity of a world.
-        """
         self.path, self.instances = path, instances
         self._rows = np.zeros((TICKS, tick_type(instances).itemsize), np.uint8)
         self._count = 0
@@ -78,24 +73,16 @@ def read_ticks(path: Path, instances: int) -> np.ndarray:
     return np.fromfile(path, tick_type(instances))
 
 
-def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMetadata, settings: UsdSettings) -> None:
-    """Task: write an episode's file beside its spool, and rename it to its place.
-
-    Args:
-        spool: File of a `TickSpool`.
-        instances: Instance capacity of its rows.
-        place: Final path of the episode's file; its folder also holds `assets/`.
-        metadata: Properties of the episode.
-        settings: Settings common to all episodes.
-    """
+def write_episode(spool: Path, instances: int, place: Path, end: EpisodeEnd, settings: UsdSettings) -> None:
+    """Task: write an episode's file beside its spool, of a `TickSpool` with this capacity, and rename it to its place beside `assets/`."""
     from synpick_warp.exporters.usd.parts import save_layer
     from synpick_warp.exporters.usd.stage import make_episode_layer
 
     ticks = read_ticks(spool, instances)
-    if ticks["frame"].tolist() != list(range(metadata.frames)):
-        raise OutputError(f"{place} has {len(ticks)} of {metadata.frames} frames; this is an error of synpick-warp, please report it")
+    if ticks["frame"].tolist() != list(range(end.frames)):
+        raise OutputError(f"{place} has {len(ticks)} of {end.frames} frames; this is an error of synpick-warp, please report it")
     staged = spool.with_name(f"{spool.name}.usdc")
-    save_layer(make_episode_layer(ticks, metadata, settings), staged)
+    save_layer(make_episode_layer(ticks, end, settings), staged)
     sync_file(staged)
     staged.rename(place)
     sync_folder(place.parent)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -10,7 +11,7 @@ from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.usd.episode import TickSpool, tick_rows, write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
-from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, EpisodeMetadata, UsdSettings, bin_asset, object_asset
+from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, UsdSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import make_bins
@@ -41,20 +42,17 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         """See `Exporter`: the asset library."""
         from synpick_warp.exporters.usd.assets import write_library  # pxr loads slowly, and only this method needs it.
 
-        context = self._context
-        library = context.out / LIBRARY
+        library = self._context.out / LIBRARY
         with output_errors(library):
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            settings = context.settings
-            assets = (context.catalog, context.lights, context.looks)
-            write_library(library, make_bins(settings.bins), settings.gripper, settings.physics, settings.render, *assets)
+            write_library(library, self._context)
         return [LIBRARY]
 
     def write_ticks(self, batch: TickBatch) -> None:
-        make_spool = partial(_make_spool, batch.object_id.shape[1])
+        instances = batch.object_id.shape[1]
         for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
-            spool = self._staged(index, make_spool).content
+            spool = self._staged(index, lambda folder: TickSpool(folder / _SPOOL, instances)).content
             with output_errors(spool.path):
                 spool.add(row)
 
@@ -62,7 +60,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         spool, place = episode.content, self._context.out / self.places(end.episode)[0]
         with output_errors(spool.path):
             spool.flush()
-        return WriteTask(write_episode, (), (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings), place)
+        return WriteTask(write_episode, (), (spool.path, spool.instances, place, replace(end, attempts=()), self._settings), place)
 
     def places(self, episode: int) -> tuple[Path]:
         """The one file. See `EpisodeExporter`."""
@@ -90,7 +88,3 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         materials["floor"] = FLOOR
         materials["table"] = Material(settings.render.table_color, None, 0.0, TABLE_ROUGHNESS)
         return {name: AssetSurface.of(name, material) for name, material in materials.items()}
-
-
-def _make_spool(instances: int, folder: Path) -> TickSpool:
-    return TickSpool(folder / _SPOOL, instances)

@@ -22,19 +22,14 @@ def light_file(index: int) -> str:
 
 
 def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> StageLight:
-    """Describe an environment map as lights of a stage; the intensity reproduces the renderer's automatic exposure.
-
-    Args:
-        index: The map's index in the bake.
-        light: The map.
-        exposure: Factor on the automatic exposure.
-    """
+    """Describe an environment map, by its index in the bake, as lights of a stage; the intensity reproduces the renderer's automatic
+    exposure times `exposure`."""
     radiance, irradiance, radius_tangent = separate_sun(light)
     directions, solid = map_directions(len(radiance))
     upward = np.maximum(directions[..., 2], 0.0) * solid
     white = np.einsum("ij,ijc->c", upward, radiance)
     azimuth = polar = 0.0
-    sun = None
+    sun: tuple[float, float, float] | None = None
     if light.sun is not None and irradiance.any():
         x, y, z = light.sun.direction
         azimuth, polar = np.degrees(np.arctan2(y, x)), np.degrees(np.arccos(np.clip(z, -1.0, 1.0)))
@@ -63,12 +58,9 @@ def write_light_maps(library: Path, lights: tuple[EnvironmentMap, ...]) -> None:
 def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
     """Separate an environment map and its sun so that no light counts twice, by the same rule as the renderer.
 
-    The sun has the colour given with the map. Its luminance is the given one or that of the bright region it replaces, whichever is
-    larger.
-
-    Returns:
-        The map (H, 2H, 3) without that region, or with a disc in its place if the sun is wide; the sun's irradiance (3), zero if it
-        has none or is that disc; tangent of its angular radius.
+    The sun has the colour given with the map. Its luminance is the given one or that of the bright region it replaces, whichever is larger.
+    Returns the map (H, 2H, 3) without that region, or with a disc in its place if the sun is wide; the sun's irradiance (3), zero if it has
+    none or is that disc; tangent of its angular radius.
     """
     sun = light.sun
     if sun is None:

@@ -52,12 +52,8 @@ def set_units(stage: Usd.Stage) -> None:
 
 
 def save_layer(layer: Sdf.Layer, path: Path) -> None:
-    """Export a layer to a file.
-
-    Raises:
-        FileNotFoundError: The folder does not exist (USD would create it).
-        OutputError: The file cannot be written; USD reports the system's error as text.
-    """
+    """Export a layer to a file; raises FileNotFoundError if the folder does not exist, which USD would create, and OutputError if the file
+    cannot be written: USD reports the system's error as text."""
     if not path.parent.is_dir():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     try:
@@ -106,13 +102,8 @@ def add_faces(stage: Usd.Stage, path: str, vertices: np.ndarray, faces: np.ndarr
 def add_surface(
     stage: Usd.Stage, path: str, material: Material, texture: str | None, gain: float = 1.0, repeats: float = 1.0
 ) -> UsdShade.Material:
-    """Add a metallic-roughness material (UsdPreviewSurface). The texture repeats, and is multiplied by the base colour in linear light.
-
-    Args:
-        texture: File of the material's texture, relative to the layer; None: it has none.
-        gain: Factor on the base colour in linear light.
-        repeats: Factor on texture coordinates.
-    """
+    """Add a metallic-roughness material (UsdPreviewSurface). The texture, a file relative to the layer or None, repeats, and is multiplied
+    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates."""
     surface = UsdShade.Material.Define(stage, path)
     shader = _add_shader(stage, f"{path}/Surface", "UsdPreviewSurface")
     surface.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
@@ -177,14 +168,8 @@ def make_collider(shape: UsdGeom.Gprim, friction: UsdShade.Material, gap: float)
 
 
 def add_body(prim: Usd.Prim, mass: float, center: np.ndarray, inertia: np.ndarray, *, kinematic: bool) -> None:
-    """Make a prim a rigid body.
-
-    Args:
-        mass: [kg]
-        center: Centre of mass in the prim's frame (3) [m].
-        inertia: Inertia about the centre of mass, in the prim's axes (3, 3) [kg·m²].
-        kinematic: Whether its motion is prescribed.
-    """
+    """Make a prim a rigid body: mass [kg], centre of mass in its frame (3) [m], inertia about that in its axes (3, 3) [kg·m²], and whether
+    its motion is prescribed (kinematic)."""
     UsdPhysics.RigidBodyAPI.Apply(prim).CreateKinematicEnabledAttr(kinematic)
     moments, axes = eigh(inertia)
     # The eigenvectors (columns) rotate the principal axes to the prim's; eigh may return a reflection.

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.codes import LookPart
+from synpick_warp.codes import Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
 from synpick_warp.exporters.usd.types import (
     AssetSurface,
-    EpisodeMetadata,
     StageLight,
     UsdSettings,
     drawn_texture,
@@ -31,6 +30,7 @@ from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera, Material
 from synpick_warp.system.linear_algebra import DECIMALS, dot
+from synpick_warp.views.frames import EpisodeEnd
 
 WHITE = (1.0, 1.0, 1.0)
 _PARTS = {"Tote": LookPart.BIN, "Bin": LookPart.BIN, "Table": LookPart.TABLE, "Floor": LookPart.BACKGROUND}
@@ -55,19 +55,15 @@ FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f
 BIN = f"{ROOT}/Bin"
 
 
-def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: UsdSettings) -> Sdf.Layer:
-    """Build the layer of an episode.
-
-    Args:
-        ticks: One row per frame, of `spool.tick_type`.
-        metadata: Properties of the root prim.
-        settings: Settings common to all episodes.
-    """
+def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: UsdSettings) -> Sdf.Layer:
+    """Build the layer of an episode from its ticks, a row of `episode.tick_type` per frame, and its end, the properties of the root
+    prim."""
     layer = Sdf.Layer.CreateAnonymous()
     stage = Usd.Stage.Open(layer)
-    _add_root(stage, metadata, settings)
+    looks = end.row.get("looks") or {}
+    _add_root(stage, end, settings)
     assets = {f"{ROOT}/Table": "table"}
-    if "background" in metadata.looks:
+    if "background" in looks:
         assets[f"{ROOT}/Floor"] = "floor"
     for path in assets:
         UsdGeom.Xform.Define(stage, path)
@@ -85,9 +81,11 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: U
     for instance in np.flatnonzero((ticks["object_id"] != -1).any(axis=0)).tolist():
         path, obj_id = _add_object(stage, ticks, instance, settings)
         assets[path] = object_asset(obj_id)
-    add_looks(stage, assets, metadata.looks, settings.surfaces)
+    for path, part, look in _drawn(assets, looks):
+        if look:
+            _add_look(stage, path, part, look, settings.surfaces[assets[path]])
     for index, camera in enumerate(settings.cameras):
-        drawn = {key: np.array(value) for key, value in metadata.cameras.get(camera.name, {}).items() if key in CAMERA_KEYS}
+        drawn = {key: np.array(value) for key, value in (end.row.get("cameras") or {}).get(camera.name, {}).items() if key in CAMERA_KEYS}
         _add_camera(stage, camera.name or f"camera_{index}", replace(camera, **drawn), ticks["fixture_pose"][:, SHAFT])
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
@@ -98,18 +96,20 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: U
     return layer
 
 
-def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: UsdSettings) -> None:
+def _add_root(stage: Usd.Stage, end: EpisodeEnd, settings: UsdSettings) -> None:
     """Define units, time codes, root prim with metadata, physics scene and groups."""
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.assembly)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(metadata.frames - 1)
+    stage.SetEndTimeCode(end.frames - 1)
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
-    for name in ("episode", "arrangement", "frames", "ending", *(name for name in ("split", "bin") if getattr(metadata, name))):
-        add_property(root, name, getattr(metadata, name))
+    known = {"episode": end.episode, "arrangement": end.arrangement, "frames": end.frames, "ending": Ending(end.ending).name.lower()}
+    drawn = {"split": end.row.get("split", ""), "bin": (end.row.get("bin") or {}).get("name", "")}
+    for name, value in (known | {name: value for name, value in drawn.items() if value}).items():
+        add_property(root, name, value)
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
     scene.CreateGravityMagnitudeAttr(settings.gravity)
@@ -139,12 +139,8 @@ def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: Us
 def _add_moving(stage: Usd.Stage, path: str, poses: np.ndarray, visible: np.ndarray, frames: np.ndarray) -> Usd.Prim:
     """Add a prim with time-sampled pose and visibility; one that never moves gets default values only.
 
-    While it is not in the scene it is invisible, and its samples are at AWAY.
-
-    Args:
-        poses: Pose at every frame of the episode (frame, 7).
-        visible: Visibility at every frame (frame).
-        frames: Frames at which its pose is known.
+    While it is not in the scene it is invisible, and its samples are at AWAY. `poses` (frame, 7) and `visible` (frame) are of every frame
+    of the episode, `frames` those at which its pose is known.
     """
     prim = UsdGeom.Xform.Define(stage, path)
     rotations = _make_continuous(poses[frames, 3:])
@@ -231,11 +227,8 @@ def _add_camera(stage: Usd.Stage, name: str, camera: Camera, shaft: np.ndarray) 
 def _add_light(stage: Usd.Stage, light: StageLight, yaw: float, exposure: float) -> None:
     """Add the episode's environment map as a dome light, and its sun, if it has one, as a distant light.
 
-    The exposure compensation is part of the intensities, since Blender ignores `inputs:exposure`; the dome keeps its value as a property.
-
-    Args:
-        yaw: Rotation of the map about +z, counter-clockwise [rad].
-        exposure: Exposure compensation relative to the automatic exposure [EV].
+    The map is rotated by `yaw` about +z, counter-clockwise [rad]. The exposure compensation, relative to the automatic exposure [EV], is
+    part of the intensities, since Blender ignores `inputs:exposure`; the dome keeps its value as a property.
     """
     intensity = light.intensity * 2.0**exposure
     dome = UsdLux.DomeLight.Define(stage, f"{ROOT}/Lights/Dome")
@@ -262,22 +255,8 @@ def _add_light(stage: Usd.Stage, light: StageLight, yaw: float, exposure: float)
     sun.AddRotateYOp().Set(light.sun_polar)
 
 
-def add_looks(stage: Usd.Stage, assets: Mapping[str, str], looks: Mapping[str, Any], surfaces: Mapping[str, AssetSurface]) -> None:
-    """Add a material to each prim that references an asset whose look the episode has drawn.
-
-    Args:
-        stage: The episode's stage.
-        assets: Asset that each prim references, by path.
-        looks: Record of the episode's looks; empty: none.
-        surfaces: Materials by asset.
-    """
-    for path, part, look in _drawn(assets, looks):
-        if look:
-            _add_look(stage, path, part, look, surfaces[assets[path]])
-
-
 def _drawn(assets: Mapping[str, str], looks: Mapping[str, Any]) -> Iterator[tuple[str, LookPart, Mapping[str, Any]]]:
-    """Path, part and look of the prims; a look may be empty."""
+    """Path, part and drawn look of the prims, by the asset that each references and the episode's record; a look may be empty."""
     rows = dict(enumerate(looks.get("objects", ()))) | {row["instance"]: row for row in looks.get("distractors", ())}
     names = ("color", "metallic", "roughness", "hue", "brightness")
     for path in assets if looks else ():

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
-from synpick_warp.codes import Ending, LookPart
+from synpick_warp.codes import LookPart
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Material
-from synpick_warp.views.frames import EpisodeEnd
 
 
 @dataclass(frozen=True)
 class StageLight:
-    """Environment map as a dome light, and its sun as a distant light: azimuth and polar angle of the sun in the map's frame [°],
-    irradiance (None: no sun), angular diameter [°].
-    """
+    """Environment map as a dome light, and its sun as a distant light."""
 
     name: str
     file: str
@@ -35,8 +30,6 @@ class StageLight:
 
 TEXTURES = "textures"
 """Folder of textures in the asset library."""
-
-
 FLOOR = Material((1.0, 1.0, 1.0), None, 0.0, 1.0)
 """Material of the floor before an episode draws its texture."""
 
@@ -67,7 +60,7 @@ def drawn_texture(part: LookPart, index: int) -> str:
 
 @dataclass(frozen=True)
 class UsdSettings:
-    """Settings common to all episodes: tick rate [1/s], gravity [m/s²], bins, cameras, lights, object names by obj_id."""
+    """Settings common to all episodes."""
 
     tick_rate: float
     """Frames per second of simulated time [1/s]."""
@@ -81,33 +74,6 @@ class UsdSettings:
     """obj_id -> name of the object."""
     surfaces: dict[str, AssetSurface]
     """Materials by asset, of those that looks are drawn for; empty: looks are not randomized."""
-
-
-@dataclass(frozen=True)
-class EpisodeMetadata:
-    """Properties of an episode's root prim: episode, discarded arrangements before, frames, ending, split (empty: none)."""
-
-    episode: int
-    arrangement: int
-    """Number of arrangements that were discarded before this one."""
-    frames: int
-    ending: str
-    split: str = ""
-    """Name of the episode's split; empty: the data set has none."""
-    bin: str = ""
-    """Name of the bin; empty: a tote that is always in its place."""
-    looks: Mapping[str, Any] = field(default_factory=dict)
-    """Record of the episode's looks; empty: they are not randomized."""
-    cameras: Mapping[str, Any] = field(default_factory=dict)
-    """Matrix and pose of the cameras that the episode draws, by name."""
-
-    @staticmethod
-    def from_end(end: EpisodeEnd) -> EpisodeMetadata:
-        """Take the metadata from the episode's end."""
-        row = end.row or {}
-        ending, bin = Ending(end.ending).name.lower(), (row.get("bin") or {}).get("name", "")
-        drawn = {name: row.get(name) or {} for name in ("looks", "cameras")}
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, ending, row.get("split", ""), bin, **drawn)
 
 
 def bin_asset(sizes: BinSizes) -> str:

@@ -25,12 +25,8 @@ _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY | os.O_NOFOLLO
 
 
 def open_regular(path: Path | str) -> int:
-    """Open a regular file for reading, no symbolic link, pipe or device; returns the handle.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        OSError: It cannot be read; `strerror` is the reason.
-    """
+    """Open a regular file for reading, no symbolic link, pipe or device; returns the handle. Raises FileNotFoundError, or OSError with the
+    reason as `strerror`."""
     try:
         handle = os.open(path, _FLAGS)
     except OSError as error:
@@ -49,16 +45,10 @@ def checksum(path: Path | str, limit: int | None = None) -> str:
 
 
 def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> dict[str, str]:
-    """Parse a checksum list: name -> SHA-256. Every name is inside the folder, and none is one of the data set's own records.
+    """Parse a checksum list in the format of `sha256sum`: name, relative to the data set -> SHA-256.
 
-    Args:
-        lines: The list, in the format of `sha256sum`.
-        folder: The data set, which its names are relative to.
-        source: The file, for messages.
-        advice: What to do if it is damaged.
-
-    Raises:
-        DatasetError: The list is not UTF-8, a line is no digest and name, a name leads out of the folder, is a record, or is there twice.
+    Raises DatasetError, with `source` and `advice` in its message, if the list is not UTF-8, a line is no digest and name, or a name leads
+    out of the folder, is one of the data set's own records, or is there twice.
     """
     known: dict[str, str] = {}
     folders: set[str] = set()
@@ -134,14 +124,9 @@ def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: 
 
 
 def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content: dict[str, Any]) -> None:
-    """Commit files: write `place`.sha256 with their checksums, then `place`.json, whose presence marks all of them as complete.
-
-    Args:
-        out: Folder of the data set.
-        place: Path of the manifest entry, relative to it, without suffix.
-        paths: Files, or folders that hold nothing else, relative to the data set.
-        content: Further keys of the entry, besides file count, size and the SHA-256 of the checksum list.
-    """
+    """Commit files, or folders that hold nothing else: write `place`.sha256 with their checksums, then `place`.json, whose presence marks
+    all of them as complete. All paths are relative to the data set; `content`: further keys of the entry, besides file count, size and the
+    SHA-256 of the checksum list."""
     _write_entry(out, place, _hash_files(out, paths), content)
 
 
@@ -151,12 +136,7 @@ def _hash_files(out: Path, paths: Sequence[Path]) -> dict[str, tuple[str, int]]:
 
 
 def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], content: dict[str, Any]) -> None:
-    """Write a manifest entry: first the checksum list, then the JSON file, which marks the files as complete.
-
-    Args:
-        out, place, content: As in `write_manifest_entry`.
-        known: SHA-256 and size [bytes] of each file, by name.
-    """
+    """Write a manifest entry, as `write_manifest_entry`, of files with known SHA-256 and size [bytes] by name."""
     lines = "".join(f"{known[name][0]}  {name}\n" for name in sorted(known)).encode()
     size = sum(size for _, size in known.values())
     entry = {**content, "files": len(known), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}

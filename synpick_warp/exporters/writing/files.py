@@ -34,11 +34,8 @@ _ALLOWED = "--out takes a new or an empty folder"
 
 
 def check_output_folder(out: Path) -> None:
-    """Check that a data set can be written to a folder; creates nothing that stays.
-
-    Raises:
-        OutputError: The folder holds something other than a data set, lies in another data set, or cannot be created or written.
-    """
+    """Check that a data set can be written to a folder; creates nothing that stays. Raises OutputError if the folder holds something other
+    than a data set, lies in another data set, or cannot be created or written."""
     check_local(out, "--out")
     _check_outside(out)
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
@@ -72,11 +69,7 @@ def check_local(out: Path, option: str) -> None:
 
 
 def _check_outside(out: Path) -> None:
-    """Check that a data set does not lie in another one, whose files it would mix with.
-
-    Raises:
-        OutputError: It does, or the path cannot be resolved.
-    """
+    """Raise OutputError if a data set would lie in another one, whose files it would mix with, or its path cannot be resolved."""
     try:
         parents = out.resolve().parents
         outer = next((each for each in parents if (each / MANIFEST_FILE).is_file() and (each / "manifest").is_dir()), None)
@@ -93,11 +86,7 @@ def is_litter(name: str) -> bool:
 
 
 def remove_folder(folder: Path, *, ignore_errors: bool = False) -> None:
-    """Remove a folder with its content, if it is one. `shutil.rmtree` would open a pipe of this name and wait for its other end.
-
-    Raises:
-        OSError: Something in it cannot be removed.
-    """
+    """Remove a folder with its content, if it is one. `shutil.rmtree` would open a pipe of this name and wait for its other end."""
     if is_folder(folder):
         shutil.rmtree(folder, ignore_errors=ignore_errors)
 

@@ -27,10 +27,11 @@ def camera_files(layout: DataLayout) -> tuple[str, ...]:
 
 
 def write_cameras(out: Path, layout: DataLayout, cameras: tuple[Camera, ...], depth_scale: float) -> None:
-    """Write camera.json, of the first camera, and `camera_files`."""
-    write_camera(out / CAMERA_FILE, cameras[0], depth_scale)
-    for name, camera in zip(camera_files(layout), cameras, strict=False):
-        write_camera(out / name, camera, depth_scale)
+    """Write camera.json, of the first camera, and `camera_files`: size, intrinsics [px] and millimetres per count of depth."""
+    for name, camera in ((CAMERA_FILE, cameras[0]), *zip(camera_files(layout), cameras, strict=False)):
+        (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+        content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
+        (out / name).write_text(json.dumps(content | camera.distortion, indent=2) + "\n", encoding="ascii")
 
 
 def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:
@@ -56,26 +57,8 @@ coefficients of `cam_dist_model`), not by `cam_K` alone. For readers that know n
     return text if bent else ""
 
 
-def write_camera(path: Path, camera: Camera, depth_scale: float) -> None:
-    """Write camera.json: size, intrinsics [px] and millimetres per count of depth."""
-    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
-    content |= camera.distortion
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
-
-
 def write_notes(out: Path, settings: ExportSettings, names: Mapping[int, str], cameras: tuple[Camera, ...]) -> list[Path]:
-    """Write `note_files`, replacing existing ones; returns their paths.
-
-    Args:
-        out: The data set.
-        settings: Its settings.
-        names: obj_id -> name.
-        cameras: The cameras.
-
-    Raises:
-        OSError: A file cannot be written.
-    """
+    """Write `note_files`, replacing existing ones; returns their paths. `names` are those of the objects by obj_id."""
     places = note_files(settings.layout)
     if places:
         write_cameras(out, settings.layout, cameras, settings.bop.depth_scale)

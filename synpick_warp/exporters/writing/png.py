@@ -63,11 +63,7 @@ class Deflater:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """Encode an image as a PNG file.
-
-    Args:
-        image: Greyscale (H, W) or RGB (H, W, 3); uint8 or uint16.
-    """
+    """Encode an image, greyscale (H, W) or RGB (H, W, 3), uint8 or uint16, as a PNG file."""
     if (image.shape[2:], image.dtype.name) not in _FORMATS or not image.size:
         raise ValueError(f"no PNG for an image of shape {image.shape} and type {image.dtype}")
     height, width = image.shape[:2]

@@ -48,23 +48,16 @@ class WriteTask:
     """Callback after success, run in the caller's thread by a later call of the pool. It may submit tasks without images."""
 
 
-@dataclass(frozen=True)
-class _Call:
-    """Task of a process: the call `function(*images, *arguments)`. Functions are pickled by name, so they are top-level ones."""
-
-    function: Callable[..., None]
-    images: tuple[SharedArray, ...]
-    arguments: tuple[Any, ...]
-
-    def __call__(self, memory: mmap.mmap) -> None:
-        self.function(*(image.map(memory) for image in self.images), *self.arguments)
+def _call(function: Callable[..., None], images: tuple[SharedArray, ...], arguments: tuple[Any, ...], memory: mmap.mmap) -> None:
+    """Task of a process: call `function(*images, *arguments)`."""
+    function(*(image.map(memory) for image in images), *arguments)
 
 
 @dataclass(eq=False)
 class _QueuedTask:
-    """Submitted task with its slot of shared memory (None: it has no images), and the copy into it in progress (None: done)."""
+    """Submitted task."""
 
-    call: _Call
+    call: Callable[[mmap.mmap], None]
     path: Path
     on_done: Callable[[], None] | None
     slot: int | None
@@ -86,8 +79,7 @@ class WriterPool:
             slot_bytes: Maximum size of the images of one task, see `shared_bytes` [B].
             inherited_handles: File handles that the processes keep open until they exit, such as one that holds a lock.
 
-        Raises:
-            OutputError: Memory or processes cannot be allocated.
+        Raises OutputError if memory or processes cannot be allocated.
         """
         self._waiting: deque[_QueuedTask] = deque()
         self._running: dict[TaskFuture, _QueuedTask] = {}
@@ -127,17 +119,14 @@ class WriterPool:
         tasks wait (back-pressure).
 
         Threads copy the images of earlier tasks while the next one is prepared, so pass tasks that are costly to prepare as a generator.
-
-        Raises:
-            DatasetError: A task read a damaged file.
-            OutputError: One of these or an earlier task failed, or a process died.
+        Raises DatasetError if a task read a damaged file, and OutputError if one of these or an earlier task failed, or a process died.
         """
         self._check()
         submitted: list[_QueuedTask] = []
         for task in tasks:
             slot = self._take_slot() if task.images else None
             images, copying = ((), None) if slot is None else self._slots.put(task.images, slot)
-            submitted.append(_QueuedTask(_Call(task.function, images, task.arguments), task.path, task.on_done, slot, copying))
+            submitted.append(_QueuedTask(partial(_call, task.function, images, task.arguments), task.path, task.on_done, slot, copying))
             self._waiting.append(submitted[-1])
             self._progress(0.0)
             while len(self._waiting) > MAX_WAITING and not self._finishing:

@@ -15,11 +15,8 @@ _ID_BITS = 8
 
 @dataclass(eq=False, slots=True)
 class Runs:
-    """Run-length encoding of a binary mask: vertical runs of true pixels, from row `first` to before `past`; with pixel count and rows
-    spanned.
-
-    Sorted by column, then row. Two runs of a column are separated by at least one False pixel.
-    """
+    """Run-length encoding of a binary mask: vertical runs of true pixels, sorted by column, then row. Two runs of a column are separated by
+    at least one False pixel."""
 
     column: np.ndarray
     """Column of each run (N) int64."""
@@ -27,7 +24,6 @@ class Runs:
     """Row of the run's first pixel (N) int64."""
     past: np.ndarray
     """Row after the run's last pixel (N) int64."""
-
     count: int
     """Number of True pixels."""
     top: int
@@ -42,11 +38,7 @@ class Runs:
         return int(self.column[0]), self.top, int(self.column[-1]), self.bottom - 1
 
     def counts(self, height: int, width: int) -> np.ndarray:
-        """COCO's uncompressed RLE: lengths of alternating False and True runs in column-major order, False first.
-
-        Returns:
-            (M) int64; they sum to height · width.
-        """
+        """COCO's uncompressed RLE: lengths of alternating False and True runs in column-major order, False first (M) int64."""
         bounds = np.empty(2 * self.column.size + 2, np.int64)
         bounds[0], bounds[-1] = 0, height * width
         offset = self.column * height
@@ -115,28 +107,16 @@ class RunBoundaries:
 
 
 def split_listed_runs(places: np.ndarray, count: np.ndarray, height: int, instances: Sequence[int]) -> list[Runs]:
-    """Masks of some instances, from the run boundaries of all masks that the device has listed.
-
-    Args:
-        places: Positions (M) column · (height + 1) + row, in turn of a run's first pixel and of the pixel below its last, mask by mask.
-        count: Number of positions of each mask (I).
-        height: Height of the image [px].
-        instances: Indices of the masks.
-    """
+    """Masks of some instances, from the run boundaries of all masks that the device has listed: positions (M) column · (height + 1) + row,
+    in turn of a run's first pixel and of the pixel below its last, mask by mask, and their number for each mask (I)."""
     bounds = np.concatenate(([0], np.cumsum(count // 2)))
     return _split_runs(places[::2], places[1::2] - places[::2], height + 1, bounds, instances)
 
 
 def _split_runs(begin: np.ndarray, length: np.ndarray, span: int, bounds: np.ndarray, instances: Sequence[int]) -> list[Runs]:
-    """Split runs by instance.
-
-    Args:
-        begin: Position of each run's first pixel (M), sorted by instance, then by position.
-        length: Pixels of each run (M).
-        span: Positions per column.
-        bounds: Index of each instance's first run, and behind them that past the last one (N + 1).
-        instances: Indices of the instances whose runs are returned.
-    """
+    """Split runs by instance, and return those of some: position of each run's first pixel (M), sorted by instance, then by position,
+    pixels of each run (M), `span` positions per column, index of each instance's first run, and behind them that past the last one (N +
+    1)."""
     length = length.astype(np.int64)
     column, first = (part.astype(np.int64) for part in _divide(begin, span))
     past = first + length
@@ -158,23 +138,13 @@ def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
 
 
 def unpack_run_boundaries(packed: np.ndarray, height: int) -> RunBoundaries:
-    """Unpack run boundaries that the device has listed.
-
-    Args:
-        packed: (2, N): column · (height + 1) + row; value above, and that below shifted by 8 bits; see `FrameBatch.boundaries`.
-        height: Height of the image [px].
-    """
+    """Unpack run boundaries that the device has listed (2, N): column · (height + 1) + row; value above, and that below shifted by 8 bits;
+    see `FrameBatch.boundaries`."""
     return RunBoundaries(packed[0], height + 1, packed[1] & ((1 << _ID_BITS) - 1), packed[1] >> _ID_BITS)
 
 
 def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBoundaries:
-    """Find the run boundaries of an image that is 0 outside of a crop.
-
-    Args:
-        image: The crop (h, w).
-        top: Row of its first pixel in the image.
-        left: Column of its first pixel in the image.
-    """
+    """Find the run boundaries of an image that is 0 outside of a crop (h, w), which begins at row `top` and column `left`."""
     rows, columns = image.shape
     span = top + rows + 1
     if not image.size:

@@ -19,11 +19,12 @@ import pytest
 from pycocotools import mask as coco
 from webdataset import tariterators
 
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config, Split
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import tar_files
-from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card, size_category
+from synpick_warp.exporters.bop.shards.card import CARD_FILE, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters
@@ -193,7 +194,7 @@ def test_an_empty_data_set_has_an_empty_key_index_and_files_shared_with_the_bop_
 
 SPLITS = (Split("train", 2, 0, "pick", "train_pbr"), Split("test", 1, 2, "pick", "test_pbr"), Split("val", 5, 9, "pick", "val_pbr"))
 """The last one has not been baked."""
-CONTENT = CardContent((SplitContent("train", "train_pbr_web", 18, 6, 1234567),), True, ".jpg", True, 24, LAYERS, ("blur",))
+TRAIN = SplitContent("train", "train_pbr_web", 18, 6, 1234567)
 READ = """
 import datasets, json, sys
 import numpy as np
@@ -252,13 +253,14 @@ def test_datasets_reads_all_views_through_the_card(two_splits, tmp_path):
 
 
 def test_card_describes_split_sizes_and_licence():
-    text = make_card(CONTENT)
+    settings = dataclasses.replace(ExportSettings.of(config(LAYERS)), effects=("blur",))
+    text = make_card(settings, [TRAIN])
     assert text.startswith("---\nlicense: mit\n")
     assert "  - split: train\n    path: train_pbr_web/shard-*.tar\n" in text
     assert "18 views in 6 webdataset shards of 1,234,567 bytes" in text
     assert text.count('- name: "blur"') == 1
-    splits = (CONTENT.splits[0], SplitContent("validation", "val_web", 2, 1, 10), SplitContent("test", "test_web", 0, 0, 0))
-    others = make_card(dataclasses.replace(CONTENT, splits=splits, embedded=False, masks=False))
+    splits = (TRAIN, SplitContent("validation", "val_web", 2, 1, 10), SplitContent("test", "test_web", 0, 0, 0))
+    others = make_card(ExportSettings.of(config(LAYERS, masks=False).with_values({"bake.lights": "own"})), splits)
     assert "license: unknown\n" in others
     assert "set `license`" in others
     assert "  - split: train\n    path: train_pbr_web/shard-*.tar\n  - split: validation\n    path: val_web/shard-*.tar\n" in others

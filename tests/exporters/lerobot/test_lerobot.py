@@ -29,8 +29,8 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.lerobot import layout, video
-from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
-from synpick_warp.exporters.lerobot.part import describe_tasks
+from synpick_warp.exporters.lerobot.episode import describe_tasks
+from synpick_warp.exporters.lerobot.exporter import LerobotExporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.testing import box_views
 from synpick_warp.testing.exporters import ExporterContract, digests, exporting, feed, finish
@@ -147,7 +147,7 @@ def test_the_last_frame_keeps_the_sentence_of_the_last_attempt(mode, attempts, s
 
 
 def test_videos_show_the_views_at_exact_times(dataset, episodes):
-    rate = video_rate(trajectories.config().physics)
+    rate = layout.video_rate(trajectories.config().physics)
     for place, episode in enumerate(EPISODES):
         row = episodes[place]
         assert (row["episode_index"], row["source/episode"], row["length"]) == (place, episode, FRAMES)

@@ -12,16 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
+from synpick_warp.codes import Ending
 from synpick_warp.exporters.usd.episode import TickSpool, read_ticks, tick_rows
 from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
 from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
-from synpick_warp.exporters.usd.types import EpisodeMetadata, UsdSettings
+from synpick_warp.exporters.usd.types import UsdSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import map_directions, resize_map
 from synpick_warp.scenes.sun import MAX_SUN_TANGENT
 from synpick_warp.scenes.types import Camera, EnvironmentMap, Sun
 from synpick_warp.stages.render import light_tables
+from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import usd_sets
 
 SETTINGS = usd_sets.settings()
@@ -37,7 +39,7 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
     """Open the stage of an episode, without its assets."""
     stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
     settings = UsdSettings(15.0, 9.81, ("tote",), cameras, stage_lights, NAMES, {})
-    layer = make_episode_layer(rows, EpisodeMetadata(0, 0, len(rows), "emptied"), settings)
+    layer = make_episode_layer(rows, EpisodeEnd(0, 0, len(rows), int(Ending.EMPTIED)), settings)
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):
             each.referenceList.ClearEdits()

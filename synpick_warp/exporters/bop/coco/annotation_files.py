@@ -25,7 +25,6 @@ from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, open_folder, output_errors, sync_folder, write_synced
-from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import MAX_JSON, decode_json, read_json
 from synpick_warp.system.inputs.paths import path_inside
@@ -80,19 +79,16 @@ def _make_annotations(view: EncodedView, settings: ViewSettings) -> Iterator[dic
         box = mask.visible.box()
         if box is not None:
             left, top, right, bottom = box
+            # Polygons as in COCO, x and y by turns [px]: one for each part.
+            polygons = [polygon.points.ravel().tolist() for polygon in trace_outlines(mask.visible)] if settings.polygons else None
             yield {
                 "category_id": pose["obj_id"],
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
-                "segmentation": _make_polygons(mask.visible) if settings.polygons else make_rle(mask.visible, height, width),
+                "segmentation": make_rle(mask.visible, height, width) if polygons is None else polygons,
                 **_make_extras(pose, info),
             } | points
-
-
-def _make_polygons(mask: Runs) -> list[list[float]]:
-    """Polygons of a mask as in COCO, x and y by turns [px]: one for each part."""
-    return [polygon.points.ravel().tolist() for polygon in trace_outlines(mask)]
 
 
 def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, Any]:
@@ -105,11 +101,7 @@ def _make_extras(pose: Mapping[str, Any], info: Mapping[str, Any]) -> dict[str, 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Sequence[Sequence[int]]) -> None:
     """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations for each frame, null for im_ids that sets of
-    others leave out, and rename all to their places.
-
-    Raises:
-        OutputError: Not all `frames` (im_id) of a scene have arrived.
-    """
+    others leave out, and rename all to their places; raises OutputError if not all `frames` (im_id) of a scene have arrived."""
     for (scene, scene_id), own in zip(scenes, frames, strict=True):
         with (scene / ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
@@ -127,12 +119,8 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
 
 
 def write_annotation_files(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
-    """Join the episodes' parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
-
-    Raises:
-        DatasetError: A part is damaged.
-        OSError: A file cannot be written.
-    """
+    """Join the episodes' parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names;
+    raises DatasetError if a part is damaged."""
     layout = settings.layout
     parts: dict[str, list[Path]] = {split: [] for split in layout.folders}
     cameras = layout.cameras

@@ -6,10 +6,13 @@ views, and miss masks of scenes with more objects, or find nothing but null wher
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
+from synpick_warp.configs.cell.rig import lens_map
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout, split_kind
+from synpick_warp.exporters.writing.notes import describe_lenses
 
 CARD_FILE = "README.md"
 """Name that the hub gives the card."""
@@ -25,41 +28,14 @@ _MASK = {"counts": _INTEGERS, "size": _INTEGERS}
 _FOREIGN = "\nObjects or light maps are not synpick-warp's own: set `license` to theirs in the copy that you upload.\n"
 
 
-@dataclass(frozen=True)
-class SplitContent:
-    """What the dataset card says of a split: names, numbers of views and shards, size [B]."""
+class SplitContent(NamedTuple):
+    """What the dataset card says of a split: name on the hub, folder of its shards, numbers of views and shards, their size [B]."""
 
     name: str
-    """Name on the hub."""
     folder: str
-    """Folder of its shards."""
     views: int
     shards: int
     bytes: int
-    """Size of all shards [B]."""
-
-
-@dataclass(frozen=True)
-class CardContent:
-    """What the dataset card says of a data set: its splits, origin of the objects, image formats, masks, layers and effects."""
-
-    splits: tuple[SplitContent, ...]
-    """At least one."""
-    embedded: bool
-    """Whether objects and light maps are those of synpick-warp; others have licences of their own."""
-    color_suffix: str
-    """.jpg or .png."""
-    masks: bool
-    """Whether views have masks."""
-    instances: int
-    """Maximum number of instances of a view."""
-    layers: tuple[str, ...]
-    effects: tuple[str, ...]
-    """Names of the active camera effects."""
-    distorted: bool = False
-    """Whether a camera has a lens that distorts."""
-    lens_note: str = ""
-    """See `describe_lenses`."""
 
 
 def hub_splits(layout: DataLayout) -> tuple[str, ...]:
@@ -68,31 +44,33 @@ def hub_splits(layout: DataLayout) -> tuple[str, ...]:
     return tuple("validation" if name == "val" and "validation" not in names else name for name in names)
 
 
-def make_card(content: CardContent) -> str:
+def make_card(settings: ExportSettings, contents: Sequence[SplitContent]) -> str:
     """Text of README.md. It leaves out splits without shards, unless none has any: a pattern that matches no file is an error."""
-    splits = [split for split in content.splits if split.shards] or content.splits
+    # Objects and light maps that are not synpick-warp's have licences of their own.
+    embedded = not (settings.bake.models or settings.bake.lights)
+    splits = [split for split in contents if split.shards] or contents
     views, shards, size = (sum(getattr(split, name) for split in splits) for name in ("views", "shards", "bytes"))
     split, folder = splits[0].name, splits[0].folder
     files = (f"\n  - split: {each.name}\n    path: {each.folder}/shard-*.tar" for each in splits)
     header = "\n".join(
         (
-            f"license: {'mit' if content.embedded else 'unknown'}",
+            f"license: {'mit' if embedded else 'unknown'}",
             "pretty_name: Synthetic bin picking by synpick-warp",
             "task_categories: [object-detection, image-segmentation, depth-estimation, robotics]",
             "tags: [6d-pose-estimation, bin-picking, synthetic, webdataset, bop]",
             f"size_categories: [{size_category(views)}]",
             f"configs:\n- config_name: default\n  data_files:{''.join(files)}",
             "dataset_info:\n  config_name: default\n  features:",
-            *_list_features(_features(content), "  "),
+            *_list_features(_features(settings), "  "),
         )
     )
     rows = "\n".join(f"| {each.name} | {each.folder} | {each.views:,} | {each.shards:,} | {each.bytes:,} |" for each in splits)
-    licence = "" if content.embedded else _FOREIGN
+    licence = "" if embedded else _FOREIGN
     return f"""---
 {header}
 ---
 # Synthetic bin picking
-{content.lens_note}
+{describe_lenses(settings)}
 {views:,} views in {shards:,} webdataset shards of {size:,} bytes in all, made by synpick-warp:
 colour, 16-bit depth, 6D poses, boxes and masks as in the BOP challenge. One shard is one camera's scene; `dataset_info.md` has
 the conventions and the objects.
@@ -113,35 +91,29 @@ these columns to `Image(decode=False)`, and decode their bytes by `decode_view`.
 
 def size_category(views: int) -> str:
     """The hub's size category of a number of examples: n<1K, 1K<n<10K, ..., n>1T."""
-    if views < 1000:
+    power = len(str(views)) - 1
+    if power < 3:
         return "n<1K"
-    power = min(len(str(views)) - 1, 12)
-    if power == 12:
-        return "n>1T"
-    return f"{_count(power)}<n<{_count(power + 1)}"
+    low, high = (f"{10 ** (each % 3)}{_SIZES[min(each, 12) // 3 - 1]}" for each in (power, power + 1))
+    return f"{low}<n<{high}" if power < 12 else "n>1T"
 
 
-def _count(power: int) -> str:
-    """Power of ten in short form, such as 10K."""
-    return f"{10 ** (power % 3)}{_SIZES[power // 3 - 1]}"
-
-
-def _features(content: CardContent) -> dict[str, object]:
+def _features(settings: ExportSettings) -> dict[str, object]:
     """Columns of the card's table with their types: a type's name, a structure or a list."""
     camera = {"cam_K": _NUMBERS, "cam_R_w2c": _NUMBERS, "cam_t_w2c": _NUMBERS, "depth_scale": "float64", "light": _LIGHT}
-    if content.distorted:
+    if any(lens_map(row) is not None for row in settings.rig.rows):
         camera |= {"cam_dist_model": "string", "cam_dist": _NUMBERS}
-    if content.effects:
-        camera["effects"] = dict.fromkeys(content.effects, "float64")
-    masks = {str(index): _MASK for index in range(content.instances)}
+    if settings.effects:
+        camera["effects"] = dict.fromkeys(settings.effects, "float64")
+    masks = {str(index): _MASK for index in range(settings.objects)}
     return {
-        f"rgb{content.color_suffix}": "image",
+        f"rgb.{settings.bop.color_format}": "image",
         "depth.png": "image",
         "camera.json": camera,
         "gt.json": {"list": _POSE},
         "gt_info.json": {"list": _INFO},
-        **({"mask.json": masks, "mask_visib.json": masks} if content.masks else {}),
-        **{f"{name}.png": "image" for name in content.layers},
+        **({"mask.json": masks, "mask_visib.json": masks} if settings.bop.masks else {}),
+        **{f"{name}.png": "image" for name in settings.render.layers},
         "__key__": "string",
         "__url__": "string",
     }

@@ -8,12 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.cell.rig import lens_map
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES, DataLayout
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter, SceneImages, constant_files
-from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
+from synpick_warp.exporters.bop.shards.card import CARD_FILE, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.shards.tar_files import (
     commit_shards,
     find_shards,
@@ -24,7 +23,6 @@ from synpick_warp.exporters.bop.shards.tar_files import (
     write_view,
 )
 from synpick_warp.exporters.writing.files import LINES, PARTIAL, join_lines, output_errors, write_atomically
-from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -64,7 +62,7 @@ class ShardsExporter(SceneExporter):
             for name, split in zip(hub_splits(layout), ShardsExporter.folders(layout), strict=True)
         ]
         with output_errors(out / CARD_FILE):
-            write_atomically(out / CARD_FILE, make_card(_describe(settings, contents)).encode())
+            write_atomically(out / CARD_FILE, make_card(settings, contents).encode())
         return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     @staticmethod
@@ -84,22 +82,6 @@ class ShardsExporter(SceneExporter):
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return commit_shards, (scenes, self._folder(scenes[0][1]), images, tuple(view.layers for view in self._views))
-
-
-def _describe(settings: ExportSettings, splits: list[SplitContent]) -> CardContent:
-    """What the card of a data set says."""
-    bake, bop = settings.bake, settings.bop
-    return CardContent(
-        splits=tuple(splits),
-        embedded=not (bake.models or bake.lights),
-        color_suffix=f".{bop.color_format}",
-        masks=bop.masks,
-        instances=settings.objects,
-        layers=settings.render.layers,
-        effects=settings.effects,
-        distorted=any(lens_map(row) is not None for row in settings.rig.rows),
-        lens_note=describe_lenses(settings),
-    )
 
 
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:

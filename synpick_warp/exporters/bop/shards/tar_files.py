@@ -53,17 +53,12 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 def write_layer(data: Buffer, scene: Path, scene_id: int, name: str, frame: int) -> None:
     """Write a view's layer as a tar entry, without end-of-archive marker, to a file in the scene's staging folder."""
     with open_folder(scene) as folder:
-        folder.write(_layer_file(frame, name), b"".join(_tar_entry(f"{_view_key(scene_id, frame)}.{name}.png", data)))
+        folder.write(f"{frame}.{name}", b"".join(_tar_entry(f"{_view_key(scene_id, frame)}.{name}.png", data)))
 
 
 def _view_key(scene: int, frame: int) -> str:
     """Key of a view in shards: scene_id and im_id, of six digits each."""
     return f"{scene:06d}_{frame:06d}"
-
-
-def _layer_file(frame: int, name: str) -> str:
-    """File name of a layer in the staging folder."""
-    return f"{frame}.{name}"
 
 
 def _mask_json(masks: Iterable[Runs], settings: ViewSettings) -> bytes:
@@ -82,20 +77,11 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
 def commit_shards(
     scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[Sequence[int]], layers: Sequence[Sequence[str]]
 ) -> None:
-    """Task: concatenate an episode's views and layers into shards, synced to disk, and rename these to their places.
-
-    Args:
-        scenes: (staging folder, scene_id) of each scene.
-        split: Folder of the shards.
-        images: Images (im_id) that each scene must have, ascending.
-        layers: Names of the layers of each view.
-
-    Raises:
-        OutputError: A scene has other images or layers.
-    """
+    """Task: concatenate the views and layers of an episode's scenes, (staging folder, scene_id), into shards, synced to disk, and rename
+    these to their places in the split's folder; raises OutputError unless each scene has all its images (im_id, ascending) and layers."""
     complete: list[tuple[Path, Path]] = []
     for (scene, scene_id), own, shown in zip(scenes, images, layers, strict=True):
-        views = [[str(frame), *(_layer_file(frame, name) for name in shown)] for frame in own]
+        views = [[str(frame), *(f"{frame}.{name}" for name in shown)] for frame in own]
         names = {path.name for path in scene.iterdir()}
         if names != {name for view in views for name in view}:
             raise OutputError(f"{scene} does not have {len(own)} whole frames; this is an error of synpick-warp, please report it")

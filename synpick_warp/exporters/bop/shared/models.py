@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
@@ -29,24 +28,15 @@ MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
 
-def write_models_folders(out: Path, catalog: Catalog, *, mechanics: bool = False) -> None:
-    """Write models/ and models_eval/, replacing existing ones; `mechanics`: as of `write_models`.
-
-    Raises:
-        CatalogError: A model file or its texture is not what was read for the catalog.
-        OSError: A file cannot be written.
-    """
-    for name in MODEL_FOLDERS:
-        if (out / name).exists():
-            shutil.rmtree(out / name)
-        write_models(out / name, catalog, mechanics)
-
-
 def write_models(folder: Path, catalog: Catalog, mechanics: bool = False) -> None:
-    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`.
+    """Write every object's PLY file and texture, and models_info.json, with the keys of `make_mechanics` if `mechanics`, in place of a
+    folder that there may be.
 
-    Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes.
+    Models loaded from BOP models are copied byte for byte, and their entries as they are, if these have the sizes of the meshes. Raises
+    CatalogError if a model file or its texture is not what was read for the catalog.
     """
+    if folder.exists():
+        shutil.rmtree(folder)
     folder.mkdir()
     infos = {}
     for entry in catalog.entries:
@@ -57,9 +47,10 @@ def write_models(folder: Path, catalog: Catalog, mechanics: bool = False) -> Non
                 path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
         else:
             _copy_model(entry, entry.source, path)
-        info = corrected_entry(_read_source_info(entry), make_model_info(entry))
+        known = read_entries(entry.source.parent / "models_info.json") if entry.source else None
+        info = corrected_entry((known or {}).get(str(entry.obj_id)), make_model_info(entry))
         infos[str(entry.obj_id)] = info | make_mechanics(entry) if mechanics else info
-    _write_json(folder / "models_info.json", infos)
+    (folder / "models_info.json").write_text(json.dumps(infos, indent=2) + "\n", encoding="ascii")
 
 
 def encode_model(entry: CatalogEntry) -> bytes:
@@ -104,7 +95,11 @@ def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
     info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
     info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
     if entry.symmetries_discrete:
-        info["symmetries_discrete"] = [_to_millimeters(matrix) for matrix in entry.symmetries_discrete]
+        info["symmetries_discrete"] = [
+            # Row-major 4 x 4 matrices, of which the translation is a length.
+            [MILLIMETERS * value if index in (3, 7, 11) else value for index, value in enumerate(matrix)]
+            for matrix in entry.symmetries_discrete
+        ]
     if entry.symmetries_continuous:
         info["symmetries_continuous"] = [
             {"axis": list(axis), "offset": [MILLIMETERS * value for value in offset]} for axis, offset in entry.symmetries_continuous
@@ -123,22 +118,10 @@ def make_mechanics(entry: CatalogEntry) -> dict[str, Any]:
     return info
 
 
-def _to_millimeters(matrix: tuple[float, ...]) -> list[float]:
-    """Row-major 4 x 4 matrix with the translation turned from m to mm."""
-    return [MILLIMETERS * value if index in (3, 7, 11) else value for index, value in enumerate(matrix)]
-
-
-def _read_source_info(entry: CatalogEntry) -> dict[str, Any] | None:
-    """The object's entry in the models_info.json beside its source file; None: there is none."""
-    path = entry.source.parent / "models_info.json" if entry.source else None
-    return None if path is None else (read_entries(path) or {}).get(str(entry.obj_id))
-
-
 def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
     """Copy a PLY file, and the texture that its header names, under the same name inside the set; without that texture, write the object.
 
-    Raises:
-        CatalogError: The texture has changed or gone since it was read, or its name is not allowed or that of another file of the set.
+    Raises CatalogError if the texture has changed or gone since it was read, or its name is not allowed or that of another file of the set.
     """
     data = read_ply_file(source)
     try:
@@ -173,39 +156,21 @@ def _tint_texture(material: Material) -> np.ndarray:
     return np.stack([table[material.texture[..., channel], channel] for channel in range(3)], axis=-1)
 
 
-def _write_json(path: Path, content: object) -> None:
-    """Write content as an indented JSON file."""
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
-
-
-def _describe_folders(layout: DataLayout) -> str:
-    """Sentence for the notes on the folders of scenes, and where each split begins."""
-    if not layout.splits:
-        return f"`{layout.split}/`"
-    return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in layout.splits)
-
-
-def _describe_scenes(layout: DataLayout) -> str:
-    """Sentence for the notes on which scene has which episode and camera."""
-    if layout.has_sensors:
-        return f"Episode k is scene k, with files of the sensors {_sensor_names(layout)},"
-    return f"Camera c of episode k is scene {layout.cameras} · k + c"
-
-
-def _sensor_names(layout: DataLayout) -> str:
-    """Names of the sensors for the notes."""
-    return f"{layout.sensors[0]} to {layout.sensors[-1]}" if layout.sensors[0] == "cam0" else ", ".join(layout.sensors)
-
-
 def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
     layout, period = settings.layout, settings.physics.tick_time
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     pictures = describe_sizes(layout, cameras)
+    folders = ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in layout.splits) or f"`{layout.split}/`"
+    scenes = f"Camera c of episode k is scene {layout.cameras} · k + c"
+    if layout.has_sensors:
+        sensors = layout.sensors
+        names = f"{sensors[0]} to {sensors[-1]}" if sensors[0] == "cam0" else ", ".join(sensors)
+        scenes = f"Episode k is scene k, with files of the sensors {names},"
     return f"""# A SynPick data set
 {describe_lenses(settings)}
 Made by synpick-warp (mode {", ".join(settings.modes)}, seed {settings.bake.seed}, {layout.cameras} cameras), in the format of the
-BOP challenge (scenewise). {_describe_scenes(layout)} of {_describe_folders(layout)}. Frames are {period:g} s apart.
+BOP challenge (scenewise). {scenes} of {folders}. Frames are {period:g} s apart.
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({settings.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated
 
 import msgspec
 
@@ -17,15 +17,11 @@ from synpick_warp.exporters.writing.files import join_lines, write_atomically
 from synpick_warp.system.inputs.json import read_json
 from synpick_warp.system.inputs.paths import path_inside
 
-BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
-
-MULTIVIEW = "test_targets_multiview_bop25.json"
-KINDS = (BOP19, BOP24)
+BOP19, BOP24, MULTIVIEW = "test_targets_bop19.json", "test_targets_bop24.json", "test_targets_multiview_bop25.json"
 _SCENE = re.compile(r"[0-9]{6,12}")
 """Name of a scene's folder."""
 _Frame = Annotated[str, msgspec.Meta(pattern=r"\A(0|[1-9][0-9]{0,8})\Z")]
 """Key of a frame in a scene's JSON files."""
-_Content = TypeVar("_Content")
 _ADVICE = "remove the scene and its episode's two files in manifest/, and resume the bake"
 
 
@@ -48,7 +44,7 @@ def sensor_suffixes(layout: DataLayout) -> tuple[str, ...]:
 
 def _kinds(layout: DataLayout) -> tuple[str, ...]:
     """Kinds of target lists; the multi-view one only with several sensors in a scene."""
-    return (*KINDS, *((MULTIVIEW,) if layout.has_sensors else ()))
+    return (BOP19, BOP24, *((MULTIVIEW,) if layout.has_sensors else ()))
 
 
 def scene_target_files(layout: DataLayout, folder: str) -> tuple[str, ...]:
@@ -85,8 +81,9 @@ def make_scene_targets(scene: Path, visibility: float, sensors: tuple[str, ...])
     BOP19: for each image and object, the number of instances of at least `visibility` (fraction), if any. BOP24: every image. Of several
     sensors, both list the images of the first, by which the toolkit evaluates. MULTIVIEW: the images of all sensors at a time.
     """
-    truth = _read(scene, f"scene_gt{sensors[0]}.json", dict[_Frame, list[_Truth]])
-    infos = _read(scene, f"scene_gt_info{sensors[0]}.json", dict[_Frame, list[_Info]])
+    truths, details = (path_inside(scene, f"scene_{name}{sensors[0]}.json", scene, DatasetError) for name in ("gt", "gt_info"))
+    truth = read_json(truths, dict[_Frame, list[_Truth]], DatasetError, _ADVICE)
+    infos = read_json(details, dict[_Frame, list[_Info]], DatasetError, _ADVICE)
     if {frame: len(entries) for frame, entries in truth.items()} != {frame: len(entries) for frame, entries in infos.items()}:
         raise DatasetError(f"{scene} has other objects in scene_gt.json than in scene_gt_info.json; {_ADVICE}")
     scene_id = int(scene.name)
@@ -99,11 +96,6 @@ def make_scene_targets(scene: Path, visibility: float, sensors: tuple[str, ...])
         together.append({"im_id": [[sensor.removeprefix("_"), int(frame)] for sensor in sensors], "scene_id": scene_id})
     for targets in (localize, detect, together):
         yield "".join(json.dumps(target) + "\n" for target in targets).encode()
-
-
-def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
-    """Read an annotation file of a scene; raises DatasetError."""
-    return read_json(path_inside(scene, name, scene, DatasetError), schema, DatasetError, _ADVICE)
 
 
 def concatenate_targets(folder: Path, out: Path, names: tuple[str, ...]) -> None:

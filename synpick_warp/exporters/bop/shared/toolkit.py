@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.configs.cell.cameras import COLOR, DEPTH
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.scenes.types import Camera, Catalog
 
@@ -108,24 +108,22 @@ toolkit.get_camera_params = extend(toolkit.get_camera_params, lambda datasets_pa
 
 _ONE_SIZE = '{sensor: IM_SIZE for sensor in ("", *SENSORS)} if SENSORS else IM_SIZE'
 """Expression of the body for images of one size."""
-
-
 _BOTH = '{sensor: ["rgb", "depth"] for sensor in SENSORS} or ["rgb", "depth"]'
 """Expression of the body for images of both kinds from all sensors; also in its loop over these."""
 _PAIRS = '[(m, s) for s in SENSORS for m in ("rgb", "depth")]'
 _EVAL_SENSOR = '"eval_sensor": SENSORS[0]'
 
 
-def format_dataset_params(layout: DataLayout, color_format: str, catalog: Catalog, cameras: tuple[Camera, ...], rig: Rig) -> str:
+def format_dataset_params(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of bop_dataset_params.py: Python that adds the data set to the toolkit's functions."""
-    entries = catalog.entries
+    layout, rig, entries = settings.layout, settings.rig, catalog.entries
     values: dict[str, Any] = {
         "SPLITS": list(layout.folders),
         "SENSORS": list(layout.sensors),
         "OBJ_IDS": [entry.obj_id for entry in entries],
         "SYMMETRIC_OBJ_IDS": [entry.obj_id for entry in entries if entry.symmetries_discrete or entry.symmetries_continuous],
         "IM_SIZE": cameras[0].resolution,
-        "RGB_EXT": f".{color_format}",
+        "RGB_EXT": f".{settings.bop.color_format}",
     }
     sizes = {sensor: camera.resolution for sensor, camera in zip(layout.sensors, cameras, strict=False)}
     body = _BODY

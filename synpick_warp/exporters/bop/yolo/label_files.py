@@ -98,11 +98,8 @@ def _format_row(index: int, points: np.ndarray) -> str:
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: Sequence[Sequence[int]]) -> None:
-    """Task: complete an episode's scenes, (staging folder, scene_id): list their images, and rename all to their places in a split.
-
-    Raises:
-        OutputError: Not all `frames` (im_id) of a scene have arrived.
-    """
+    """Task: complete an episode's scenes, (staging folder, scene_id): list their images, and rename all to their places in a split; raises
+    OutputError if not all `frames` (im_id) of a scene have arrived."""
     for (scene, scene_id), own in zip(scenes, frames, strict=True):
         images = sorted(os.listdir(scene / IMAGES))
         if [image_name(scene_id, frame) for frame in own] != [name.partition(".")[0] for name in images]:
