@@ -1,4 +1,4 @@
-"""Plug-ins: formats and grippers of other installed packages, by their entry points.
+"""Plug-ins: formats, grippers and layers of other installed packages, by their entry points.
 
     [project.entry-points."synpick_warp.formats"]
     boxes = "my_package.boxes:FORMAT"         # a synpick_warp.exporters.formats.Format
@@ -6,8 +6,11 @@
     [project.entry-points."synpick_warp.grippers"]
     triangle = "my_package.triangle"          # a module with make_head(gripper) and BEHAVIOR
 
-Names are known without an import of the package; a module is imported when its name is first used. Names of this package stay its own. A
-file of its own, since settings, scenes, stages and exporters all read it.
+    [project.entry-points."synpick_warp.layers"]
+    range = "my_package.range:LAYER"          # has the members of synpick_warp.views.layers.Layer
+
+Names are known without an import of the package; a module is imported when its name is first used, that of a layer by every bake and in its
+writers, so it imports little. Names of this package stay its own. A file of its own, since settings, scenes, stages and exporters read it.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from typing import Any, Literal
 
 from synpick_warp.errors import ConfigError
 
-Group = Literal["formats", "grippers"]
+Group = Literal["formats", "grippers", "layers"]
 
 
 @functools.cache

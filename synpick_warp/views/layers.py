@@ -1,6 +1,7 @@
 """Annotation layers (AOVs, "annotators"): one table of the per-pixel ground truth beside colour, depth and masks.
 
-The choices of `render.layers`, the device buffers, the PNG codec and the notes in a data set derive from this table. Imports nothing.
+The choices of `render.layers`, the device buffers, the PNG codec and the notes in a data set derive from this table. Layers of other
+packages are rows as well (`system/plugins.py`): of these, `kernel` is the kernel, as "module:name". Imports little.
 To add a layer:
 
 1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits: "raw" is for integers, which files hold as they are;
@@ -13,7 +14,10 @@ To add a layer:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+
+from synpick_warp.system.plugins import load_plugin, plugin_names
 
 ZERO_CODE = 32768
 """Code of 0 in a signed layer."""
@@ -42,9 +46,11 @@ class Layer:
     """Key of `layer_codec.CODECS`."""
     note: str
     """Meaning of the file's codes, for the notes of a data set."""
+    kernel: str = ""
+    """Kernel of a layer of another package, as "module:name"; its parameters are among those of our layers' kernels."""
 
 
-LAYER_TABLE = {
+_OWN = {
     "normals": Layer(
         dtype="float32",
         components=3,
@@ -154,4 +160,32 @@ LAYER_TABLE = {
         "at that centre would bend the cup off. The product of both is SuctionNet's score.",
     ),
 }
-"""Layers by name, in the order of files, buffers and notes."""
+
+
+class LayerTable(Mapping[str, Layer]):
+    """Layers by name, in the order of files, buffers and notes: ours, then those of other packages, each loaded when it is first used."""
+
+    def __init__(self) -> None:
+        self._names = (*_OWN, *plugin_names("layers", tuple(_OWN)))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._names
+
+    def __getitem__(self, name: str) -> Layer:
+        """Raises a ConfigError if the package of a layer is broken."""
+        if name in _OWN:
+            return _OWN[name]
+        if name not in self._names:
+            raise KeyError(name)
+        members = [field.name for field in fields(Layer)]
+        plugin = load_plugin("layers", name, *members)
+        return Layer(*(getattr(plugin, member) for member in members))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+LAYER_TABLE = LayerTable()

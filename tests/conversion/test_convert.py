@@ -1,5 +1,5 @@
 """Conversion of data sets: byte equality with a bake of the format, resuming, and errors in one line, also of trajectories that lack
-something. A package of others (tests/plugins) adds a format and a gripper: bakes, `verify` and `convert` know them as they know ours."""
+something. A package of others (tests/plugins) adds a format, a gripper and a layer, which are known as ours are."""
 
 from __future__ import annotations
 
@@ -338,18 +338,30 @@ def boxes(monkeypatch) -> None:
     monkeypatch.setitem(FORMAT_TABLE, "boxes", FORMAT)
 
 
-def test_a_package_of_others_bakes_its_format_with_its_gripper(tmp_path):
+READ_RANGE = """
+import numpy as np, synpick_warp
+view = synpick_warp.open("DATA")[0].view(0)
+rows, columns = np.indices(view.depth.shape)
+rays = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(np.asarray(view.intrinsics)).T
+np.testing.assert_allclose(view.layer("range"), 1e3 * view.depth * np.linalg.norm(rays, axis=2), atol=1.1)  # rounded [mm]
+"""
+
+
+def test_a_package_of_others_bakes_its_format_with_its_gripper_and_layer(tmp_path):
     environment = checkout_environment()
     environment["PYTHONPATH"] += f":{PLUGINS}"
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "synpick_warp", *arguments]
+        command = [sys.executable, *arguments]
         return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
 
-    options = ("--formats", "boxes,zarr", "--device", "cpu", *assignments(PICKING | {"gripper.kind": "triangle"}))
-    done = run("bake", "--config", "smoke", *options, "--out", "DATA")
+    settings = PICKING | {"gripper.kind": "triangle", "render.layers": ["range"], "bop.masks": False}
+    options = ("--formats", "boxes,bop,zarr", "--device", "cpu", *assignments(settings))
+    for arguments in (("bake", "--config", "smoke", *options, "--out", "DATA"), ("verify", "DATA")):
+        done = run("-m", "synpick_warp", *arguments)
+        assert done.returncode == 0, done.stderr
+    done = run("-c", READ_RANGE)
     assert done.returncode == 0, done.stderr
-    assert run("verify", "DATA").returncode == 0
     assert len(list((tmp_path / "DATA" / "boxes").glob("*/*.json"))) > 10
     assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
 
@@ -359,19 +371,21 @@ def test_a_package_of_others_bakes_its_format_with_its_gripper(tmp_path):
     [
         (None, "cannot be loaded: ModuleNotFoundError"),
         ("FORMAT =", "cannot be loaded: SyntaxError"),
-        ("class FORMAT: ...", "is broken_extras:FORMAT, which has no module"),
+        ("class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
     ],
 )
-def test_a_package_of_others_that_is_broken_harms_only_its_own_format(tmp_path, sets, module, said):
+@pytest.mark.parametrize("group", ["formats", "layers"])
+def test_a_package_of_others_that_is_broken_is_one_line_of_what_uses_it(tmp_path, sets, module, said, group):
     folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-extras\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text("[synpick_warp.formats]\nbroken = broken_extras:FORMAT\nbop = broken_extras:FORMAT\n")
+    (folder / "entry_points.txt").write_text(f"[synpick_warp.{group}]\nbroken = broken_extras:FORMAT\nbop = broken_extras:FORMAT\n")
     if module is not None:
         (folder.parent / "broken_extras.py").write_text(module)
     environment = checkout_environment()
     environment["PYTHONPATH"] += f":{folder.parent}"
-    for arguments, code in ((("verify", sets["source"]), 0), (("bake", "--config", "smoke", "--formats", "broken", "--dry-run"), 2)):
+    use = ("--formats", "broken") if group == "formats" else ("--set", 'render.layers=["broken"]')
+    for arguments, code in ((("verify", sets["source"]), 0), (("bake", "--config", "smoke", *use, "--dry-run"), 2)):
         command = [sys.executable, "-m", "synpick_warp", *map(str, arguments)]
         done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == code, done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pkgutil
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +31,7 @@ from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_images
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.stereo import STEREO_LAYERS, StereoRenderer
+from synpick_warp.views.layers import LAYER_TABLE
 
 MAX_CLASS = 65535
 """Largest obj_id that fits into the layer `classes`."""
@@ -46,7 +48,7 @@ KERNELS = {
     "suction_seal": render_suction_seal_kernel,
     "suction_wrench": render_suction_wrench_kernel,
 }
-"""Kernel of each layer but those of `STEREO_LAYERS`; its output is named as the layer."""
+"""Kernel of each layer of ours but those of `STEREO_LAYERS`; its output is named as the layer."""
 BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
 
 
@@ -114,7 +116,8 @@ class LayerRenderer:
         for name in self.names:
             if name not in STEREO_LAYERS:
                 pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
-                launch_images(KERNELS[name], pixels, scene, self, snapshot, batch, out=out)
+                kernel = KERNELS.get(name) or pkgutil.resolve_name(LAYER_TABLE[name].kernel)
+                launch_images(kernel, pixels, scene, self, snapshot, batch, out=out)
         if self.stereo is not None:
             self.stereo.render(snapshot, bodies, gbuffer, views, out)
 

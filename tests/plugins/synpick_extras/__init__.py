@@ -1,1 +1,1 @@
-"""A package of others: a format and a gripper for synpick-warp."""
+"""A package of others: a format, a gripper and a layer for synpick-warp."""
