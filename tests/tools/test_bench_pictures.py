@@ -28,8 +28,7 @@ from tests.worlds.shapes import GREY, UPRIGHT, ball, box, camera, entry, sheet
 from tests.worlds.small_worlds import catalog
 from tests.worlds.toy_scene import ToyScene, render, snapshot
 from tools.bench import __main__ as bench
-from tools.bench import engines, peers, pictures, run, worlds
-from tools.bench import sensor as bench_sensor
+from tools.bench import peer_scenes, peers, pictures, run, worlds
 from tools.options import MeasuredRow
 
 WORLDS, CAMERAS, BATCH, AFTER, HISTORY_TICKS, KEPT_TICKS, ROUNDS = 2, 3, 4, 2, 2, 3, 2
@@ -177,7 +176,7 @@ def views(device):
         table=True,
     )
     config = toy.settings()
-    scene = bench_sensor.build_sensor_scene(
+    scene = peer_scenes.SensorScene(
         config.render, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, -config.tote.wall, snapshot(toy, device), 4, device
     )
     scene.prepare(color=False)[0]()
@@ -187,7 +186,7 @@ def views(device):
 def test_an_independent_renderer_agrees(views):
     scene, index, depth, ours = views
     assert set(np.unique(ours.instance)) == {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
-    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene.segment, index, depth, ours.instance, ours.depth, 0.1))
+    same, close, largest = (row.value for row in peer_scenes.compare_hits(scene.segment, index, depth, ours.instance, ours.depth, 0.1))
     # Rounding decides on which side of a silhouette a grazing ray passes.
     assert same >= 99.9
     assert close >= 99.9
@@ -199,7 +198,7 @@ def test_differences_are_counted(views):
     segment, counts = ours.instance.copy(), ours.depth.copy()
     segment[0, :30] = Segment.CUP
     counts[0, 30:] += 100
-    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene.segment, index, depth, segment, counts, 0.1))
+    same, close, largest = (row.value for row in peer_scenes.compare_hits(scene.segment, index, depth, segment, counts, 0.1))
     assert same == pytest.approx(87.5, abs=0.2)
     assert close == pytest.approx(75.0, abs=0.2)
     assert largest >= 9.9
@@ -209,7 +208,7 @@ def test_textures_with_the_same_border_stay_distinct():
     black = np.zeros((1024, 1024, 3), np.uint8)
     framed = black.copy()
     framed[:, 1:] = 200
-    first, second = (bench_sensor.newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
+    first, second = (peer_scenes.newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
     assert first.texture_hash != second.texture_hash
 
 
@@ -235,7 +234,7 @@ def short(monkeypatch):
             monkeypatch.setattr(module, name, 1)
     monkeypatch.setattr(peers, "SMALL_SIZE", (16, 16))
     for name in ("FALL_STEPS", "LEAD_STEPS", "REST_STEPS"):
-        monkeypatch.setattr(engines, name, 2)
+        monkeypatch.setattr(peers, name, 2)
 
 
 @pytest.fixture
@@ -251,7 +250,7 @@ def pile():
     """Two objects on the tote's floor, side by side."""
     entries = catalog().entries[:2]
     heights = [-float(min(piece.vertices[:, 2].min() for piece in entry.pieces)) for entry in entries]
-    return engines.EqualPile(entries, np.array([(x, 0.0, z, *UPRIGHT) for x, z in zip((-0.1, 0.1), heights, strict=True)]))
+    return peers.EqualPile(entries, np.array([(x, 0.0, z, *UPRIGHT) for x, z in zip((-0.1, 0.1), heights, strict=True)]))
 
 
 @pytest.mark.parametrize(("names", "modules"), [("mujoco", "mujoco"), ("mujoco-warp,sensor-camera", "mujoco and mujoco_warp")])
@@ -304,7 +303,7 @@ def test_the_pile_is_that_of_the_median_world_and_worlds_repeat(device):
     snapshot = allocate(Snapshot, {"world": 3, "instance": 2, "fixture": 3}, device)
     snapshot.catalog_index.assign(np.array([[0, 1], [-1, 1], [-1, -1]], np.int32))
     snapshot.pose.assign(np.arange(42, dtype=np.float32).reshape(3, 2, 7))
-    median = engines.pick_pile(catalog(), snapshot)
+    median = peers.pick_pile(catalog(), snapshot)
     assert [entry.obj_id for entry in median.entries] == [2]
     assert median.pose.tolist() == [list(range(21, 28))]
     tiled = peers.tile_snapshot(snapshot, 5, device)
@@ -314,21 +313,21 @@ def test_the_pile_is_that_of_the_median_world_and_worlds_repeat(device):
 
 def test_worlds_of_a_pile_are_equal_and_a_fall_starts_above(pile, device):
     lifted = pile.lift()
-    assert (lifted.pose[:, 2] > pile.pose[:, 2] + 0.99 * engines.LIFT).all()
+    assert (lifted.pose[:, 2] > pile.pose[:, 2] + 0.99 * peers.LIFT).all()
     assert (lifted.pose[:, :2] == pile.pose[:, :2]).all()
-    model = engines.build_piles(TWO, pile, 3, device)
+    model = peers.build_piles(TWO, pile, 3, device)
     assert (model.world_count, model.body_count) == (3, 6)
     assert model.body_mass.numpy() == pytest.approx([entry.mass for entry in pile.entries] * 3)
 
 
-@pytest.mark.parametrize("name", ["ours", "mujoco-warp", *engines.CONES])
+@pytest.mark.parametrize("name", ["ours", "mujoco-warp", *peers.CONES])
 def test_a_pile_in_the_air_falls_as_galilei_says_and_one_on_the_floor_stays(name, pile, device, request):
     if name == "ours":
-        engine = engines.make_ours(TWO, pile, device)
+        engine = peers.make_ours(TWO, pile, device)
     else:
         request.getfixturevalue("mujoco")
         warp_engine = name == "mujoco-warp"
-        engine = engines.make_mujoco_warp(TWO, pile, device, "pyramidal", 16) if warp_engine else engines.MujocoEngine(TWO, pile, name)
+        engine = peers.make_mujoco_warp(TWO, pile, device, "pyramidal", 16) if warp_engine else peers.MujocoEngine(TWO, pile, name)
     steps, lifted = 20, pile.lift()
     seconds = steps * TWO.physics.step
     engine.start(lifted)
@@ -344,14 +343,14 @@ def test_a_pile_in_the_air_falls_as_galilei_says_and_one_on_the_floor_stays(name
     assert np.abs(velocity).max() < 0.05
 
 
-@pytest.mark.parametrize("cone", engines.CONES)
+@pytest.mark.parametrize("cone", peers.CONES)
 def test_mujoco_warp_in_graphs_takes_the_steps_of_single_launches(cone, pile, mujoco, monkeypatch):
     """On a CPU, where Warp might replay another kernel of the same key."""
     found = []
     for captures in (False, True):
-        monkeypatch.setattr(engines, "may_capture", lambda device, captures=captures: captures)
-        engine = engines.make_mujoco_warp(TWO, pile, wp.get_device("cpu"), cone, 16)
+        monkeypatch.setattr(peers, "may_capture", lambda device, captures=captures: captures)
+        engine = peers.make_mujoco_warp(TWO, pile, wp.get_device("cpu"), cone, 16)
         engine.start(pile)
-        engine.run(4 * engines.GRAPH_STEPS)
+        engine.run(4 * peers.GRAPH_STEPS)
         found.append(engine.bodies())
     np.testing.assert_array_equal(*found)

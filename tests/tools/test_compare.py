@@ -27,7 +27,7 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from tests.builders import ONE_OBJECT, assignments
 from tests.harness.environment import ROOT
-from tools.compare import guard, guard_device, kernel_sources, pictures
+from tools.compare import guard, kernel_sources, pictures
 from tools.compare import runs as compared
 from tools.compare.__main__ import main
 from tools.compare.guard_steps import SETS, Step, cpu_steps
@@ -88,19 +88,19 @@ def text(old: str, new: str) -> Callable[[Path], object]:
 IMAGE, STAGE, ARRAY = "train/000004/depth/000002.png", "usd/000001.usdc", "trajectory.zarr/episodes/000001/pose"
 OTHER = {"bake.worlds": 9, "bake.seed": 5}
 CASES = [
-    (IMAGE, edit_image, ": row 3, column 5: 29 and 33; 2 of 48 values, by up to 9", "train/*/depth/*.png", 9.0),
+    (IMAGE, edit_image, ": [3, 5]: 29 and 33; 2 of 48 values, by up to 9", "train/*/depth/*.png", 9.0),
     ("train/000004/scene_gt.json", text("2.0", "2.5"), ": 0[0].cam_t_m2c[1]: 2.0 and 2.5", "train/*/scene_gt.json", 0.5),
     ("episodes.jsonl", text("8", "9"), ": [1].frames: 8 and 9", "episodes.jsonl", 1.0),
     ("manifest/000001.sha256", text("11", "12"), ": line 2: 11  b and 12  b", "manifest/*.sha256", None),
     (
         ARRAY,
         lambda path: operator.setitem(zarr.open_array(path, mode="r+"), (2, 1), 7.25),
-        "/c/0/0: axis 0 2, axis 1 1: 7.0 and 7.25; 1 of 12 values, by up to 0.25",
+        "/c/0/0: [2, 1]: 7.0 and 7.25; 1 of 12 values, by up to 0.25",
         "trajectory.zarr/episodes/*/pose/c/0",
         0.25,
     ),
-    ("shard-000000.tar", edit_shard, ": 000001.gt.json: [1]: 2 and 4", "shard-*.tar", 2.0),
-    (STAGE, edit_usd, ": line 5 as text: double radius = 2 and double radius = 3", "usd/*.usdc", None),
+    ("shard-000000.tar", edit_shard, ": 000001.gt.json[1]: 2 and 4", "shard-*.tar", 2.0),
+    (STAGE, edit_usd, ": line 5: double radius = 2 and double radius = 3", "usd/*.usdc", None),
     ("config.toml", lambda path: path.write_text(config_to_toml(load_config("smoke", OTHER))), ": bake.seed: 0 and 5", "config.toml", 5.0),
 ]
 
@@ -336,12 +336,12 @@ def test_files_are_compared_without_times(tmp_path, name, old, new, verdict):
 @pytest.mark.parametrize("digests", [("a", "a"), ("a", "b")])
 def test_all_worlds_of_both_checkouts_have_one_digest(tmp_path, monkeypatch, digests):
     options = SimpleNamespace(device="cuda:0", models="", lights="")
-    monkeypatch.setattr(guard_device, "_run", lambda *_: "")
-    monkeypatch.setattr(guard_device, "digest_folder", lambda folder: digests[folder.parent.name == "new"])
-    results = list(guard_device.compare_worlds(*sides(tmp_path), options))
-    assert len(results) >= 2 * len(guard_device.WORLDS)
-    assert [verdict for title, verdict, _ in results if title.startswith("old")] == ["equal"] * (len(results) // 2)
-    assert {verdict for title, verdict, _ in results if title.startswith("new")} == {"equal" if digests[0] == digests[1] else "different"}
+    monkeypatch.setattr(guard, "_run", lambda *_: "")
+    monkeypatch.setattr(guard, "digest_folder", lambda folder: digests[folder.parent.name == "new"])
+    results = list(guard.compare_worlds(*sides(tmp_path), options))
+    assert len(results) >= 2 * len(guard.WORLDS)
+    assert [line.verdict for line in results if line.name.startswith("old")] == ["equal"] * (len(results) // 2)
+    assert {line.verdict for line in results if line.name.startswith("new")} == {"equal" if digests[0] == digests[1] else "different"}
 
 
 @pytest.mark.parametrize(("rates", "verdict"), [((1000.0, 995.0), "equal"), ((1000.0, 985.0), "different"), ((1000.0, 1100.0), "equal")])
@@ -351,10 +351,10 @@ def test_pictures_may_be_one_percent_slower(tmp_path, monkeypatch, rates, verdic
         (side.folder / command[-1]).write_text(json.dumps({"rows": rows}))
         return ""
 
-    monkeypatch.setattr(guard_device, "_run", measure)
-    ((_, found, detail),) = guard_device.compare_pictures(*sides(tmp_path), SimpleNamespace(device="cuda:0", models="", lights=""))
-    assert found == verdict
-    assert detail.startswith("1000.0 and")
+    monkeypatch.setattr(guard, "_run", measure)
+    (line,) = guard.compare_pictures(*sides(tmp_path), SimpleNamespace(device="cuda:0", models="", lights=""))
+    assert line.verdict == verdict
+    assert line.detail.startswith("1000.0 and")
 
 
 def test_each_set_is_verified_and_every_format_and_layer_is_in_one():
@@ -369,9 +369,9 @@ def test_digests_leave_out_worlds_and_version(tmp_path):
         (tmp_path / name / "train").mkdir(parents=True)
         (tmp_path / name / "config.toml").write_text(settings)
         (tmp_path / name / "train" / "scene_gt.json").write_text("{}")
-    assert guard_device.digest_folder(tmp_path / "a") == guard_device.digest_folder(tmp_path / "b")
+    assert guard.digest_folder(tmp_path / "a") == guard.digest_folder(tmp_path / "b")
     (tmp_path / "b" / "train" / "scene_gt.json").write_text("[]")
-    assert guard_device.digest_folder(tmp_path / "a") != guard_device.digest_folder(tmp_path / "b")
+    assert guard.digest_folder(tmp_path / "a") != guard.digest_folder(tmp_path / "b")
 
 
 RANDOM = """

@@ -10,22 +10,12 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", exc_type=ImportError)
-scores = pytest.importorskip("tools.reports.real.scores", exc_type=ImportError)
+training = pytest.importorskip("tools.reports.real.training", exc_type=ImportError)
 
 from synpick_warp.errors import ConfigError  # noqa: E402
 from synpick_warp.system.hardware.device import pick_device  # noqa: E402
-from tools.reports.real import training  # noqa: E402
-from tools.reports.real.__main__ import check_ids, interval, make_options, source_of  # noqa: E402
-from tools.reports.real.training import (  # noqa: E402
-    Recipe,
-    ResidualNetwork,
-    compress_views,
-    prepare_batch,
-    segmentation_loss,
-    train,
-    warp_views,
-)
-from tools.reports.real.views import ViewPool  # noqa: E402
+from tools.reports.real import __main__ as report  # noqa: E402
+from tools.reports.real.training import Recipe, ViewPool, prepare_batch, segmentation_loss, train, warp_views  # noqa: E402
 
 RECIPE = Recipe(views=8, passes=1.0, batch=4, width=8, seconds=10.0, capacity=8)
 
@@ -47,12 +37,11 @@ def test_scores_of_a_known_prediction():
     truth[0, :4], truth[1, :2] = 1, 2
     found = truth.copy()
     found[0, 2:4], found[0, 8] = 0, 3
-    made = scores.score([("a", found, truth)], 4)
+    made = report.score([(found, truth)], 4)
     assert made.iou == {1: 0.5, 2: 1.0}
     assert made.mean_iou == 0.75
     assert made.found == 0.5
     assert made.background == pytest.approx(1 / 14)
-    assert made.views == {"a": 0.75}
 
 
 def test_predictions_have_the_size_of_the_image():
@@ -64,7 +53,7 @@ def test_predictions_have_the_size_of_the_image():
 
     color = np.zeros((24, 40, 3), np.uint8)
     color[4:12, 10:28] = 200
-    found = scores.predict(network, color, (20, 12), torch.device("cpu"))
+    found = report.predict(network, color, (20, 12), torch.device("cpu"))
     np.testing.assert_array_equal(found, color[..., 0] > 0)
 
 
@@ -80,9 +69,9 @@ def test_images_grow_over_the_schedule(progress, size):
 
 
 def test_the_interval_is_students():
-    assert interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
-    assert interval([1.0, 2.0]) == "(1, 2)"
-    assert interval([1.0]) == ""
+    assert report.interval([1.0, 2.0, 3.0]) == "(-0.484 to 4.48)"
+    assert report.interval([1.0, 2.0]) == "(1, 2)"
+    assert report.interval([1.0]) == ""
 
 
 def test_augmentation_moves_labels_with_the_image():
@@ -102,7 +91,7 @@ def test_jpeg_is_opencvs(quality):
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     expected = cv2.imdecode(cv2.imencode(".jpg", image, options)[1], cv2.IMREAD_COLOR)[..., ::-1].astype(np.float64)
     tensor = torch.from_numpy(image[..., ::-1].copy()).permute(2, 0, 1)[None] / 255.0
-    made = 255.0 * compress_views(tensor, torch.tensor([quality]))[0].permute(1, 2, 0).numpy()
+    made = 255.0 * training.compress_views(tensor, torch.tensor([quality]))[0].permute(1, 2, 0).numpy()
     assert np.abs(made - expected).mean() < 0.5 * np.abs(expected - image[..., ::-1]).mean()
     assert np.abs(made - expected).max() < 20.0
 
@@ -119,7 +108,7 @@ def test_the_loss_of_known_logits():
 
 
 def test_the_network_has_logits_of_the_images_size():
-    assert ResidualNetwork(5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
+    assert training.ResidualNetwork(5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
 
 
 def test_a_pool_replaces_views_once_it_is_full():
@@ -134,23 +123,18 @@ def test_a_pool_replaces_views_once_it_is_full():
     assert torch.equal(images[:, 0], classes)
 
 
-class Drawn:
-    """Synthetic data source: batches of four images of a bright square, each after a delay of `pause` seconds."""
-
-    def __init__(self, pause: float = 0.0):
-        self.pause = pause
-
-    def batches(self, views):
-        for _ in range(views // 4):
-            time.sleep(self.pause)
-            classes = torch.zeros(4, 16, 16, dtype=torch.uint8)
-            classes[:, 4:12, 4:12] = 1
-            yield (classes[:, None] * 200).expand(-1, 3, -1, -1), classes
+def draw(views: int, pause: float = 0.0):
+    """Batches of four images of a bright square, each after a delay of `pause` seconds."""
+    for _ in range(views // 4):
+        time.sleep(pause)
+        classes = torch.zeros(4, 16, 16, dtype=torch.uint8)
+        classes[:, 4:12, 4:12] = 1
+        yield (classes[:, None] * 200).expand(-1, 3, -1, -1), classes
 
 
 def test_a_pool_that_fills_slowly_leaves_time_to_train():
     recipe = dataclasses.replace(RECIPE, views=4000, capacity=4000, width=2, seconds=2.0, jpeg=0.0)
-    trained = train(Drawn(0.05), recipe, 2, torch.device("cpu"), 0)
+    trained = train(draw(4000, 0.05), recipe, 2, torch.device("cpu"), 0)
     assert 0 < trained.views < 4000
     assert trained.stream_seconds < trained.seconds
     assert trained.samples >= recipe.batch
@@ -158,7 +142,7 @@ def test_a_pool_that_fills_slowly_leaves_time_to_train():
 
 def test_views_beyond_the_pool_come_while_the_network_trains():
     recipe = dataclasses.replace(RECIPE, views=16, width=2, seconds=60.0, half=0.5)
-    trained = train(Drawn(), recipe, 2, torch.device("cpu"), 0)
+    trained = train(draw(16), recipe, 2, torch.device("cpu"), 0)
     assert trained.views == 16
     assert trained.samples == 16
 
@@ -168,17 +152,17 @@ def test_views_keep_ahead_of_samples(monkeypatch):
     steps, step = [], training._Trainer.step
     monkeypatch.setattr(training._Trainer, "step", lambda self, pool: (steps.append(pool.seen), step(self, pool)))
     recipe = dataclasses.replace(RECIPE, views=40, capacity=40, width=2, seconds=600.0, passes=5.0)
-    train(Drawn(), recipe, 2, torch.device("cpu"), 0)
+    train(draw(40), recipe, 2, torch.device("cpu"), 0)
     assert steps == [min(40, 8 + 4 * (1 + step // 4)) for step in range(50)]
 
 
 def test_images_and_objects_that_networks_cannot_have_are_named():
-    options = make_options().parse_args(
-        ["--real", "frames", "--config", "synpick", "--set", "cameras.resolution=[100,96]", "--enlarge", "1"]
-    )
-    with pytest.raises(ConfigError, match=r"100x96 px .* multiples of 16"):
-        source_of(options, 0, pick_device("cpu"))
-    options.enlarge = 4
-    assert source_of(options, 0, pick_device("cpu")).config.rig.sizes[0] == (400, 384)
+    def sizes(resolution: str) -> list[tuple[int, int]]:
+        options = ["--real", "frames", "--config", "synpick", "--set", f"cameras.resolution={resolution}"]
+        return report.settings_of(report.make_options().parse_args(options), 0, pick_device("cpu")).rig.sizes
+
+    assert sizes("[96,72]")[0] == (192, 144)
+    with pytest.raises(ConfigError, match=r"200x192 px .* multiples of 16"):
+        sizes("[100,96]")
     with pytest.raises(ConfigError, match="obj_id 22; allowed here: 1 to 21"):
-        check_ids([np.zeros((2, 2), np.uint8), np.full((3, 2), 22, np.uint8)])
+        report.check_ids([np.zeros((2, 2), np.uint8), np.full((3, 2), 22, np.uint8)])

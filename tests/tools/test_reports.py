@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -17,14 +15,14 @@ from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, ONE_OBJECT, PICKING, assignments, refusal
 from tests.harness.environment import ROOT
 from tools.bench import __main__ as bench
-from tools.bench import run, worlds
+from tools.bench import worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.figures import read_runs
 from tools.reports import rest as rest_report
 from tools.reports import sequence
 from tools.reports.real_frames import read_frames, write_data_set
-from tools.reports.sequence import GAP, LINE, Pair, ReferenceStore, Shot, draw_sheet, summarize_pairs
+from tools.reports.sequence import Pair, Shot, summarize_pairs
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))
@@ -115,7 +113,7 @@ def test_more_arrangements_than_worlds(tmp_path):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "STREAM_BATCHES"):
         monkeypatch.setattr(worlds, name, 1)
-    for target in ("run.MIN_REPEATS", "run.BURST", "meter.LEAD_TICKS"):
+    for target in ("run.MIN_REPEATS", "run.BURST", "bakes.LEAD_TICKS"):
         monkeypatch.setattr(f"tools.bench.{target}", 1)
     # Other tests write to and delete from the file system whose used space is measured.
     unchanged = shutil.disk_usage(tmp_path)
@@ -129,18 +127,6 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     printed = capsys.readouterr().out
     for name in ("views, all stages", "picking, steps alone", "perception and planning: fraction of simulation and rendering"):
         assert name in printed
-
-
-def test_a_stopwatch_sums_calls(device):
-    watch, calls = run.Stopwatch(device), []
-    owner = SimpleNamespace(work=lambda value, *, factor: calls.append(value * factor) or time.sleep(2e-3))
-    with watch.time_method(owner, "work", "name"):
-        owner.work(2, factor=3)
-        owner.work(4, factor=1)
-    owner.work(5, factor=1)
-    assert calls == [6, 4, 5]
-    assert watch.seconds("name") >= 4e-3
-    assert watch.seconds("another") == 0.0
 
 
 @pytest.mark.parametrize(
@@ -193,19 +179,11 @@ def test_bounds_are_of_the_means():
     assert [row.holds for row in summarize_pairs([dark, dark])] == [False, True, False]
 
 
-def test_a_sheet_has_a_labelled_row_per_pair_and_large_images_are_shrunk():
-    sheet = draw_sheet([pair(shot(100), shot(110))] * 2)
-    assert sheet.shape == (LINE + 2 * (9 * 40 + GAP + LINE), 3 * (640 + GAP), 3)
-    assert [int(sheet[2 * LINE + 5, column * (640 + GAP) + 5, 0]) for column in range(3)] == [100, 110, 50]
-    assert sheet[LINE : 2 * LINE].min() < 100  # The label.
-    assert draw_sheet([pair(shot(10, (72, 1280)), shot(10, (72, 1280)))]).shape == (2 * LINE + 36 + GAP, 3 * (640 + GAP), 3)
-
-
 @pytest.mark.slow
 def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, capsys):
     """A bound of 35 dB does not hold for tiny images of few paths: exit code 1."""
-    file, sheet = tmp_path / "numbers.json", tmp_path / "sheet.png"
-    options = ["--mode", "move", "--frames", "3,0", "--size", "32x18", "--samples", "4", "--json", str(file), "--sheet", str(sheet)]
+    file = tmp_path / "numbers.json"
+    options = ["--mode", "move", "--frames", "3,0", "--size", "32x18", "--samples", "4", "--json", str(file)]
     code = sequence.main([*options, *FEW_STEPS])
     rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
     frames = [int(name.split(",")[0].removeprefix("frame ")) for name in rows if name.endswith("denoised against reference")]
@@ -215,37 +193,9 @@ def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, ca
         np.mean([row["value"] for name, row in rows.items() if name.endswith(": denoised against reference")])
     )
     assert (mean["holds"], code) == (mean["value"] >= 35.0, 1)
-    assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + GAP)
     capsys.readouterr()
     assert sequence.main(["--frames", "100000", "--mode", "move", "--size", "32x18", *FEW_STEPS, "--set", "move.speed=9"]) == 2
     assert "no episode has frame 100000" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkeypatch, capsys):
-    rendered, original = [], ReferenceStore._render
-    monkeypatch.setattr(ReferenceStore, "_render", lambda *given: rendered.append(1) or original(*given))
-
-    def run(*options: str) -> tuple[dict[str, float], int]:
-        """Values, and the number of references that were rendered."""
-        file, before = tmp_path / "numbers.json", len(rendered)
-        common = ["--mode", "move", "--frames", "0,3", "--size", "32x18", "--references", str(kept), "--json", str(file)]
-        sequence.main([*common, *FEW_STEPS, *options])
-        return {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}, len(rendered) - before
-
-    kept = tmp_path / "kept"
-    kept.mkdir()
-    few = ["--samples", "4"]
-    first = run(*few)
-    assert first[1] == 2
-    assert run(*few) == (first[0], 0)
-    coarser, count = run(*few, "--set", "render.coarse_pixel=4")
-    assert (coarser == first[0], count) == (False, 0)
-    assert run("--samples", "8")[1] == run(*few, "--seed", "5")[1] == 2
-    assert len(list(kept.iterdir())) == 6
-    with pytest.raises(SystemExit, match="2"):
-        run("--references", str(tmp_path / "none"))
-    assert "there is no folder" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -1,39 +1,161 @@
 """Parts that bake to the temporary folder (TMPDIR): the steady state, with and without pictures.
 
-Background processes verify finished episodes and delete their files, so that the disk does not fill.
+Readings of counts and resources are taken after each tick while nearly all worlds act; then the bake is stopped. Meanwhile processes verify
+each committed episode as `synpick-warp verify` does, and delete its files, so that the disk does not fill.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import shutil
+import signal
+import statistics
 import tempfile
-from collections.abc import Iterator
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial, reduce
 from pathlib import Path
+from typing import Any, NamedTuple, Self
 from unittest import mock
 
 import numpy as np
+import warp as wp
 
+from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
-from synpick_warp.errors import DatasetError
+from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_checksums
+from synpick_warp.dataset.commit.verify import check_files
+from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, shared_files
 from synpick_warp.factory.order import predict_frames
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.factory.sizes import pick_processes
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.stages.sim.arrange import sample_episodes_ahead
+from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.processes.pool import WorkerPool, WorkerProgram
+from synpick_warp.system.progress import SilentProgress
 from synpick_warp.views.frames import TickBatch
-from tools.bench.cleaner import Assignment, Cleaner
-from tools.bench.meter import SteadyMeter, summarize_rates
 from tools.bench.run import LIVE_FRACTION, SPARE_EPISODES, Bench
 from tools.options import MeasuredRow
 
+LEAD_TICKS = 2
+"""Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
+SLICE_SECONDS = 20.0
+"""Window length of the reported rates (median, minimum and maximum over windows) [s]."""
 WITHOUT_PICTURES = ("usd", "zarr")
 """Formats of trajectories alone; worlds that pick still render the images of their perception."""
 HOUR = 3600.0
 """[s]"""
+LIST_INTERVAL = 0.5
+"""Interval at which committed episodes are listed [s]."""
+CORES_PER_PROCESS = 4
+"""Number of CPU cores per process that verifies; with fewer cores there is one process. Verifying and deleting a view takes less CPU time
+than writing it: on an H200's host with 16 cores, 4 processes kept up with 877 full-HD views/s with all masks."""
+_PARENT, _USER, _SYSTEM, _RESIDENT = 1, 11, 12, 21
+"""Indices in /proc/PID/stat (proc_pid_stat(5)) after the command's name: parent process, CPU time in user mode and in system mode [clock
+ticks], resident memory [pages]."""
+_ANONYMOUS = re.compile(r"^RssAnon:\s*(\d+) kB$", re.MULTILINE)
+"""Line of /proc/PID/status, which processes that have ended and kernel threads lack."""
+
+
+# ---- verification and deletion ----
+
+
+class Tally(NamedTuple):
+    """Counters of a cleaner: verified episodes and files, deleted bytes, first problem (empty: none)."""
+
+    episodes: int = 0
+    """Number of verified episodes."""
+    files: int = 0
+    """Number of verified files."""
+    deleted: int = 0
+    """Disk space freed by deletion [bytes]."""
+    problem: str = ""
+    """Description of the first missing or damaged file, after which nothing more is verified; empty: none."""
+
+    def plus(self, other: Tally) -> Tally:
+        """Sum of two counters, with the problem of the first that has one."""
+        return Tally(self.episodes + other.episodes, self.files + other.files, self.deleted + other.deleted, self.problem or other.problem)
+
+
+@dataclass(frozen=True)
+class CleanedSet:
+    """Data set whose committed episodes are verified and deleted; manifest entries, and files of others, are kept."""
+
+    out: Path
+    """Folder of the data set."""
+    folders: tuple[str, ...]
+    """Folders shared by several episodes, relative to the data set; they are kept even if empty."""
+
+    def clean(self, episode: int) -> Tally:
+        """Verify a committed episode, and delete its files; an episode with a problem is kept."""
+        deleted = 0
+        try:
+            known = read_checksums(self.out, episode_entry(episode))
+            if problem := check_files(self.out, known).problem:
+                return Tally(problem=problem)
+            for name in known:
+                deleted += (self.out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
+                (self.out / name).unlink()
+        except SynpickError as error:
+            return Tally(problem=str(error))
+        except OSError as error:
+            return Tally(problem=f"{error.filename} cannot be deleted: {error.strerror}")
+        self._remove_empty_folders(known)
+        return Tally(1, len(known), deleted)
+
+    def _remove_empty_folders(self, names: dict[str, str]) -> None:
+        """Remove the parent folders of files `names` that are now empty, except shared folders and their parents."""
+        stay = {folder for name in self.folders for folder in (Path(name), *Path(name).parents)} | {Path()}
+        folders = {parent for name in names for parent in Path(name).parents} - stay
+        for folder in sorted(folders, key=lambda folder: -len(folder.parts)):
+            with contextlib.suppress(OSError):  # It holds other files.
+                os.rmdir(self.out / folder)
+
+
+class Cleaner:
+    """Pool of processes that verify and delete the episodes of a running bake; a context manager that ends them."""
+
+    def __init__(self, data_set: CleanedSet, processes: int | None = None) -> None:
+        """Start `processes` processes; None: a number by CORES_PER_PROCESS."""
+        program = WorkerProgram(partial(CleanedSet, data_set.out, data_set.folders), "process that verifies episodes", "bake.worlds")
+        self._pool = WorkerPool(program, processes or max(1, count_cores() // CORES_PER_PROCESS))
+        self._out, self._known, self._tally, self._listed = data_set.out, set[int](), Tally(), 0.0
+
+    @property
+    def pids(self) -> tuple[int, ...]:
+        """Ids of the worker processes."""
+        return self._pool.pids()
+
+    def poll(self) -> Tally:
+        """Hand over new episodes, and return the totals of those that are done; a process that died is a problem."""
+        if self._tally.problem:
+            return self._tally
+        try:
+            if time.monotonic() - self._listed >= LIST_INTERVAL:
+                self._listed = time.monotonic()
+                for episode in sorted(set(committed_episodes(self._out)) - self._known):
+                    self._known.add(episode)
+                    self._pool.submit(partial(CleanedSet.clean, episode=episode), drain=False)
+            while done := self._pool.receive(0.0):
+                self._tally = reduce(Tally.plus, (future.result() for future in done), self._tally)
+        except SynpickError as error:
+            self._tally = self._tally._replace(problem=str(error))
+        return self._tally
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.kill()
 
 
 @contextlib.contextmanager
@@ -44,11 +166,193 @@ def clean_up_behind(layout: DataLayout, out: Path) -> Iterator[Cleaner]:
         DatasetError: An episode was damaged.
     """
     folders = tuple(map(str, shared_files(load_exporter_classes(layout.formats), layout).folders))
-    with Cleaner(Assignment(out, folders)) as cleaner:
+    with Cleaner(CleanedSet(out, folders)) as cleaner:
         yield cleaner
         tally = cleaner.poll()
     if tally.problem:
         raise DatasetError(tally.problem)
+
+
+# ---- readings ----
+
+
+class Usage(NamedTuple):
+    """Resources of processes."""
+
+    cpu: float = 0.0
+    """CPU time in user mode and in the kernel [s]."""
+    resident: int = 0
+    """Resident memory [bytes]; memory that processes share, such as the slots through which writers get images, counts in each."""
+    anonymous: int = 0
+    """Resident memory of the process's own [bytes]: without shared memory and files."""
+
+    def plus(self, other: Usage) -> Usage:
+        """Sum of the resources of two."""
+        return Usage(self.cpu + other.cpu, self.resident + other.resident, self.anonymous + other.anonymous)
+
+
+def measure_usage() -> dict[int, Usage]:
+    """Resources of this process and of its running descendants, by process id."""
+    usages: dict[int, Usage] = {}
+    parents: dict[int, int] = {}
+    tick = 1.0 / os.sysconf("SC_CLK_TCK")
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                values = list(map(int, (entry / "stat").read_text().rpartition(")")[2].split()[1:]))
+                anonymous = _ANONYMOUS.search((entry / "status").read_text())
+            except OSError:
+                continue
+            user, system, pages = (values[index - 1] for index in (_USER, _SYSTEM, _RESIDENT))
+            own = 1024 * int(anonymous[1]) if anonymous else 0
+            usages[int(entry.name)] = Usage(tick * (user + system), pages * os.sysconf("SC_PAGE_SIZE"), own)
+            parents[int(entry.name)] = values[_PARENT - 1]
+    return {pid: usage for pid, usage in usages.items() if _descends(pid, os.getpid(), parents)}
+
+
+def _descends(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
+    """True if a process is the ancestor or one of its descendants."""
+    while pid in parents and pid != ancestor:
+        pid = parents[pid]
+    return pid == ancestor
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Reading of a bake after a tick."""
+
+    time: float
+    """[s]"""
+    count: int
+    """Views, or frames of worlds, so far."""
+    episodes: int
+    """Ended episodes."""
+    main: Usage
+    """Of the main process."""
+    writers: Usage
+    """Of the writers; with several devices, of the devices' processes as well."""
+    cleaner: Usage
+    """Of the processes that verify and delete."""
+    tally: Tally
+    """Their totals."""
+    disk: int
+    """Bytes in use on the file system."""
+    device: int
+    """Bytes of device memory in use, by all processes; 0 on the CPU."""
+
+
+class SteadyMeter(SilentProgress):
+    """Progress observer that takes a reading after each tick of the steady state, and then stops the bake by SIGINT.
+
+    It stops after `seconds` of readings, when no episode waits for a world any more, or when verification finds a damaged file.
+    """
+
+    def __init__(
+        self,
+        seconds: float,
+        folder: Path,
+        steady_count: float,
+        worlds: int,
+        device: wp.Device,
+        cleaner: Cleaner | None = None,
+        counter: Callable[[], int] | None = None,
+        devices: int = 1,
+    ) -> None:
+        """
+        Args:
+            seconds: Time to measure [s].
+            folder: Where the bake writes.
+            steady_count: Steady-state threshold: views, or frames, of a device's tick.
+            worlds: Worlds of a device.
+            device: First device of the bake.
+            cleaner: Processes that verify and delete; None: there are none.
+            counter: Function that returns the number of frames so far; None: views are counted.
+            devices: Devices of the bake, with a process each if there are several.
+        """
+        self.seconds, self.folder, self.steady_count, self.worlds = seconds, folder, steady_count, worlds
+        self.device, self.cleaner, self.counter, self.devices = device, cleaner, counter, devices
+        self.ticks = 0
+        self._counts = deque([0], maxlen=devices)
+        # Devices with processes of their own leave this one without a CUDA context; each query of free memory would make one, for seconds.
+        _ = device.context
+        self.started = time.perf_counter()
+        self.first_count = 0.0
+        self.initial_disk = shutil.disk_usage(folder).used
+        self.readings: list[Reading] = []
+        self.is_stopped = False
+
+    def update(self, *, episodes_done: int, episodes: int, views: int, **_: Any) -> None:
+        """Take a reading after each tick from the steady state on; interrupts the bake when it has measured long enough."""
+        count = self.counter() if self.counter else views
+        tally = self.cleaner.poll() if self.cleaner else Tally()
+        if count:
+            self.first_count = self.first_count or time.perf_counter() - self.started
+            # Ticks of several devices take turns: as many of them as there are devices are counted together.
+            self.ticks += int(self.ticks > 0 or count - self._counts[0] >= self.devices * self.steady_count)
+            self._counts.append(count)
+            if self.ticks > LEAD_TICKS * self.devices and not self.is_stopped:
+                self.readings.append(self._read(count, episodes_done, tally))
+        measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
+        if not self.is_stopped and (measured or tally.problem or episodes_done >= episodes - self.worlds * self.devices):
+            self.is_stopped = True
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
+        """Reading of this moment: time, counts, CPU and memory of the processes, cleaner apart, disk, device memory."""
+        now, disk, usages = time.perf_counter(), shutil.disk_usage(self.folder).used, measure_usage()
+        main, pids = usages.pop(os.getpid(), Usage()), self.cleaner.pids if self.cleaner else ()
+        cleaner = reduce(Usage.plus, [usages.pop(pid, Usage()) for pid in pids], Usage())
+        device = self.device.total_memory - self.device.free_memory if self.device.is_cuda else 0
+        return Reading(now, count, episodes, main, reduce(Usage.plus, usages.values(), Usage()), cleaner, tally, disk, device)
+
+
+def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
+    """Counts per second of consecutive slices of at least `seconds` [s], which begin and end with readings; the rest is left out."""
+    rates: list[float] = []
+    first = readings[0]
+    for reading in readings[1:]:
+        if reading.time - first.time >= seconds:
+            rates.append((reading.count - first.count) / (reading.time - first.time))
+            first = reading
+    return rates
+
+
+def summarize_rates(unit: str, meter: SteadyMeter) -> Iterator[MeasuredRow]:
+    """Rows of a measurement with at least two readings: rate, its slices, CPU time, and memory at both ends; `unit` is what they count."""
+    first, last = meter.readings[0], meter.readings[-1]
+    count, seconds = last.count - first.count, last.time - first.time
+    yield MeasuredRow(f"time to the first {unit}s", meter.first_count, "s")
+    yield MeasuredRow("measured", seconds, "s")
+    yield MeasuredRow("a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
+    yield MeasuredRow(f"{unit}s to disk", count / seconds, "1/s")
+    rates = slice_rates(meter.readings, SLICE_SECONDS)
+    for name, choose in ((f"median of {len(rates)} times", statistics.median), ("slowest", min), ("fastest", max)) if rates else ():
+        yield MeasuredRow(f"{unit}s to disk, {name} {SLICE_SECONDS:.0f} s", choose(rates), "1/s")
+    workers = "writers" if meter.devices == 1 else "writers and devices' processes"
+    spent = {workers: last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
+    if meter.cleaner:
+        spent["verification and deletion"] = last.cleaner.cpu - first.cleaner.cpu
+    for name, value in spent.items():
+        yield MeasuredRow(f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
+    yield MeasuredRow("cores busy", sum(spent.values()) / seconds, "")
+    for when, reading in (("at the beginning", first), ("at the end", last)):
+        yield MeasuredRow(f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
+        yield MeasuredRow(f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
+        yield MeasuredRow(f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
+    if meter.device.is_cuda:
+        yield MeasuredRow("device memory in use by all processes, first device", last.device / GIB, "GiB")
+    yield MeasuredRow("episodes that ended", last.episodes - first.episodes, "")
+
+
+# ---- parts ----
+
+
+def _rows_of(meter: SteadyMeter, stopped: int, rows: Iterator[MeasuredRow]) -> Iterator[MeasuredRow]:
+    """Yield the rows of a bake, if there are readings; raises KeyboardInterrupt if Ctrl-C or another signal from outside stopped it."""
+    if len(meter.readings) > 1:
+        yield from rows
+    if stopped and not meter.is_stopped:
+        raise KeyboardInterrupt
 
 
 def measure_steady(bench: Bench) -> Iterator[MeasuredRow]:
@@ -63,9 +367,7 @@ def measure_steady(bench: Bench) -> Iterator[MeasuredRow]:
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(DataLayout.of(config), Path(folder) / "out") as cleaner:
         meter = SteadyMeter(bench.seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=count)
         summary = run_bake(config, Path(folder) / "out", meter, devices=names)
-    if len(meter.readings) > 1:
-        yield from _summarize_steady(meter)
-    meter.raise_interruption(summary)
+    yield from _rows_of(meter, summary.stopped, _summarize_steady(meter))
 
 
 def _summarize_steady(meter: SteadyMeter) -> Iterator[MeasuredRow]:
@@ -73,7 +375,6 @@ def _summarize_steady(meter: SteadyMeter) -> Iterator[MeasuredRow]:
     yield from summarize_rates("view", meter)
     first, last = meter.readings[0], meter.readings[-1]
     verified, deleted = last.tally.episodes - first.tally.episodes, last.tally.deleted - first.tally.deleted
-    yield MeasuredRow("episodes that ended", last.episodes - first.episodes, "")
     yield MeasuredRow("episodes of which all files are verified and deleted", verified, "")
     yield MeasuredRow("files of these", last.tally.files - first.tally.files, "")
     yield MeasuredRow("errors found in them", int(bool(last.tally.problem)), "")
@@ -86,31 +387,20 @@ def _summarize_steady(meter: SteadyMeter) -> Iterator[MeasuredRow]:
 def measure_trajectories(bench: Bench) -> Iterator[MeasuredRow]:
     """World-steps per second and episodes per hour of a bake without pictures in steady state."""
     config = bench.config.with_values({"bake.formats": WITHOUT_PICTURES, "bake.episodes": SPARE_EPISODES * bench.config.bake.worlds})
-    worlds = config.bake.worlds
-    with tempfile.TemporaryDirectory() as folder, _count_frames() as frames:
-        meter = SteadyMeter(bench.seconds, Path(folder), LIVE_FRACTION * worlds, worlds, bench.device, counter=lambda: frames[0])
-        summary = run_bake(config, Path(folder) / "out", meter)
-    if len(meter.readings) > 1:
-        sampled = sample_episodes_ahead(config, load_catalog(config), np.arange(config.bake.episodes, dtype=np.int32), bench.device)
-        yield from _summarize_trajectories(config, float(np.mean(predict_frames(*sampled))), meter)
-    meter.raise_interruption(summary)
-
-
-@contextlib.contextmanager
-def _count_frames() -> Iterator[list[int]]:
-    """Count frames handed to the exporters within this context; yields a list whose one element is the count."""
-    frames, write = [0], Exporters.write_ticks
+    worlds, frames, write = config.bake.worlds, [0], Exporters.write_ticks
 
     def count(exporters: Exporters, batch: TickBatch) -> None:
         frames[0] += len(batch)
         write(exporters, batch)
 
-    with mock.patch.object(Exporters, "write_ticks", count):
-        yield frames
+    with tempfile.TemporaryDirectory() as folder, mock.patch.object(Exporters, "write_ticks", count):
+        meter = SteadyMeter(bench.seconds, Path(folder), LIVE_FRACTION * worlds, worlds, bench.device, counter=lambda: frames[0])
+        summary = run_bake(config, Path(folder) / "out", meter)
+    yield from _rows_of(meter, summary.stopped, _summarize_trajectories(config, meter))
 
 
-def _summarize_trajectories(config: Config, mean: float, meter: SteadyMeter) -> Iterator[MeasuredRow]:
-    """Rows: rates, world-steps of all worlds whether live or not, disk space, and episodes, which have `mean` frames."""
+def _summarize_trajectories(config: Config, meter: SteadyMeter) -> Iterator[MeasuredRow]:
+    """Rows: rates, world-steps of all worlds whether live or not, disk space, and episodes, by the mean of their predicted frames."""
     worlds, physics = config.bake.worlds, config.physics
     yield MeasuredRow("worlds", worlds, "")
     yield from summarize_rates("frame", meter)
@@ -121,5 +411,6 @@ def _summarize_trajectories(config: Config, mean: float, meter: SteadyMeter) -> 
     yield MeasuredRow("simulated time: multiple of real time", rate * physics.step, "")
     yield MeasuredRow("worlds with a frame in a tick", 100.0 * frames / (ticks * worlds), "%")
     yield MeasuredRow("size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
-    yield MeasuredRow("episodes that ended", last.episodes - first.episodes, "")
+    episodes = np.arange(config.bake.episodes, dtype=np.int32)
+    mean = float(np.mean(predict_frames(*sample_episodes_ahead(config, load_catalog(config), episodes, meter.device))))
     yield MeasuredRow(f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")

@@ -1,11 +1,10 @@
-"""What all parts of the benchmark share: the run with its options, repeated timing, timers of methods."""
+"""What all parts of the benchmark share: the run with its options, and repeated timing, of calls and of scopes in them."""
 
 from __future__ import annotations
 
 import contextlib
 import statistics
 import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from unittest import mock
@@ -13,6 +12,7 @@ from unittest import mock
 import warp as wp
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.stages import timing
 from synpick_warp.system.hardware.device import pick_device
 
 FOREVER = 1 << 30
@@ -50,70 +50,53 @@ class Bench:
         return pick_device(self.config.bake.device)
 
     def seconds_per_call(self, function: Callable[[], object], share: float = 1.0, calls: int | None = None) -> float:
-        """Median time of a call [s], in bursts (None: of BURST) repeated for that share of `seconds`; see `seconds_per_call`."""
-        return seconds_per_call(function, self.device, share * self.seconds, calls or BURST)
+        """Median time of a call [s], device work included, after one warm-up call.
+
+        Bursts of `calls` calls (None: BURST) are timed, each with a synchronisation at its end: at least `MIN_REPEATS` of them, for that
+        share of `seconds` or longer.
+        """
+        function()
+        calls, times = calls or BURST, list[float]()
+        while len(times) < MIN_REPEATS or sum(times) < share * self.seconds:
+            wp.synchronize_device(self.device)
+            started = time.perf_counter()
+            for _ in range(calls):
+                function()
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - started)
+        return statistics.median(times) / calls
 
 
-def seconds_per_call(function: Callable[[], object], device: wp.Device, min_seconds: float, calls: int = 1) -> float:
-    """Median time of a call [s], device work included, after one warm-up call.
+def time_scopes(function: Callable[[], object], device: wp.Device, min_seconds: float) -> dict[str, float]:
+    """Mean time [s] that a call of `function` spends in each timing scope, by its path: names of outer scopes and its own, joined by ': '.
 
-    Bursts of `calls` calls are timed, each with a synchronisation at its end: at least `MIN_REPEATS` of them, for at least `min_seconds`.
+    Calls in bursts, after one warm-up call, at least MIN_REPEATS of them, for at least `min_seconds`.
     """
     function()
-    times: list[float] = []
-    while len(times) < MIN_REPEATS or sum(times) < min_seconds:
-        wp.synchronize_device(device)
-        started = time.perf_counter()
-        for _ in range(calls):
-            function()
-        wp.synchronize_device(device)
-        times.append(time.perf_counter() - started)
-    return statistics.median(times) / calls
+    wp.synchronize_device(device)
+    with timing.record() as recorder:
+        started, calls = time.perf_counter(), 0
+        while calls < MIN_REPEATS or time.perf_counter() - started < min_seconds:
+            for _ in range(BURST):
+                function()
+            calls += BURST
+            wp.synchronize_device(device)
+    return {name: seconds / calls for name, seconds in scope_seconds(recorder, device).items()}
 
 
-class Stopwatch:
-    """Device timer of methods by CUDA events, without synchronisation; by the host's clock on the CPU."""
+def scope_seconds(recorder: timing.Recorder, device: wp.Device) -> dict[str, float]:
+    """Total time of each recorded scope [s], by its path: on a GPU that of the device, on a CPU that of the host."""
+    return {": ".join(path): stage.device if device.is_cuda else stage.host for path, stage in recorder.times.items()}
 
-    def __init__(self, device: wp.Device) -> None:
-        self.device = device
-        self.events: dict[str, list[tuple[wp.Event, wp.Event]]] = defaultdict(list)
-        self.spent: dict[str, float] = defaultdict(float)
 
-    def time_method(self, owner: object, method: str, name: str) -> contextlib.AbstractContextManager[object]:
-        """Context manager that adds the time spent in `owner.method` to the timer `name`."""
-        function = getattr(owner, method)
+@contextlib.contextmanager
+def scope_around(owner: object, method: str, name: str, device: wp.Device) -> Iterator[None]:
+    """Context manager in which calls of `owner.method` are in the timing scope `name`."""
+    function = getattr(owner, method)
 
-        def timed(*arguments: object, **options: object) -> object:
-            with self._time(name):
-                return function(*arguments, **options)
+    def scoped(*arguments: object, **options: object) -> object:
+        with timing.scope(name, device):
+            return function(*arguments, **options)
 
-        return mock.patch.object(owner, method, timed)
-
-    def time_generator(self, owner: object, method: str, name: str) -> contextlib.AbstractContextManager[object]:
-        """Context manager that times a generator method, from its first to its last part, with what its consumer does between."""
-        function = getattr(owner, method)
-
-        def timed(*arguments: object, **options: object) -> Iterator[object]:
-            with self._time(name):
-                yield from function(*arguments, **options)
-
-        return mock.patch.object(owner, method, timed)
-
-    @contextlib.contextmanager
-    def _time(self, name: str) -> Iterator[None]:
-        """Add the time of the block to what `name` has spent: on a GPU by events, on a CPU by the clock."""
-        if not self.device.is_cuda:
-            started = time.perf_counter()
-            yield
-            self.spent[name] += time.perf_counter() - started
-            return
-        pair = (wp.Event(self.device, enable_timing=True), wp.Event(self.device, enable_timing=True))
-        self.device.stream.record_event(pair[0])
+    with mock.patch.object(owner, method, scoped):
         yield
-        self.device.stream.record_event(pair[1])
-        self.events[name].append(pair)
-
-    def seconds(self, name: str) -> float:
-        """Total time of the timer `name` [s]; waits for the device."""
-        wp.synchronize_device(self.device)
-        return self.spent[name] + 1e-3 * sum(wp.get_event_elapsed_time(*pair) for pair in self.events[name])

@@ -9,7 +9,7 @@ import contextlib
 import math
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 from unittest import mock
@@ -42,7 +42,7 @@ from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.view_ring import view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
-from tools.bench.run import BURST, FOREVER, Bench, seconds_per_call
+from tools.bench.run import FOREVER, Bench
 from tools.bench.worlds import measure_perception
 from tools.options import MeasuredRow
 
@@ -73,26 +73,18 @@ NEWTONS_OWN = {
 # ---- growth ----
 
 
-@dataclass(frozen=True)
-class Pile:
-    """Worlds after the drop."""
-
-    snapshot: Snapshot
-    objects: float
-    """Mean objects of a world."""
-    seconds: float
-    """Physics of a tick [s]."""
-
-
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """Measurements of worlds with some settings."""
+    """Measurements of worlds with the settings of a run of the benchmark."""
 
-    config: Config
+    bench: Bench
     catalog: Catalog
-    lights: tuple[EnvironmentMap, ...]
-    device: wp.Device
-    min_seconds: float
+    lights: tuple[EnvironmentMap, ...] = ()
+
+    @property
+    def config(self) -> Config:
+        """Settings."""
+        return self.bench.config
 
     @property
     def steps(self) -> int:
@@ -103,12 +95,12 @@ class Variant:
         """Renderer's scene."""
         config = self.config
         fixtures, cameras = make_fixtures(make_bins(config.cell.bins), config.gripper), make_cameras(config.rig)
-        return build_render_scene(config.render, -config.tote.wall, self.catalog, fixtures, cameras, self.lights, self.device)
+        return build_render_scene(config.render, -config.tote.wall, self.catalog, fixtures, cameras, self.lights, self.bench.device)
 
     def simulate(self, scene: RenderScene | None) -> Simulation:
         """New worlds, in which piles never count as settled."""
         lights, worlds = max(1, len(self.lights)), range(self.config.bake.worlds)
-        simulation = Simulation(self.config, self.catalog, lights, self.device, scene, worlds)
+        simulation = Simulation(self.config, self.catalog, lights, self.bench.device, scene, worlds)
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
         return simulation
 
@@ -116,23 +108,17 @@ class Variant:
         """Time of a tick's physics [s], after `lead` ticks."""
         for _ in range(lead):
             simulation.tick()
-        return seconds_per_call(simulation.tick, self.device, self.min_seconds, BURST)
+        return self.bench.seconds_per_call(simulation.tick)
 
-    def drop(self, scene: RenderScene) -> Pile:
-        """Drop piles and time ticks of their physics."""
-        simulation = self.simulate(scene)
-        seconds, snapshot = self.time_ticks(simulation, DROP_TICKS), simulation.record.snapshot
-        return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
-
-    def time_view(self, scene: RenderScene, pile: Pile) -> float:
+    def time_view(self, scene: RenderScene, snapshot: Snapshot) -> float:
         """Time of a view [s], in full batches."""
-        config, device, worlds = self.config, self.device, self.config.bake.worlds
+        config, device, worlds = self.config, self.bench.device, self.config.bake.worlds
         cameras, objects = len(config.rig), config.arrangement.max_objects
         sizes = view_sizes(config.render, config.rig, worlds, objects, device)
         count = min(sizes["view"], worlds * cameras)
         renderer = make_renderer(config, scene, objects, sizes["view"], worlds * cameras)
         images, views = allocate(ViewBuffers, sizes, device), first_views(count, cameras, objects, device)
-        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), device, self.min_seconds, BURST) / count
+        return self.bench.seconds_per_call(lambda: renderer.render(snapshot, views, images)) / count
 
 
 def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
@@ -165,30 +151,35 @@ def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, 
 
 def measure_growth(bench: Bench) -> Iterator[MeasuredRow]:
     """Measure the settings themselves, then each factor's values; or physics alone of `bench.instances` like parts."""
-    started, config = time.perf_counter(), bench.config
-    if bench.instances:
-        yield from _measure_instances(bench)
-    else:
-        own = Variant(config, load_catalog(config), load_lights(config.bake.lights), bench.device, bench.seconds)
-        scene = own.build_scene()
-        pile = own.drop(scene)
-        yield from _rows("as set", own.steps, pile, own.time_view(scene, pile))
-        for factor, values in FACTORS.items():
-            for value, changed in dict(vary(config, factor, each) for each in values).items():
-                varied = replace(own, config=changed)
-                other = varied.build_scene() if factor in ("resolution", "cameras") else scene
-                dropped = varied.drop(scene) if factor in ("worlds", "objects") else None
-                yield from _rows(f"{factor} {value}", varied.steps, dropped, varied.time_view(other, dropped or pile))
+    started = time.perf_counter()
+    yield from _measure_instances(bench) if bench.instances else _measure_factors(bench)
     yield MeasuredRow("all measurements", time.perf_counter() - started, "s")
 
 
-def _rows(name: str, steps: int, pile: Pile | None, view: float) -> Iterator[MeasuredRow]:
-    """Rows of a point: of piles that were dropped for it, and of a view that takes `view` [s]."""
-    if pile is not None:
-        yield MeasuredRow(f"{name}: objects a tote", pile.objects)
-        yield MeasuredRow(f"{name}: physics of a tick", 1e3 * pile.seconds, "ms")
-        yield MeasuredRow(f"{name}: world-steps", steps / pile.seconds, "1/s")
-    yield MeasuredRow(f"{name}: a view", 1e3 * view, "ms")
+def _measure_factors(bench: Bench) -> Iterator[MeasuredRow]:
+    """Rows of the settings themselves, and of each value of each factor."""
+    own = Variant(bench, load_catalog(bench.config), load_lights(bench.config.bake.lights))
+    scene = own.build_scene()
+    piles = yield from _measure_point("as set", own, scene)
+    for factor, values in FACTORS.items():
+        for value, changed in dict(vary(bench.config, factor, each) for each in values).items():
+            varied = replace(own, bench=replace(bench, config=changed))
+            shown = varied.build_scene() if factor in ("resolution", "cameras") else scene
+            yield from _measure_point(f"{factor} {value}", varied, shown, None if factor in ("worlds", "objects") else piles)
+
+
+def _measure_point(
+    name: str, variant: Variant, scene: RenderScene, piles: Snapshot | None = None
+) -> Generator[MeasuredRow, None, Snapshot]:
+    """Rows of a view of some piles, which it returns; None: of piles that are dropped for it, with rows of their physics."""
+    if piles is None:
+        simulation = variant.simulate(scene)
+        seconds, piles = variant.time_ticks(simulation, DROP_TICKS), simulation.record.snapshot
+        yield MeasuredRow(f"{name}: objects a tote", float((piles.catalog_index.numpy() >= 0).sum(axis=1).mean()))
+        yield MeasuredRow(f"{name}: physics of a tick", 1e3 * seconds, "ms")
+        yield MeasuredRow(f"{name}: world-steps", variant.steps / seconds, "1/s")
+    yield MeasuredRow(f"{name}: a view", 1e3 * variant.time_view(scene, piles), "ms")
+    return piles
 
 
 # ---- growth by instances ----
@@ -212,12 +203,13 @@ def _measure_instances(bench: Bench) -> Iterator[MeasuredRow]:
     varied = [config.with_values(number_settings(config.arrangement.counts, number)) for number in bench.instances]
     catalog, bins = load_catalog(max(varied, key=lambda each: each.arrangement.max_objects)), make_bins(config.cell.bins)
     for fitted in [fit_to_catalog(each, catalog, bins, device, SilentProgress()) for each in varied]:
-        yield from _measure_like_parts(Variant(fitted, catalog, (), device, bench.seconds))
+        yield from _measure_like_parts(Variant(replace(bench, config=fitted), catalog))
 
 
 def _measure_like_parts(pile: Variant) -> Iterator[MeasuredRow]:
     """Rows of landing and resting parts, of contacts and of memory."""
-    config, worlds, before = pile.config, pile.config.bake.worlds, _memory_in_use(pile.device)
+    config, device = pile.config, pile.bench.device
+    worlds, before = config.bake.worlds, _memory_in_use(device)
     simulation, name = pile.simulate(None), f"{pile.config.arrangement.max_objects} instances"
     for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
         seconds = pile.time_ticks(simulation, ticks)
@@ -228,9 +220,9 @@ def _measure_like_parts(pile: Variant) -> Iterator[MeasuredRow]:
     for what, array in (("contacts", own.contacts.rigid_contact_count), ("overlaps", own.overlap_count)):
         yield MeasuredRow(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
     yield MeasuredRow(f"{name}: worlds without overflow", 100.0 * float(np.mean(~own.solver.constraint_overflow.numpy()[:-1])), "%")
-    yield MeasuredRow(f"{name}: memory of the physics", (_memory_in_use(pile.device) - before) / GIB, "GiB")
+    yield MeasuredRow(f"{name}: memory of the physics", (_memory_in_use(device) - before) / GIB, "GiB")
     pieces = max(len(pile.catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, pile.catalog))
-    terms = [term for term in plan_memory(config, pile.device, 0, pieces) if term.name.startswith(("Newton", "the state", "separating"))]
+    terms = [term for term in plan_memory(config, device, 0, pieces) if term.name.startswith(("Newton", "the state", "separating"))]
     yield MeasuredRow(f"{name}: memory planned for it, at least", sum(term.size for term in terms) / GIB, "GiB")
 
 
@@ -250,12 +242,12 @@ def measure_heaps(bench: Bench) -> Iterator[MeasuredRow]:
     quick."""
     worlds = min(bench.config.bake.worlds, HEAP_WORLDS)
     config = replace(bench.config, bake=replace(bench.config.bake, worlds=1, mode="pick"))
-    own = Variant(config, load_catalog(config), load_lights(config.bake.lights), bench.device, bench.seconds)
+    own, device = Variant(replace(bench, config=config), load_catalog(config), load_lights(config.bake.lights)), bench.device
     render_scene = own.build_scene()
-    scene = make_scene_data(config, own.catalog, build_model(config, own.catalog, own.device), len(own.lights), own.device)
+    scene = make_scene_data(config, own.catalog, build_model(config, own.catalog, device), len(own.lights), device)
     for count in INSTANCES:
         sizes = world_sizes(worlds, count, config.move.rounds, 1, 1)
-        state, attempts, _, _, record = allocate_worlds(sizes, own.device)
+        state, attempts, _, _, record = allocate_worlds(sizes, device)
         parts = (render_scene, scene, state, attempts, record.observation, record.plan)
         perception = Perception(config.perception, config.rig, config.bake.seed, *parts)
         entry, pose = heap(own.catalog, config.tote.floor_size, config.bake.seed, worlds, count)
@@ -263,7 +255,7 @@ def measure_heaps(bench: Bench) -> Iterator[MeasuredRow]:
         record.snapshot.catalog_index.assign(entry)
         record.snapshot.pose.assign(pose)
         record.snapshot.fixture_pose.fill_(wp.transform_identity())
-        for row in measure_perception(perception, record.snapshot, own.device, bench.seconds):
+        for row in measure_perception(perception, record.snapshot, device, bench.seconds):
             yield replace(row, name=f"{count} instances: {row.name}")
         seen = perception.images.views.world.numpy()
         visible, above = (getattr(record.observation, name).numpy()[seen] for name in ("visible", "above"))

@@ -31,7 +31,7 @@ from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.progress import SilentProgress
 from tools.bench import run
 from tools.bench.online import measure_stream
-from tools.bench.run import FOREVER, Bench, Stopwatch
+from tools.bench.run import FOREVER, Bench
 from tools.options import MeasuredRow, of_part
 
 FALL_TICKS, SETTLE_TICKS = 4, 60
@@ -42,6 +42,8 @@ LEAD_TICKS, PICK_TICKS = 25, 60
 """Ticks from the first perception to the middle of the first attempt, and ticks measured from there: an attempt takes 55."""
 STREAM_BATCHES = 12
 """Number of batches that are rendered and copied back to back."""
+STEPS, PERCEPTION = "physics", "perceive"
+"""Timing scopes of a tick."""
 CPU_VIEWS = 6
 """Number of views that are encoded on the CPU."""
 
@@ -140,18 +142,14 @@ def _tick_rates(simulation: Simulation, seconds: float, state: str) -> Iterator[
 def _measure_tick_parts(bench: Bench, simulation: Simulation) -> Iterator[MeasuredRow]:
     """Breakdown of a tick: physics steps, everything else, launch overhead, collision detection."""
     physics, tick = simulation.physics, simulation.tick
-    watch, calls = Stopwatch(simulation.device), 0
-    with watch.time_generator(physics, "tick_parts", "steps"):
-        while calls < run.MIN_REPEATS or watch.seconds("steps") < bench.seconds:
-            tick()
-            calls += 1
+    steps = run.time_scopes(tick, simulation.device, bench.seconds)[STEPS]
     started = time.perf_counter()
     tick()
     host = time.perf_counter() - started
     with mock.patch.object(physics, "tick_parts", side_effect=lambda *_: iter(())):
         outside = bench.seconds_per_call(tick, 0.25)
     collide = _capture_graph(lambda: physics.pipeline.collide(physics.state, physics.contacts), simulation.device)
-    yield MeasuredRow("a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
+    yield MeasuredRow("a tick: physics steps", 1e3 * steps, "ms")
     yield MeasuredRow("a tick: everything but physics steps", 1e3 * outside, "ms")
     yield MeasuredRow("a tick: host time to launch it", 1e3 * host, "ms")
     yield MeasuredRow("a collision detection of all worlds", 1e3 * bench.seconds_per_call(collide, 0.25), "ms")
@@ -191,12 +189,12 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Me
         simulation: Worlds in the middle of an attempt.
         pile_seconds: Time of a tick's steps with the pile alone, for comparison [s]; 0: not measured.
     """
-    device, perception, worlds = simulation.device, simulation.perception, simulation.layout.worlds
-    reader, watch = TickReader(simulation.record), Stopwatch(device)
+    device, worlds = simulation.device, simulation.layout.worlds
+    reader = TickReader(simulation.record)
     perceptions, attached, acting = 0, 0, 0
     wp.synchronize_device(device)
-    started = time.perf_counter()
-    with watch.time_generator(simulation.physics, "tick_parts", "steps"), watch.time_method(perception, "perceive", "perception"):
+    with timing.record() as recorder:
+        started = time.perf_counter()
         for _ in range(PICK_TICKS):
             simulation.tick()
             reader.start()
@@ -205,9 +203,9 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Me
             acting += int(act.sum())
             attached += int((act & report.attached.any(axis=1)).sum())
             perceptions += int((act & (report.column("task") == Task.LOOK)).sum())
-    wp.synchronize_device(device)
-    tick = (time.perf_counter() - started) / PICK_TICKS
-    steps, perceive = (watch.seconds(name) / PICK_TICKS for name in ("steps", "perception"))
+        wp.synchronize_device(device)
+        tick = (time.perf_counter() - started) / PICK_TICKS
+    steps, perceive = (run.scope_seconds(recorder, device)[name] / PICK_TICKS for name in (STEPS, PERCEPTION))
     yield from _tick_rates(simulation, tick, "picking")
     yield from _tick_rates(simulation, steps, "picking, steps alone")
     if pile_seconds:
@@ -237,19 +235,15 @@ def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.De
         perception.list_worlds()
         perception.perceive_batch(snapshot)
 
-    run.seconds_per_call(perceive_batch, device, 0.0)
-    watch, calls = Stopwatch(device), 0
     with contextlib.ExitStack() as patches:
         for stage in (*stages, (perception.planner, "order_clutter", graph)):
-            patches.enter_context(watch.time_method(*stage))
-        while calls < run.MIN_REPEATS or sum(map(watch.seconds, names)) < min_seconds:
-            perceive_batch()
-            calls += 1
+            patches.enter_context(run.scope_around(*stage, device))
+        seconds = run.time_scopes(perceive_batch, device, min_seconds)
     views = perception.images.views.count
     yield MeasuredRow("views in a batch", views, "")
-    for name in (*names, graph):
-        yield MeasuredRow(f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
-    yield MeasuredRow("a view", 1e3 * sum(map(watch.seconds, names)) / (calls * views), "ms")
+    for name, path in (*zip(names, names, strict=True), (graph, f"{names[-1]}: {graph}")):
+        yield MeasuredRow(f"a view: {name}", 1e3 * seconds[path] / views, "ms")
+    yield MeasuredRow("a view", 1e3 * sum(map(seconds.__getitem__, names)) / views, "ms")
 
 
 def _perception_fraction(bench: Bench) -> Iterator[MeasuredRow]:
@@ -276,7 +270,7 @@ def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:
     def render() -> None:
         ring.renderer.render(simulation.record.snapshot, views, ring.slots[0].images)
 
-    spent = {name: seconds / count for name, seconds in _time_passes(render, device, bench.seconds).items()}
+    spent = {name: seconds / count for name, seconds in run.time_scopes(render, device, bench.seconds).items()}
     spent["all"] = bench.seconds_per_call(render, 0.25) / count
     for name, seconds in spent.items():
         yield MeasuredRow(f"a view: {name}", 1e3 * seconds, "ms")
@@ -296,20 +290,6 @@ def _measure_rendering(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:
     report = _mark_live(simulation, worlds)
     seconds = bench.seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], 1.0, 1)
     yield MeasuredRow("views, all stages and copies", worlds * cameras / seconds, "1/s")
-
-
-def _time_passes(render: Callable[[], None], device: wp.Device, min_seconds: float) -> dict[str, float]:
-    """Mean time [s] of each timing scope of `render`, by its path: names of outer scopes and its own, joined by ': '."""
-    render()
-    wp.synchronize_device(device)
-    with timing.record() as recorder:
-        started = time.perf_counter()
-        while not recorder.times or time.perf_counter() - started < min_seconds:
-            for _ in range(run.BURST):
-                render()
-            wp.synchronize_device(device)
-    times = recorder.times.items()
-    return {": ".join(path): (stage.device if device.is_cuda else stage.host) / stage.calls for path, stage in times}
 
 
 def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:

@@ -19,28 +19,29 @@ With `--work DIR` results are kept, by the content of the checkout: the next run
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import hashlib
 import inspect
 import json
 import os
 import re
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.errors import DatasetError
 from tools.compare import guard_steps, kernel_sources, runs
-from tools.compare.guard_device import compare_pictures, compare_worlds
-from tools.compare.guard_steps import Step, cpu_steps
+from tools.compare.guard_steps import Step, cpu_steps, mixed_episodes
 from tools.options import fail, make_names_parser, make_parser, write_json
 
 CPU_PARTS = ("sets", "commands", "kernels")
@@ -49,6 +50,16 @@ MAX_NAMED = 8
 """Kernels that a line about different kernels shows."""
 PACKAGE_FOLDERS = ("synpick_warp", "kernels", "scenes", "configs")
 """Folders of a checkout on which results depend."""
+WORLDS = (8, 512)
+"""World counts in which the same episodes are baked."""
+ROUNDS = 2
+"""Measurements of each checkout, in turns."""
+PICTURE_WORLDS = 128
+"""Worlds of these: four measurements take less than ten minutes."""
+TOLERANCE = 0.01
+"""How much slower pictures may become; they may become faster."""
+LEFT_OUT = ("config.toml", "manifest.json")
+"""Files that differ with the number of worlds, or with the program's version."""
 _PROGRESS = re.compile(r"^(?: +\d+:\d\d  .*|\w+ [\d,]+/[\d,]+)\n", re.MULTILINE)
 """Lines of progress, which come as time passes."""
 _TIMES = re.compile(
@@ -61,9 +72,8 @@ _LAST_COLUMN = re.compile(rb",[^,\n]*$", re.MULTILINE)
 _VERSION = re.compile(r'^__version__ = "([^"]+)"', re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class Line:
-    """Result of one comparison: part, name, verdict (equal, different or failed), detail."""
+class Line(NamedTuple):
+    """Result of one comparison."""
 
     part: str
     name: str
@@ -85,18 +95,16 @@ class Side:
     @property
     def version(self) -> str:
         """Version of the package in this checkout."""
-        match = _VERSION.search(
-            "".join(
-                path.read_text() for name in ("_version", "__init__") if (path := self.checkout / "synpick_warp" / f"{name}.py").exists()
-            )
-        )
+        files = [path for name in ("_version", "__init__") if (path := self.checkout / "synpick_warp" / f"{name}.py").exists()]
+        match = _VERSION.search("".join(path.read_text() for path in files))
         return match[1] if match else "unknown"
 
-    def environment(self) -> dict[str, str]:
-        """Environment of its commands: its code before all other places of packages, and a fixed width of text."""
+    def call(self, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
+        """Run a Python command in the folder: with this checkout's code before all other places of packages, and a fixed width of text."""
         places = [str(self.checkout), *filter(None, [os.environ.get("PYTHONPATH")])]
         fixed = {"PYTHONPATH": os.pathsep.join(places), "COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"}
-        return os.environ | fixed
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=self.folder, env=os.environ | fixed, capture_output=True, text=True, check=False)
 
     def run(self, step: Step) -> None:
         """Run a step, unless its text is there, which is written last: exit code, standard output and errors."""
@@ -104,12 +112,10 @@ class Side:
         if text.exists():
             return
         script = [str(Path(kernel_sources.__file__).resolve()), step.kernels] if step.kernels else ["-m", "synpick_warp"]
-        command = [sys.executable, *script, *step.arguments]
-        done = subprocess.run(command, cwd=self.folder, env=self.environment(), capture_output=True, text=True, check=False)
+        done = self.call([*script, *step.arguments])
         text.parent.mkdir(exist_ok=True)
-        content = f"exit code {done.returncode}\n{done.stdout}{done.stderr}"
         part = text.with_suffix(".part")
-        part.write_text(content)
+        part.write_text(f"exit code {done.returncode}\n{done.stdout}{done.stderr}")
         part.rename(text)
 
     def text_file(self, step: Step) -> Path:
@@ -141,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
         for line in compare(sides[0], sides[1], options):
             print(line, flush=True)
             lines.append(line)
-    write_json(options.json, [dataclasses.asdict(line) for line in lines])
+    write_json(options.json, [line._asdict() for line in lines])
     different = [line for line in lines if line.verdict != "equal"]
     print(f"{len(lines) - len(different)} of {len(lines)} equal: {sides[0].checkout} and {sides[1].checkout}")
     return int(bool(different))
@@ -192,9 +198,9 @@ def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]
                 print(f"           {step.name}: {time.perf_counter() - started:.1f} s", file=sys.stderr, flush=True)
                 yield from _compare_step(old, new, step, options.parts)
     if "worlds" in options.parts:
-        yield from (Line("worlds", *result) for result in compare_worlds(old, new, options))
+        yield from compare_worlds(old, new, options)
     if "pictures" in options.parts:
-        yield from (Line("pictures", *result) for result in compare_pictures(old, new, options))
+        yield from compare_pictures(old, new, options)
 
 
 def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> Iterator[Line]:
@@ -228,7 +234,7 @@ def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Lin
         return Line(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
     try:
         layers, difference = runs.compare(old, new)
-    except runs.UnusableRunError as error:
+    except DatasetError as error:
         return Line(part, name, "failed", str(error))
     files, differing = (sum(getattr(layer, name) for layer in layers.values()) for name in ("files", "differing"))
     return Line(
@@ -257,6 +263,62 @@ def _compare_kernels(name: str, old_file: Path, new_file: Path) -> Line:
     details += [f"only old: {key}" for key in missing] + [f"only new: {key}" for key in added]
     details += [f"{key} is now {partner}" for key, partner in renamed.items()]
     return Line("kernels", name, "different" if changed or missing or added else "equal", "; ".join(details))
+
+
+def compare_worlds(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
+    """Bake the same episodes in each number of worlds, and on two GPUs if there are two; all digests of both checkouts are one."""
+    runs = [(options.device, worlds) for worlds in WORLDS]
+    if wp.get_cuda_device_count() > 1:
+        runs.append(("cuda:0,cuda:1", WORLDS[0]))
+    expected = ""
+    for device, worlds in runs:
+        for name, side in (("old", old), ("new", new)):
+            title, out = f"{name}, {worlds} worlds on {device}", f"worlds-{device.replace(':', '')}-{worlds}"
+            command = ("-m", "synpick_warp", *mixed_episodes(device, worlds, out, options.models, options.lights))
+            if failure := _run(side, command):
+                yield Line("worlds", title, "failed", failure)
+                continue
+            digest = digest_folder(side.folder / out)
+            expected = expected or digest
+            yield Line("worlds", title, "equal" if digest == expected else "different", digest)
+
+
+def digest_folder(folder: Path) -> str:
+    """Digest of the names and contents of all files but `LEFT_OUT`, 16 digits."""
+    digest = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and path.name not in LEFT_OUT):
+        digest.update(f"{path.relative_to(folder)}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:16]
+
+
+def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
+    """Measure the renderer's rate of both checkouts in turns, and compare the medians of all rows in views/s."""
+    rates: dict[str, dict[str, list[float]]] = {"old": {}, "new": {}}
+    fixed = ["--device", options.device, "--parts", "pictures", "--worlds", str(PICTURE_WORLDS)]
+    fixed += [argument for name in ("models", "lights") if (folder := getattr(options, name)) for argument in (f"--{name}", folder)]
+    for turn in range(ROUNDS):
+        for name, side in (("old", old), ("new", new)):
+            file = f"pictures-{turn}.json"
+            command = ("-m", "tools.bench", *fixed, "--json", file)
+            if failure := _run(side, command):
+                yield Line("pictures", f"{name}, turn {turn}", "failed", failure)
+                return
+            for row in json.loads((side.folder / file).read_text())["rows"]:
+                if row["unit"] == "1/s" and "median" in row["name"]:
+                    rates[name].setdefault(row["name"], []).append(row["value"])
+    if not rates["old"] or rates["old"].keys() != rates["new"].keys():
+        yield Line("pictures", "rows", "failed", f"{', '.join(rates['old']) or 'none'} and {', '.join(rates['new']) or 'none'}")
+    for row in rates["old"].keys() & rates["new"].keys():
+        before, after = (statistics.median(rates[name][row]) for name in ("old", "new"))
+        change = after / before - 1.0
+        verdict = "equal" if change > -TOLERANCE else "different"
+        yield Line("pictures", row, verdict, f"{before:.1f} and {after:.1f} views/s, {100 * change:+.2f} %")
+
+
+def _run(side: Side, arguments: tuple[str, ...]) -> str:
+    """Run a Python command of `side`; returns the error message, empty on success."""
+    done = side.call(arguments)
+    return f"exit code {done.returncode}: {(done.stderr.strip() or 'no message').splitlines()[-1]}" if done.returncode else ""
 
 
 if __name__ == "__main__":

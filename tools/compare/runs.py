@@ -10,6 +10,7 @@ on, such as the count of worlds, and the program's version in the manifest are i
 from __future__ import annotations
 
 import argparse
+import filecmp
 import io
 import json
 import math
@@ -17,44 +18,43 @@ import re
 import sys
 import tarfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, FREE_SETTINGS, INPUTS, MANIFEST_FILE, OBJECT
+from synpick_warp.errors import DatasetError
 from tools.options import fail
 
-IMAGES = (".png", ".jpg")
-USD = (".usd", ".usdc", ".usda")
 IGNORED = {CONFIG_FILE: FREE_SETTINGS, MANIFEST_FILE: ("versions.synpick-warp", f"{INPUTS}.{OBJECT}*")}
 """Keys of files that may differ, as patterns. The digest of all objects covers those of single objects, which older versions lack."""
 SAME_CONTENT = "different bytes, equal content"
-CHUNK = 1 << 20
-"""Bytes of a file compared at once."""
 _INDICES = re.compile(r"\d{6,}(_\d{6,})*")
 """Indices of episodes, scenes, frames and instances in a file's path."""
 
 
-@dataclass
-class Difference:
-    """First difference of two files (where, with both values), and the largest one (NaN: something other than numbers differs)."""
+class Difference(NamedTuple):
+    """Difference of two files or values."""
 
     where: str
-    """Key path, pixel, index or byte, with both values."""
+    """Key path, with indices in brackets; line or member of an archive."""
+    values: str
+    """Both values."""
     largest: float = math.nan
     """Largest difference of two numbers; NaN: something other than numbers differs."""
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.values}".removeprefix(": ")
 
 
 @dataclass
 class LayerImages:
-    """Comparison of all files of one type: their number, how many differ, largest difference (NaN: something other than numbers
-    differs).
-    """
+    """Comparison of all files of one type."""
 
     files: int = 0
     differing: int = 0
@@ -62,14 +62,13 @@ class LayerImages:
     """Largest difference of two numbers; NaN: something other than numbers differs."""
 
 
-class UnusableRunError(Exception):
-    """Error: a folder is missing or empty."""
-
-
 def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
     """Compare two folders; returns layers by name, and the first difference as one line (empty: none).
 
     Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
+
+    Raises:
+        DatasetError: A folder is missing or empty.
     """
     names = [_list_files(folder) for folder in (first, second)]
     layers: dict[str, LayerImages] = {}
@@ -81,17 +80,17 @@ def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
         if difference is not None:
             layer.differing += 1
             layer.largest = math.nan if math.isnan(difference.largest) else max(layer.largest, difference.largest)
-            first_difference = first_difference or f"{name}: {difference.where}"
+            first_difference = first_difference or f"{name}: {difference}"
     return layers, first_difference
 
 
 def _list_files(folder: Path) -> set[str]:
     """Paths of all files below a folder, relative to it."""
     if not folder.is_dir():
-        raise UnusableRunError(f"there is no folder {folder}")
+        raise DatasetError(f"there is no folder {folder}")
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     if not names:
-        raise UnusableRunError(f"{folder} is empty")
+        raise DatasetError(f"{folder} is empty")
     return names
 
 
@@ -116,108 +115,35 @@ def _compare_file(first: Path, second: Path, name: str, names: list[set[str]]) -
     """Difference of one file of both folders; None if its bytes are equal, or its settings are equal in effect."""
     for folder, own in zip((first, second), names, strict=True):
         if name not in own:
-            return Difference(f"only in {second if folder == first else first}")
-    if _same_bytes(first / name, second / name):
+            return Difference("", f"only in {second if folder == first else first}")
+    if filecmp.cmp(first / name, second / name, shallow=False):
         return None
     difference = explain(first / name, second / name)
     if difference is None and name not in IGNORED:
-        return Difference(SAME_CONTENT, 0.0)
+        return Difference("", SAME_CONTENT, 0.0)
     return difference
 
 
-def _same_bytes(first: Path, second: Path) -> bool:
-    """Whether two files have the same content."""
-    if first.stat().st_size != second.stat().st_size:
-        return False
-    with first.open("rb") as one, second.open("rb") as other:
-        while True:
-            chunk = one.read(CHUNK)
-            if chunk != other.read(CHUNK):
-                return False
-            if not chunk:
-                return True
-
-
 def explain(first: Path, second: Path) -> Difference | None:
-    """First difference of the decoded content of two files; None: equal, or differing only in ignored settings."""
+    """First difference of the decoded content of two files, with the largest of all; None: equal, or differing only in ignored settings."""
     folder = _array_folder(first)
     if folder is not None:
-        return compare_zarr(folder, second.parents[first.parents.index(folder)])
-    if first.suffix == ".tar":
-        return compare_tars(first, second)
-    if first.suffix in USD:
-        return compare_usd(first, second)
-    return compare_bytes(first.name, first.read_bytes(), second.read_bytes())
+        import zarr
 
+        arrays = (zarr.open_array(each, mode="r") for each in (folder, second.parents[first.parents.index(folder)]))
+        found = compare_values(*(np.asarray(array[...]) for array in arrays))
+    elif first.suffix.startswith(".usd"):
+        from pxr import Sdf
 
-def compare_bytes(name: str, first: bytes, second: bytes) -> Difference | None:
-    """First difference of two files' content, decoded by the suffix of their name."""
-    suffix = PurePosixPath(name).suffix
-    if suffix in IMAGES:
-        one, other = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for data in (first, second))
-        if one is None or other is None:
-            return Difference("not an image")
-        return compare_arrays(one, other, names=("row", "column", "channel"))
-    if suffix == ".json":
-        return _from_pairs(_without_ignored(name, compare_values(json.loads(first), json.loads(second))))
-    if suffix == ".jsonl":
-        lines, others = ([json.loads(line) for line in data.splitlines()] for data in (first, second))
-        return _from_pairs(compare_values(lines, others))
-    if suffix == ".toml":
-        pairs = compare_values(tomllib.loads(first.decode()), tomllib.loads(second.decode()))
-        return _from_pairs(_without_ignored(name, pairs))
-    length = min(len(first), len(second))
-    differs = np.flatnonzero(np.frombuffer(first[:length], np.uint8) != np.frombuffer(second[:length], np.uint8))
-    offset = int(differs[0]) if differs.size else length
-    if suffix in (".sha256", ".md"):
-        line = first[:offset].count(b"\n")
-        return Difference(f"line {line + 1}: {_line(first, line)} and {_line(second, line)}")
-    return Difference(f"byte {offset:,}; {len(first):,} and {len(second):,} bytes")
-
-
-def compare_values(first: Any, second: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """(key path, first value, second value) of each difference between two JSON values."""
-    if isinstance(first, dict) and isinstance(second, dict):
-        for key in [*first, *(key for key in second if key not in first)]:
-            yield from compare_values(first.get(key), second.get(key), f"{path}.{key}")
-    elif isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
-        for index, (one, other) in enumerate(zip(first, second, strict=True)):
-            yield from compare_values(one, other, f"{path}[{index}]")
-    elif isinstance(first, list) and isinstance(second, list):
-        yield path, f"{len(first)} entries", f"{len(second)} entries"
-    elif first != second:
-        yield path, first, second
-
-
-def _without_ignored(name: str, pairs: Iterator[tuple[str, Any, Any]]) -> Iterator[tuple[str, Any, Any]]:
-    """Drop the differing pairs whose key is ignored in files of this name."""
-    return (pair for pair in pairs if not any(fnmatchcase(pair[0].lstrip("."), key) for key in IGNORED.get(name, ())))
-
-
-def _from_pairs(pairs: Iterator[tuple[str, Any, Any]]) -> Difference | None:
-    """Summarize differing values (key path, first value, second value); None without any."""
-    where, largest = "", 0.0
-    for path, one, other in pairs:
-        where = where or f"{path.lstrip('.') or 'all'}: {one} and {other}"
-        numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (one, other))
-        largest = max(largest, abs(one - other)) if numeric and not math.isnan(largest) else math.nan
-    return Difference(where, largest) if where else None
-
-
-def compare_arrays(first: np.ndarray, second: np.ndarray, names: tuple[str, ...] = ()) -> Difference | None:
-    """First differing element of two arrays; NaN equals NaN. `names` are the dimensions' names."""
-    if first.shape != second.shape or first.dtype != second.dtype:
-        return Difference(f"{first.dtype}{list(first.shape)} and {second.dtype}{list(second.shape)}")
-    numbers = first.dtype.kind in "biuf"
-    differs = (first != second) & ~((first != first) & (second != second)) if numbers else first != second
-    if not differs.any():
+        layers = (Sdf.Layer.OpenAsAnonymous(str(path)) for path in (first, second))  # type: ignore[attr-defined]
+        found = compare_values(*(_lines(layer.ExportToString().encode()) for layer in layers))
+    else:
+        found = compare_bytes(first.name, first.read_bytes(), second.read_bytes())
+    kept = [each for each in found if not any(fnmatchcase(each.where, key) for key in IGNORED.get(first.name, ()))]
+    if not kept:
         return None
-    index = tuple(int(position) for position in np.argwhere(differs)[0])
-    labels = names[: len(index)] or tuple(f"axis {axis}" for axis in range(len(index)))
-    where = ", ".join(f"{label} {position}" for label, position in zip(labels, index, strict=True))
-    largest = float(np.abs(first[differs].astype(np.float64) - second[differs].astype(np.float64)).max()) if numbers else math.nan
-    count = int(differs.sum())
-    return Difference(f"{where}: {first[index]} and {second[index]}; {count:,} of {first.size:,} values, by up to {largest:g}", largest)
+    largest = [each.largest for each in kept]
+    return kept[0]._replace(largest=math.nan if any(map(math.isnan, largest)) else max(largest))
 
 
 def _array_folder(path: Path) -> Path | None:
@@ -231,47 +157,82 @@ def _array_folder(path: Path) -> Path | None:
     return None
 
 
-def compare_zarr(first: Path, second: Path) -> Difference | None:
-    """First difference of two zarr arrays; None: they are equal."""
-    import zarr
-
-    one, other = (np.asarray(zarr.open_array(folder, mode="r")[...]) for folder in (first, second))
-    return compare_arrays(one, other)
+def _image(data: bytes) -> Any:
+    """Pixels of an image file."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    return "not an image" if pixels is None else pixels
 
 
-def compare_tars(first: Path, second: Path) -> Difference | None:
-    """First difference of two tar archives, member by member; None: they are equal."""
-    with tarfile.open(first) as one, tarfile.open(second) as other:
-        members = (one.getmembers(), other.getmembers())
-        named = [[member.name for member in own] for own in members]
-        if named[0] != named[1]:
-            return Difference(f"{len(named[0])} and {len(named[1])} members, or different names")
-        total: Difference | None = None
-        for mine, theirs in zip(*members, strict=True):
-            data = [(archive.extractfile(member) or io.BytesIO()).read() for archive, member in ((one, mine), (other, theirs))]
-            difference = compare_bytes(mine.name, *data) if data[0] != data[1] else None
-            if difference is not None:
-                where = total.where if total else f"{mine.name}: {difference.where}"
-                total = Difference(where, difference.largest if total is None else max(total.largest, difference.largest))
-        return total
+def _lines(data: bytes) -> dict[str, str]:
+    """Lines of a text, by their numbers."""
+    return {f"line {number}": line.strip() for number, line in enumerate(data.decode(errors="replace").splitlines(), start=1)}
 
 
-def compare_usd(first: Path, second: Path) -> Difference | None:
-    """First differing line of two USD layers as text; None: they are equal."""
-    from pxr import Sdf
+DECODERS: Mapping[str, Callable[[bytes], Any]] = {
+    ".png": _image,
+    ".jpg": _image,
+    ".json": json.loads,
+    ".jsonl": lambda data: [json.loads(line) for line in data.splitlines()],
+    ".toml": lambda data: tomllib.loads(data.decode()),
+    ".sha256": _lines,
+    ".md": _lines,
+}
+"""Suffix -> content of such a file as values, lists, dictionaries and arrays."""
 
-    layers = (Sdf.Layer.OpenAsAnonymous(str(path)) for path in (first, second))  # type: ignore[attr-defined]
-    texts = [layer.ExportToString().splitlines() for layer in layers]
-    for line, (one, other) in enumerate(zip(*texts, strict=False), start=1):
-        if one != other:
-            return Difference(f"line {line} as text: {one.strip()} and {other.strip()}")
-    return Difference(f"{len(texts[0])} and {len(texts[1])} lines as text") if len(texts[0]) != len(texts[1]) else None
+
+def compare_bytes(name: str, first: bytes, second: bytes, path: str = "") -> Iterator[Difference]:
+    """Differences of two files' content, decoded by the suffix of their name; of archives member by member."""
+    suffix = PurePosixPath(name).suffix
+    if suffix == ".tar":
+        one, other = (dict(_members(data)) for data in (first, second))
+        for member in dict.fromkeys([*one, *other]):
+            if member not in one or member not in other:
+                yield Difference(member, "only in one of them")
+            elif one[member] != other[member]:
+                yield from compare_bytes(member, one[member], other[member], member)
+    elif suffix in DECODERS:
+        yield from compare_values(*map(DECODERS[suffix], (first, second)), path)
+    else:
+        length = min(len(first), len(second))
+        differs = np.flatnonzero(np.frombuffer(first[:length], np.uint8) != np.frombuffer(second[:length], np.uint8))
+        yield Difference(f"{path} byte {differs[0] if differs.size else length:,}".lstrip(), f"{len(first):,} and {len(second):,} bytes")
 
 
-def _line(data: bytes, index: int) -> str:
-    """Line of a text by index; "nothing" beyond its end."""
-    lines = data.splitlines()
-    return lines[index].decode(errors="replace") if index < len(lines) else "nothing"
+def _members(archive: bytes) -> Iterator[tuple[str, bytes]]:
+    """(name, content) of each member of a tar archive."""
+    with tarfile.open(fileobj=io.BytesIO(archive)) as file:
+        yield from ((member.name, (file.extractfile(member) or io.BytesIO()).read()) for member in file)
+
+
+def compare_values(first: Any, second: Any, path: str = "") -> Iterator[Difference]:
+    """Differences between two JSON values, whose leaves may be arrays."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        for key in dict.fromkeys([*first, *second]):
+            yield from compare_values(first.get(key), second.get(key), f"{path}.{key}".lstrip("."))
+    elif isinstance(first, list) and isinstance(second, list) and len(first) == len(second):
+        for index, (one, other) in enumerate(zip(first, second, strict=True)):
+            yield from compare_values(one, other, f"{path}[{index}]")
+    elif isinstance(first, list) and isinstance(second, list):
+        yield Difference(path, f"{len(first)} entries and {len(second)} entries")
+    elif isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+        yield from compare_arrays(first, second, path)
+    elif isinstance(first, np.ndarray) or isinstance(second, np.ndarray) or first != second:
+        numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (first, second))
+        yield Difference(path, f"{first} and {second}", abs(first - second) if numeric else math.nan)
+
+
+def compare_arrays(first: np.ndarray, second: np.ndarray, path: str = "") -> Iterable[Difference]:
+    """First differing element of two arrays, and the largest difference; NaN equals NaN."""
+    if first.shape != second.shape or first.dtype != second.dtype:
+        return [Difference(path, f"{first.dtype}{list(first.shape)} and {second.dtype}{list(second.shape)}")]
+    numbers = first.dtype.kind in "biuf"
+    differs = (first != second) & ~((first != first) & (second != second)) if numbers else first != second
+    if not differs.any():
+        return []
+    index = tuple(np.argwhere(differs)[0].tolist())
+    largest = float(np.abs(first[differs].astype(np.float64) - second[differs].astype(np.float64)).max()) if numbers else math.nan
+    values = f"{first[index]} and {second[index]}; {int(differs.sum()):,} of {first.size:,} values, by up to {largest:g}"
+    return [Difference(f"{path}{list(index)}", values, largest)]
 
 
 def print_layers(layers: dict[str, LayerImages]) -> None:
@@ -291,7 +252,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         layers, first_difference = compare(options.first, options.second)
-    except (UnusableRunError, OSError, ValueError) as error:
+    except (DatasetError, OSError, ValueError) as error:
         return fail("compare runs", " ".join(str(error).split()))
     print_layers(layers)
     print(f"first difference: {first_difference}" if first_difference else "no difference")

@@ -1,1 +1,1 @@
-"""Examples of the Python API, run as `python -m tools.examples.NAME FOLDER`; each bakes a small data set if the folder has none."""
+"""Examples of training, run as `python -m tools.examples.NAME`, and adapters for libraries of reinforcement learning."""

@@ -37,8 +37,8 @@ HELD_OUT_STRIDE = 20
 LEARNING_RATE = 2e-3
 MIN_SIDE = 8
 """Least width and height of an image [px]: it is halved three times."""
-WARM_UP = 0.1
-"""Fraction of the training in which the learning rate rises; afterwards it falls as a cosine."""
+WARM_UP, LEAST_RATE = 0.1, 0.01
+"""Fraction of a training in which the learning rate rises; fraction of the rate to which it falls afterwards, as a cosine."""
 
 
 class Network(nn.Module):
@@ -85,6 +85,12 @@ def hold_out(stream: ViewStream, views: int) -> tuple[list[dict[str, torch.Tenso
     return batches, 1 + max(stream.object_names)
 
 
+def schedule(done: float, warm_up: float = WARM_UP) -> float:
+    """Factor of the learning rate when the fraction `done` of a training has passed."""
+    factor = done / warm_up if done < warm_up else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - warm_up) / (1 - warm_up)))
+    return max(factor, LEAST_RATE)
+
+
 def train(dataset: StreamDataset, views: int, classes: int, width: int, device: torch.device) -> tuple[Network, list[float]]:
     """Train a new network on at least `views` views, in whole batches; returns the network and the loss of each batch."""
     torch.manual_seed(dataset.config.bake.seed)
@@ -92,9 +98,7 @@ def train(dataset: StreamDataset, views: int, classes: int, width: int, device: 
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE)
     losses, seen = [], 0
     for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
-        done = seen / views
-        factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP) / (1 - WARM_UP))
-        optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(factor, 0.01)
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * schedule(seen / views)
         loss = functional.cross_entropy(network(batch["rgb"]), batch["classes"])
         optimizer.zero_grad()
         loss.backward()

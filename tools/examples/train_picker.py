@@ -12,7 +12,6 @@ PyTorch; the defaults are for a GPU.
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -28,7 +27,7 @@ try:
     import torch  # pyright: ignore[reportMissingImports]
     from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-    from tools.examples.train_online import Network
+    from tools.examples.train_online import Network, schedule
 except ModuleNotFoundError as missing:
     raise SystemExit(f"train_picker: {missing.name} is not installed; pip install torch") from None
 
@@ -157,9 +156,7 @@ def train(samples: PickSamples, width: int, steps: int, device: torch.device, se
     bounds = np.searchsorted(samples.trials["state"], np.arange(len(samples.episode) + 1))
     random, losses = np.random.default_rng(seed), []
     for step in range(steps):
-        done = step / steps
-        factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP) / (1 - WARM_UP))
-        optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(factor, 0.01)
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * schedule(step / steps, WARM_UP)
         states = random.choice(len(samples.episode), min(batch, len(samples.episode)), replace=False)
         rows = np.concatenate([np.arange(bounds[state], bounds[state + 1]) for state in states])
         place = torch.from_numpy(np.repeat(np.arange(len(states)), bounds[states + 1] - bounds[states]))

@@ -5,29 +5,21 @@ quality of a bake. Here every frame of camera 0 is denoised, from the first one 
 references, with half of `--samples` each: the product of the two differences estimates the error without the references' noise. Exits with
 1 if a bound is violated, with 2 if nothing can be rendered.
 
-    python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256 --sheet sheet.png
-
-With `--references DIR` references are cached: another run with other settings of the denoiser takes a tenth of the time.
+    python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import hashlib
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import warp as wp
 from rich.console import Console
 
-from synpick_warp.apps.viz.drawing import FONT, put_text, write_picture
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
@@ -36,20 +28,15 @@ from synpick_warp.factory.memory_plan import check_memory, explain_shortage, pla
 from synpick_warp.factory.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.stream import read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
-from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, positive_count, writable_file
+from tools.options import MeasuredRow, configure, fail, make_parser, positive_count
 
 MIN_PSNR, MAX_BIAS = 35.0, 1.0
 """Bounds of the mean PSNR over all compared frames [dB], and of the mean bias [%]."""
-DENOISER_SETTINGS = ("coarse_pixel", "coarse_paths", "history", "mode")
-"""Settings of section `render` that do not affect references."""
-CELL_WIDTH, GAP, LINE, GAIN = 640, 6, 30, 5
-"""Contact sheet: width of an image, gap between images, height of a line of text [px]; factor that makes differences visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,50 +85,6 @@ class Pair:
         return 100.0 * (float(self.denoised.radiance.mean()) / expected - 1.0)
 
 
-class ReferenceStore:
-    """Pairs of references with half of the paths each, cached in one file per pair. The key is a hash of settings and of the world's state.
-
-    The key does not cover the code: clear the folder after a change of the reference renderer.
-    """
-
-    def __init__(self, folder: Path | None, config: Config, scene: RenderScene) -> None:
-        """
-        Args:
-            folder: Folder of the files; None: no caching.
-            config: Settings of the references, including the number of paths.
-            scene: Scene of the references.
-        """
-        self._folder = folder
-        half, room = {"render.mode": REFERENCE, "render.samples": max(1, config.render.samples // 2)}, config.arrangement.max_objects
-        both = (config.with_values(half | {"bake.seed": config.bake.seed + offset}) for offset in (0, 1))
-        self._studios = [Studio(make_renderer(each, scene, room, 1)) for each in both]
-        content: dict[str, Any] = dataclasses.asdict(config)
-        for name in DENOISER_SETTINGS:
-            del content["render"][name]
-        self._settings = repr(content).encode()
-
-    def get(self, snapshot: Snapshot, world: int) -> tuple[Shot, Shot]:
-        """Return the references of a world, from the cache or else from the renderer."""
-        if self._folder is None:
-            return self._render(snapshot, world)
-        state = hashlib.sha256(self._settings)
-        for item in dataclasses.fields(snapshot):
-            state.update(getattr(snapshot, item.name).numpy()[world].tobytes())
-        path = self._folder / f"{state.hexdigest()}.npz"
-        if not path.exists():
-            shots = self._render(snapshot, world)
-            part = path.with_suffix(".part.npz")
-            np.savez(part, **{f"{name}{index}": array for index, shot in enumerate(shots) for name, array in vars(shot).items()})
-            part.replace(path)
-        with np.load(path) as content:
-            first, second = (Shot(content[f"color{index}"], content[f"radiance{index}"]) for index in (0, 1))
-        return first, second
-
-    def _render(self, snapshot: Snapshot, world: int) -> tuple[Shot, Shot]:
-        first, second = (studio.render(snapshot, world) for studio in self._studios)
-        return first, second
-
-
 def _frames(text: str) -> tuple[int, ...]:
     """Type of an option: frame indices joined by commas."""
     parts = text.split(",")
@@ -155,8 +98,6 @@ OWN = {
     "mode": {"default": "pick", "help": "bake.mode (default: pick)"},
     "frames": {"type": _frames, "default": (0, 8, 30), "help": "frames to compare, comma-separated (default: 0,8,30)"},
     "samples": {"type": positive_count, "default": 256, "help": "paths per pixel of both references together (default: 256)"},
-    "sheet": {"type": writable_file, "help": "contact sheet: denoised, reference, and five times their difference"},
-    "references": {"type": existing_folder, "help": "folder in which references are cached between runs"},
 }
 """Options of this report; see `tools.options.OPTIONS`."""
 
@@ -174,7 +115,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = configure(options, worlds | {"bake.mode": options.mode, "render.samples": options.samples})
         config = config.with_values({"cameras.positions": config.cameras.positions[:1], "cameras.ups": config.cameras.ups[:1]})
         device = pick_device(config.bake.device)
-        for frame, pair in compare_frames(config, options.frames, options.references):
+        for frame, pair in compare_frames(config, options.frames):
             pairs.append(pair)
             missing.discard(frame)
             name, seconds = f"frame {frame}, {pair.light}", time.perf_counter() - started
@@ -183,8 +124,6 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{seconds:6.0f} s  frame {frame:4}  {pair.light}: {pair.quality:.2f} dB, {pair.bias:+.2f} %")
         if missing:
             raise SynpickError(f"no episode has frame {min(missing)} of --frames; name earlier ones")
-        if options.sheet:
-            console.print(f"wrote {write_picture(options.sheet, draw_sheet(pairs)[..., ::-1])}")
     except SynpickError as error:
         return fail("reports.sequence", error)
     rows += summarize_pairs(pairs)
@@ -193,21 +132,22 @@ def main(arguments: list[str] | None = None) -> int:
     return finish_report("tools.reports.sequence", options.json, device, "frames of episodes", title, rows)
 
 
-def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None = None) -> Iterator[tuple[int, Pair]]:
-    """Simulate episodes and render camera 0; yields (frame, denoised image and references) for the given frames of each episode.
+def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[int, Pair]]:
+    """Simulate episodes, one per world, and render camera 0; yields (frame, denoised image and references) for these frames of each.
 
-    Args:
-        config: All settings; one episode per world.
-        frames: Indices of frames.
-        cache: Folder in which references are cached; None: no caching.
+    References have half of the paths each, and seeds of their own.
     """
     device = pick_device(config.bake.device)
     fitted = fit_to_device(config.with_values({"render.mode": FAST}), device, config.bake.episodes)
     check_memory(plan_memory(fitted, device), device)
     with explain_shortage(fitted):
         stages = build_stages(fitted, device, SilentProgress(), range(config.bake.episodes))
-    denoised, store = Studio(stages.groups[0].renderer), ReferenceStore(cache, config, stages.groups[0].renderer.scene)
-    simulation, names = stages.simulation, stages.light_table.name
+    denoised, simulation, names = Studio(stages.groups[0].renderer), stages.simulation, stages.light_table.name
+    half = config.with_values({"render.mode": REFERENCE, "render.samples": max(1, config.render.samples // 2)})
+    first, second = (
+        Studio(make_renderer(half.with_values({"bake.seed": seed}), denoised.renderer.scene, config.arrangement.max_objects, 1))
+        for seed in (config.bake.seed, config.bake.seed + 1)
+    )
     while True:
         simulation.tick()
         report = read_tick(simulation.record)
@@ -217,7 +157,7 @@ def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None =
                 shot = denoised.render(snapshot, world)
                 if shown[world] in frames:
                     light = str(names[int(snapshot.light.numpy()[world])])
-                    yield int(shown[world]), Pair(light, shot, store.get(snapshot, world))
+                    yield int(shown[world]), Pair(light, shot, (first.render(snapshot, world), second.render(snapshot, world)))
         phase = report.column("phase")
         if ((phase == Phase.IDLE) | ((phase == Phase.ACT) & (shown >= max(frames)))).all():
             return
@@ -232,35 +172,6 @@ def summarize_pairs(pairs: list[Pair]) -> list[MeasuredRow]:
         MeasuredRow("denoised against reference, min", min(qualities), "dB"),
         MeasuredRow("bias of mean radiance, mean", bias, "%", f"within {MAX_BIAS:g}", abs(bias) < MAX_BIAS),
     ]
-
-
-def draw_sheet(pairs: list[Pair]) -> np.ndarray:
-    """Draw a contact sheet (H, W, 3) uint8 RGB: a labelled row of images for each pair."""
-    blocks = []
-    for pair in pairs:
-        denoised, reference = pair.denoised.color, pair.references[0].color
-        images = (denoised, reference, cv2.absdiff(denoised, reference).clip(0, 255 // GAIN) * GAIN)
-        row = np.concatenate([np.pad(_scale(image), ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for image in images], axis=1)
-        blocks += [_draw_line([f"{pair.light}:  {pair.quality:.1f} dB,  bias {pair.bias:+.1f} %"], row.shape[1]), row]
-    return np.concatenate([_draw_line(["denoised", "reference", f"{GAIN} x their difference"], blocks[-1].shape[1]), *blocks])
-
-
-def _scale(image: np.ndarray) -> np.ndarray:
-    """Image shrunk to the cells' width, or enlarged by an integer factor."""
-    height, width = image.shape[:2]
-    if width > CELL_WIDTH:
-        return cv2.resize(image, (CELL_WIDTH, round(height * CELL_WIDTH / width)), interpolation=cv2.INTER_AREA)
-    factor = CELL_WIDTH // width
-    return image.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def _draw_line(texts: list[str], width: int) -> np.ndarray:
-    """Draw a line of evenly spaced texts, shrunk to fit their columns."""
-    canvas, column = np.full((LINE, width, 3), 255, np.uint8), width // len(texts)
-    for index, text in enumerate(texts):
-        size = 0.65 * min(1.0, (column - 2 * GAP) / cv2.getTextSize(text, FONT, 0.65, 1)[0][0])
-        put_text(canvas, text, (index * column + GAP, LINE - 9), size, (30, 30, 30))
-    return canvas
 
 
 if __name__ == "__main__":

@@ -4,25 +4,29 @@ Each seed has its own piles, pictures and network; values are means over seeds w
 evaluated for all seeds, for comparison. Needs PyTorch; the defaults are for a GPU.
 
     python -m tools.reports.real --real REAL --models YCB --lights HDRI --seeds 3 --json real.json --pictures OUT
+
+IoU is over the pixels of all views (PASCAL VOC; Everingham et al., 2010). Each class is there once in a view, so an instance is the pixels
+of its class. Predictions are those of the network at its own size; logits are upsampled to the size of the labels.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 try:
     import torch  # pyright: ignore[reportMissingImports]
+    from torch import nn  # pyright: ignore[reportMissingImports]
+    from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-    from tools.reports.real.scores import NetworkScores, draw_overlay, predict, score, score_pool
-    from tools.reports.real.training import BLOCK, Recipe, Trained, train
-    from tools.reports.real.views import ViewPool, ViewSource, hold_out
+    from tools.reports.real.training import BLOCK, Recipe, Trained, ViewPool, train
 except ModuleNotFoundError as missing:
     raise SystemExit(f"reports.real: {missing.name} is not installed; pip install torch") from None
 
@@ -30,7 +34,9 @@ from rich.console import Console
 from scipy import stats
 
 from synpick_warp.configs.cell.rig import resized
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.online.dataset import StreamDataset
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
@@ -38,37 +44,123 @@ from tools.reports.real_frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
-FEW_WORLDS = 64
-"""Maximum number of worlds for held-out views."""
+HELD_OUT_VIEWS, FEW_WORLDS = 400, 64
+"""Synthetic views to measure on, and maximum number of worlds for them."""
 PRESET = "tabletop-train"
 """Default preset of the stream."""
 VIEWS_PER_BATCH = 48
 """Views that are rendered together: more than a batch of the training, so that the GPU is busy."""
+STRIDE, ENLARGE = 2, 2
+"""Every n-th frame of an episode is trained on, at n times the resolution of the preset, which is that of the photographs."""
 MODELS = 21
 """Largest obj_id: networks have a class for each, and class 0 for pixels without object."""
+FOUND_IOU = 0.5
+"""IoU above which an instance counts as found."""
+MIN_PIXELS = 20
+"""Pixels of the network's image below which an instance of a synthetic view is not counted."""
+SCORED = 16
+"""Views of a pool that are scored together."""
+OVERLAY_WIDTH = 240
+"""Width of a view in the contact sheet [px]."""
 COUNTS = {
     "views": (24_000, "views of the stream"),
     "seeds": (3, "trainings, each with piles of its own"),
     "worlds": (512, "worlds simulated in parallel"),
-    "held-out": (400, "synthetic views to measure on"),
     "capacity": (24_000, "views in the pool, at most"),
     "batch": (16, "views of a batch"),
-    "width": (64, "channels of the network's first level"),
-    "stride": (2, "every n-th frame of an episode is taken"),
-    "enlarge": (2, "factor by which the resolution of all cameras is enlarged"),
 }
 """Options that are integers above 0: default and meaning."""
 OWN = {
     **{name: {"type": positive_count, "default": value, "help": f"{text} (default: {value})"} for name, (value, text) in COUNTS.items()},
     "passes": {"type": number_in(0.0), "default": 4.0, "help": "number of epochs (default: 4)"},
     "seconds": {"type": number_in(0.0), "default": 280.0, "help": "time limit of a training with its stream [s] (default: 280)"},
-    "crop": {"type": number_in(0.1, 1.0), "default": Recipe.crop, "help": "side length of late crops, as a fraction (default: 0.5)"},
-    "first-seed": {"type": int, "default": 0, "help": "first seed (default: 0)"},
-    "cameras": {"type": int, "nargs": "+", "help": "indices of the cameras to train on (default: all)"},
-    "name": {"default": "real", "help": "name of the run, in files (default: real)"},
     "pictures": {"type": existing_folder, "metavar": "DIR", "help": "write overlays of all frames to this folder"},
 }
 """Options of this report; see `tools.options.OPTIONS`."""
+
+Batches = Generator[tuple[torch.Tensor, torch.Tensor]]
+Labelled = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8."""
+
+
+# ---- scores ----
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkScores:
+    """Scores of a network on annotated views."""
+
+    iou: dict[int, float]
+    """IoU over all views of each object that occurs, by obj_id."""
+    instances: list[float]
+    """IoU of each instance."""
+    background: float
+    """Share of the background's pixels that are taken for objects."""
+
+    @property
+    def mean_iou(self) -> float:
+        """IoU averaged over the objects that occur."""
+        return float(np.mean(list(self.iou.values()))) if self.iou else float("nan")
+
+    @property
+    def found(self) -> float:
+        """Share of instances with an IoU above FOUND_IOU."""
+        return float(np.mean(np.array(self.instances) > FOUND_IOU)) if self.instances else float("nan")
+
+
+def predict(network: nn.Module, color: np.ndarray, size: tuple[int, int], device: torch.device) -> np.ndarray:
+    """Segmentation of an image (H, W, 3) uint8, which the network sees at `size` (width, height): obj_id of each pixel (H, W) uint8."""
+    small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+    image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
+    with torch.no_grad():
+        logits = functional.interpolate(network(image.to(device)).float(), size=color.shape[:2], mode="bilinear", align_corners=False)
+    return logits[0].argmax(0).to(torch.uint8).cpu().numpy()
+
+
+def score(predictions: Iterable[tuple[np.ndarray, np.ndarray]], classes: int, least: int = 1) -> NetworkScores:
+    """Scores of predictions: predicted and true obj_ids (H, W) uint8; `least`: pixels of an instance that counts."""
+    total, instances = np.zeros((classes, classes), np.int64), list[float]()
+    for found, truth in predictions:
+        table = np.bincount(truth.astype(np.int64).ravel() * classes + found.ravel(), minlength=classes**2).reshape(classes, classes)
+        total += table
+        instances += _ious(table)[1:][table.sum(axis=1)[1:] >= least].tolist()
+    ious, occurs = _ious(total), total.sum(axis=1) > 0
+    background = float(total[0, 1:].sum() / max(1, total[0].sum()))
+    return NetworkScores({index: float(ious[index]) for index in range(1, classes) if occurs[index]}, instances, background)
+
+
+def _ious(table: np.ndarray) -> np.ndarray:
+    """IoU of each class of a confusion table (truth, prediction)."""
+    union = table.sum(0) + table.sum(1) - table.diagonal()
+    return table.diagonal() / np.maximum(union, 1)
+
+
+def score_pool(network: nn.Module, pool: ViewPool, classes: int) -> NetworkScores:
+    """Scores of a network on the views of a pool, at their own size."""
+
+    def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for images, truth in zip(*(values[: pool.count].split(SCORED) for values in pool.tensors()), strict=True):
+            with torch.no_grad():
+                found = network(images).argmax(1)
+            yield from zip(found.to(torch.uint8).cpu().numpy(), truth.cpu().numpy(), strict=True)
+
+    return score(pairs(), classes, MIN_PIXELS)
+
+
+def draw_overlay(path: Path, rows: Sequence[Labelled], classes: int) -> None:
+    """Write a contact sheet (PNG) with a column for each view: image, and truth and prediction laid over it, in a hue for each obj_id."""
+    index, columns = np.arange(classes), []
+    hues = np.stack([index * 67 % 180, np.full(classes, 220), np.where(index % 2, 255, 190)], axis=-1).astype(np.uint8)
+    palette = cv2.cvtColor(hues[None], cv2.COLOR_HSV2RGB)[0]
+    palette[0] = 0
+    for color, truth, found in rows:
+        height = round(color.shape[0] * OVERLAY_WIDTH / color.shape[1])
+        layers = [color, *(cv2.addWeighted(color, 0.45, palette[ids], 0.55, 0) for ids in (truth, found))]
+        columns.append(np.vstack([cv2.resize(layer, (OVERLAY_WIDTH, height), interpolation=cv2.INTER_AREA) for layer in layers]))
+    cv2.imwrite(str(path), np.hstack(columns)[..., ::-1])
+
+
+# ---- runs ----
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +170,8 @@ class TrainingOutcome:
     trained: Trained
     real: NetworkScores
     synthetic: NetworkScores
-    overlay: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Colour image (H, W, 3) uint8, true and predicted obj_ids (H, W) uint8 of each frame."""
+    overlay: list[Labelled]
+    """The photographs with their labels."""
 
 
 def check_ids(labels: list[np.ndarray]) -> None:
@@ -93,13 +185,8 @@ def check_ids(labels: list[np.ndarray]) -> None:
         raise ConfigError(f"an object has obj_id {largest}; allowed here: 1 to {MODELS}, those of YCB-Video")
 
 
-def recipe_of(options: argparse.Namespace) -> Recipe:
-    """Hyper-parameters of a command line."""
-    return Recipe(**{name: value for name, value in vars(options).items() if name in Recipe.__dataclass_fields__})
-
-
-def source_of(options: argparse.Namespace, seed: int, device: Any) -> ViewSource:
-    """Source of the training views of a seed.
+def settings_of(options: argparse.Namespace, seed: int, device: Any) -> Config:
+    """Settings of the stream of a seed.
 
     Raises:
         ConfigError: A setting is wrong.
@@ -107,21 +194,28 @@ def source_of(options: argparse.Namespace, seed: int, device: Any) -> ViewSource
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config = configure(options, fixed)
-    if options.enlarge > 1:
-        sizes = [(options.enlarge * width, options.enlarge * height) for width, height in config.rig.sizes]
-        config = replace(config, camera=tuple(map(resized, config.rig.rows, sizes)))
-    for width, height in config.rig.sizes:
+    sizes = [(ENLARGE * width, ENLARGE * height) for width, height in config.rig.sizes]
+    for width, height in sizes:
         if width % (2 * BLOCK) or height % (2 * BLOCK):
             raise ConfigError(f"images of {width}x{height} px cannot be augmented by JPEG; use multiples of {2 * BLOCK}")
-    return ViewSource(config, TRAINING, options.stride, tuple(options.cameras or ()) or None)
+    return replace(config, camera=tuple(map(resized, config.rig.rows, sizes)))
+
+
+def stream_views(config: Config, episodes: range, views: int) -> Batches:
+    """Images (B, 3, H, W) and obj_ids (B, H, W) uint8 of `views` views of a stream; a batch is valid until the next one."""
+    dataset = StreamDataset(config, fields=("rgb", "classes"), episodes=episodes, stride=STRIDE)
+    for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
+        yield batch["rgb"][:views], batch["classes"][:views].to(torch.uint8)
+        views -= len(batch["rgb"])
+        if views <= 0:
+            return
 
 
 def measure(trained: Trained, frames: list[RealFrame], held: ViewPool, device: torch.device) -> TrainingOutcome:
     """Scores of a network on real frames, which it sees at the size of the held-out views, and on these."""
     height, width = held.tensors()[0].shape[2:]
-    found = [predict(trained.network, frame.color, (int(width), int(height)), device) for frame in frames]
-    real = score([(frame.name, one, frame.label) for frame, one in zip(frames, found, strict=True)], 1 + MODELS)
-    overlay = [(frame.color, frame.label, one) for frame, one in zip(frames, found, strict=True)]
+    overlay = [(frame.color, frame.label, predict(trained.network, frame.color, (int(width), int(height)), device)) for frame in frames]
+    real = score([(found, truth) for _, truth, found in overlay], 1 + MODELS)
     return TrainingOutcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
 
 
@@ -134,7 +228,7 @@ def interval(values: Sequence[float]) -> str:
 
 
 def rows_of(outcomes: list[TrainingOutcome]) -> list[MeasuredRow]:
-    """Rows of the report: means over seeds, for all frames, by object and by frame."""
+    """Rows of the report: means over seeds, for all frames and by object."""
 
     def row(name: str, values: list[float], unit: str = "", part: str = "") -> MeasuredRow:
         return MeasuredRow(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
@@ -150,11 +244,10 @@ def rows_of(outcomes: list[TrainingOutcome]) -> list[MeasuredRow]:
         row("training, in all", [one.trained.seconds for one in outcomes], "s"),
         row("of it the stream", [one.trained.stream_seconds for one in outcomes], "s"),
         row("views", [float(one.trained.views) for one in outcomes]),
+        row("samples", [float(one.trained.samples) for one in outcomes]),
         row("loss at the end", [one.trained.losses[-1] for one in outcomes]),
     ]
-    first = outcomes[0].real
-    rows += [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in first.iou]
-    return rows + [row(f"{name}: mean IoU", [one.real.views[name] for one in outcomes], part="frame") for name in first.views]
+    return rows + [row(f"obj_id {index}: IoU", [one.real.iou[index] for one in outcomes], part="object") for index in outcomes[0].real.iou]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -176,39 +269,21 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
     Raises:
         SynpickError: A setting is wrong, models or lights cannot be used, or files cannot be written.
     """
-    source = source_of(options, 0, device)
-    few = replace(source.config, bake=replace(source.config.bake, worlds=min(options.worlds, FEW_WORLDS)))
-    held = hold_out(replace(source, config=few, episodes=HELD_OUT, cameras=None), options.held_out)
+    config = settings_of(options, 0, device)
+    few, held = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS))), ViewPool(HELD_OUT_VIEWS, 0)
+    held.fill(stream_views(few, HELD_OUT, HELD_OUT_VIEWS), HELD_OUT_VIEWS)
     check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])
-    target, outcomes = torch.device(device.alias), list[TrainingOutcome]()
-    for seed in range(options.first_seed, options.first_seed + options.seeds):
-        trained = train(source_of(options, seed, device), recipe_of(options), 1 + MODELS, target, seed)
-        outcomes.append(measure(trained, frames, held, target))
-        print(_line(seed, outcomes[-1]), flush=True)
-        write_run(options.json, describe_run("tools.reports.real", (), rows_of(outcomes), name=options.name, seeds=by_seed(outcomes)))
+    recipe = Recipe(**{name: value for name, value in vars(options).items() if name in Recipe.__dataclass_fields__})
+    target, outcomes, rows = torch.device(device.alias), list[TrainingOutcome](), list[MeasuredRow]()
+    for seed in range(options.seeds):
+        views = stream_views(settings_of(options, seed, device), TRAINING, recipe.views)
+        outcomes.append(measure(train(views, recipe, 1 + MODELS, target, seed), frames, held, target))
+        rows, losses = rows_of(outcomes), [one.trained.losses for one in outcomes]
+        write_run(options.json, describe_run("tools.reports.real", (), rows, losses=losses))
+        print(f"seed {seed}:", *(f"{row.name} {row.value:.4g} {row.unit};" for row in rows_of(outcomes[-1:]) if not row.part), flush=True)
         if options.pictures is not None:
-            draw_overlay(options.pictures / f"{options.name}_seed_{seed}.png", outcomes[-1].overlay, 1 + MODELS)
-    print_rows(Console(), "", "photographs", rows_of(outcomes))
-
-
-def _line(seed: int, outcome: TrainingOutcome) -> str:
-    """Summary of a seed, as a line."""
-    trained, real = outcome.trained, outcome.real
-    return (
-        f"seed {seed}: {trained.views} views, {trained.samples} samples, {trained.seconds:.1f} s (stream {trained.stream_seconds:.1f}); "
-        f"loss {trained.losses[0]:.3f} to {trained.losses[-1]:.3f}; mIoU {real.mean_iou:.3f} (synthetic "
-        f"{outcome.synthetic.mean_iou:.3f}), found {100 * real.found:.0f} %, background {100 * real.background:.1f} %"
-    )
-
-
-def by_seed(outcomes: list[TrainingOutcome]) -> list[dict[str, Any]]:
-    """Scores and facts of each seed, for JSON."""
-    real = [{name: getattr(one.real, name) for name in ("mean_iou", "found", "background", "instances")} for one in outcomes]
-    facts = ("losses", "seconds", "stream_seconds", "views", "samples")
-    return [
-        scores | {"synthetic_mean_iou": one.synthetic.mean_iou} | {name: getattr(one.trained, name) for name in facts}
-        for scores, one in zip(real, outcomes, strict=True)
-    ]
+            draw_overlay(options.pictures / f"real_seed_{seed}.png", outcomes[-1].overlay, 1 + MODELS)
+    print_rows(Console(), "", "photographs", rows)
 
 
 def make_options() -> argparse.ArgumentParser:

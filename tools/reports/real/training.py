@@ -1,8 +1,11 @@
-"""Training of a segmentation network from a pool of views, with augmentation, by cross entropy and soft Dice.
+"""Training of a segmentation network on views of a stream, with augmentation, by cross entropy and soft Dice.
+
+Experience replay (Lin, 1992): views are copied to a pool on the device, from which batches are drawn. Views of one batch of a stream show
+few piles; batches from a pool mix many, and each view is trained on several times.
 
 The network is a residual U-Net (Zhang et al., GRSL 2018), from scratch. AdamW with a warm-up and a cosine schedule, mixed precision
-(bfloat16) on a GPU. Augmentation is geometric (scale,
-rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation, gamma, blur, noise, JPEG), each image by its own draw.
+(bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation,
+gamma, blur, noise, JPEG), each image by its own draw.
 """
 
 from __future__ import annotations
@@ -10,7 +13,8 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -19,8 +23,7 @@ from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
 from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
-from tools.examples.train_online import LEARNING_RATE, WARM_UP
-from tools.reports.real.views import ViewPool, ViewSource
+from tools.examples.train_online import LEARNING_RATE, schedule
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
@@ -32,8 +35,6 @@ BLOCK = 8
 """Side of a JPEG block [px]."""
 DEPTHS = (2, 3, 4, 3)
 """Residual blocks of each level of the network."""
-LEAST_RATE = 0.01
-"""Fraction of the learning rate at which the schedule ends."""
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
 FIRST = 0.125
@@ -53,12 +54,12 @@ class Recipe:
     passes: float
     """Number of epochs."""
     batch: int
-    width: int
-    """Channels of the network's first level."""
     seconds: float
     """Time limit of rendering and training together [s], by which the schedule ends. Compilation comes before."""
     capacity: int
     """Views in the pool, at most."""
+    width: int = 64
+    """Channels of the network's first level."""
     scale: float = 1.5
     """Largest scale factor; the smallest is its reciprocal."""
     rotation: float = 15.0
@@ -75,6 +76,71 @@ class Recipe:
     """End of the stage with images of half the size, as a fraction of the schedule (progressive resizing)."""
     crop: float = 0.5
     """Side length of random crops in the rest of the schedule, as a fraction of the image's; 1: whole images."""
+
+
+@dataclass(eq=False)
+class ViewPool:
+    """Replay buffer of views on the device; once full, new ones replace random ones.
+
+    Attributes:
+        images: (N, 3, H, W) uint8.
+        classes: obj_ids (N, H, W) uint8.
+    """
+
+    capacity: int
+    seed: int
+    count: int = 0
+    """Views in the pool."""
+    seen: int = 0
+    """Views that have been added."""
+    seconds: float = 0.0
+    """Time that the stream took."""
+    images: torch.Tensor | None = field(default=None, repr=False)
+    classes: torch.Tensor | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        self._random = torch.Generator().manual_seed(self.seed)
+
+    def add(self, images: torch.Tensor, classes: torch.Tensor) -> None:
+        """Copy views into the pool."""
+        if self.images is None or self.classes is None:
+            self.images = images.new_empty((self.capacity, *images.shape[1:]))
+            self.classes = classes.new_empty((self.capacity, *classes.shape[1:]))
+        new = min(len(images), self.capacity - self.count)
+        replaced = torch.randperm(self.count if new < len(images) else 0, generator=self._random)[: len(images) - new]
+        places = self._on_device(torch.cat((torch.arange(self.count, self.count + new), replaced)))
+        for kept, added in zip(self.tensors(), (images, classes), strict=True):
+            kept[places] = added[: len(places)]
+        self.count += new
+        self.seen += len(images)
+
+    def fill(self, batches: Iterator[tuple[torch.Tensor, torch.Tensor]], views: int, seconds: float = math.inf) -> bool:
+        """Add batches until `views` or more have been added in all; False: the stream ended, or `seconds` passed before."""
+        started = time.perf_counter()
+        while self.seen < views and time.perf_counter() - started < seconds:
+            batch = next(batches, None)
+            if batch is None:
+                break
+            self.add(*batch)
+        self.seconds += time.perf_counter() - started
+        return self.seen >= views
+
+    def draw(self, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Batch of random views, drawn with replacement: images (size, 3, H, W) uint8, obj_ids (size, H, W) int64."""
+        images, classes = self.tensors()
+        chosen = self._on_device(torch.randint(self.count, (size,), generator=self._random))
+        return images[chosen], classes[chosen].long()
+
+    def _on_device(self, places: torch.Tensor) -> torch.Tensor:
+        """Copy of indices on the device of the pool, for which the host does not wait."""
+        device = self.tensors()[0].device
+        return places.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else places
+
+    def tensors(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Images and obj_ids of all places, of which the first `count` are filled; the pool must have views."""
+        assert self.images is not None
+        assert self.classes is not None
+        return self.images, self.classes
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,8 +336,7 @@ class _Trainer:
     def step(self, pool: ViewPool) -> None:
         """Train on a batch drawn from the pool, in mixed precision, and append its loss to `losses`."""
         done = self.progress
-        factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * min(1.0, (done - WARM_UP) / (1 - WARM_UP)))
-        self.optimizer.param_groups[0]["lr"] = self.recipe.rate * max(factor, LEAST_RATE)
+        self.optimizer.param_groups[0]["lr"] = self.recipe.rate * schedule(done)
         images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, done)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.network(images.contiguous(memory_format=torch.channels_last))
@@ -283,14 +348,15 @@ class _Trainer:
         self.losses.append(loss.detach())
 
 
-def train(source: ViewSource, recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
+def train(batches: Generator[tuple[torch.Tensor, torch.Tensor]], recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
     """Train a network on views of a stream. Training starts when a first part of the pool is filled; the rest is filled during training.
+
+    `batches`: images (B, 3, H, W) and obj_ids (B, H, W) uint8 of the stream; a batch is valid until the next one.
 
     Raises:
         SynpickError: Settings, models or lights cannot be used.
     """
     pool, trainer = ViewPool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
-    batches = source.batches(recipe.views)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
     first, pace = pool.seen, min(PACE, recipe.passes)
     trainer.waited = time.perf_counter() - trainer.started
