@@ -24,7 +24,7 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.system.hardware.device import pick_device
 from tools.bench.bakes import measure_steady, measure_trajectories
-from tools.bench.online import measure_environment, measure_picks
+from tools.bench.online import measure_environment
 from tools.bench.peers import PEERS, check_installed, measure_peers
 from tools.bench.pictures import measure_pictures
 from tools.bench.run import Bench
@@ -54,7 +54,6 @@ OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[MeasuredRow]]] = {
     "patches": measure_patches,
     "heaps": measure_heaps,
     "environment": measure_environment,
-    "picks": measure_picks,
 }
 """Parts that build worlds of their own, in the order in which they are measured."""
 DEFAULT_PARTS = (*SHARED_PARTS, "steady")

@@ -1,4 +1,4 @@
-"""Parts of what trains without files: the online stream beside the bare renderer, steps of the environment, grasp trials."""
+"""Parts of what trains without files: the online stream beside the bare renderer, and steps of the environment."""
 
 from __future__ import annotations
 
@@ -13,18 +13,15 @@ from synpick_warp.codes import Phase
 from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.environment.settings import make_choice
-from synpick_warp.factory.assembly import Factory, Stages, build_stages
+from synpick_warp.factory.assembly import Factory, Stages
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.picks import PickEngine, count_batch
 from synpick_warp.online.selection import Selection
 from synpick_warp.online.stream import Producer, ViewStream
-from synpick_warp.stages import timing
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
-from synpick_warp.stages.sim.choices import ChoiceReader, ChoiceRecorder
-from synpick_warp.stages.stream import TickReport, read_tick
+from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from tools.bench.run import Bench
@@ -218,47 +215,3 @@ def _sample(environment: PickingEnvironment, random: np.random.Generator) -> np.
         across = random.uniform(-SPREAD, SPREAD, (count, 2))
         return np.concatenate([across, np.full((count, 1), HEIGHT), np.tile([0.0, 0.0, 1.0], (count, 1))], axis=1)
     return random.uniform(-1.0, 1.0, (count, 6))
-
-
-# ---- picks ----
-
-
-def measure_picks(bench: Bench) -> Iterator[MeasuredRow]:
-    """Labels and world-steps per second of grasp trials, and where time goes.
-
-    As many states of first attempts as a batch of a bake has are saved, and their trials run twice; the second run is measured.
-    """
-    device, bake = bench.device, bench.config.bake
-    stages = build_stages(bench.config.with_values({"bake.mode": "pick"}), device, SilentProgress(), range(bake.worlds))
-    simulation, engine = stages.simulation, PickEngine(stages)
-    worlds, physics = engine.simulation.layout.worlds, stages.config.physics
-    batch = count_batch(engine.config.picks, bake.worlds, worlds)
-    recorder = ChoiceRecorder(simulation, stages.config.picks.states, batch + simulation.layout.worlds)
-    reader, choices = ChoiceReader(recorder, len(stages.catalog)), []
-    while len(choices) < batch:
-        simulation.tick()
-        choices += reader.read(read_tick(simulation.record))
-    yield MeasuredRow("worlds", worlds, "")
-    yield MeasuredRow("size of a state", 1e-3 * recorder.ring.words.shape[1] * 4, "kB, without contacts")
-    started = time.perf_counter()
-    engine.run(recorder.ring, choices)
-    yield MeasuredRow("first run, which loads kernels", time.perf_counter() - started, "s")
-    with timing.record() as times:
-        started = time.perf_counter()
-        batches = engine.run(recorder.ring, choices)
-        wp.synchronize_device(device)
-        seconds = time.perf_counter() - started
-    duration, success, hits = (np.concatenate([one.trials[name] for one in batches]) for name in ("duration", "success", "hits"))
-    ticks = sum(stage.calls for path, stage in times.times.items() if path[-1] == "judge")
-    yield MeasuredRow("states", len(choices), "")
-    yield MeasuredRow("labels", len(duration), "")
-    yield MeasuredRow("labels/s", len(duration) / seconds, "1/s")
-    yield MeasuredRow("world-steps", ticks * physics.steps_per_tick * worlds / seconds, "1/s")
-    yield MeasuredRow("world-steps that trials need", duration.sum() / physics.step / seconds, "1/s")
-    yield MeasuredRow("ticks of a trial", duration.mean() / physics.tick_time, "")
-    yield MeasuredRow("ticks of a success", duration[success].mean() / physics.tick_time, "")
-    yield MeasuredRow("successes", 100.0 * success.mean(), "%")
-    yield MeasuredRow("trials that hit nothing", 100.0 * (hits == 0).mean(), "%")
-    for path, stage in times.times.items():
-        if len(path) < 4:
-            yield MeasuredRow("time: " + ": ".join(path), stage.device if device.is_cuda else stage.host, "s")

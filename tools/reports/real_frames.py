@@ -15,6 +15,7 @@ import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,6 @@ CENTER = 0.5
 """Centre of the first pixel in our coordinates, where the frames have 0 [px]."""
 _MILLIMETRES = 1e3
 """In a metre."""
-_PARTS = {"color": "rgb", "depth": "depth"}
-"""Images of a frame, and the folders of BOP that they become a file of."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +143,8 @@ def write_data_set(folder: Path, models: Path, out: Path) -> Path:
         fx, fy, cx, cy = frames[0].intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         camera = {"width": width, "height": height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": DEPTH_SCALE}
         _write_json(out / "camera.json", camera)
-        for sequence in sorted({frame.sequence for frame in frames}):
-            _write_annotations([frame for frame in frames if frame.sequence == sequence], _scene_folder(out, sequence))
-        for frame in frames:
-            for part, kind in _PARTS.items():
-                target = _scene_folder(out, frame.sequence) / kind / f"{frame.image:06d}.png"
-                target.parent.mkdir(exist_ok=True)
-                shutil.copyfile(folder / f"{frame.name}-{part}.png", target)
-        _write_masks(frames, out)
+        for sequence, group in groupby(frames, lambda frame: frame.sequence):
+            _write_scene(folder, list(group), out / SPLIT / f"{sequence:06d}")
         targets = [
             {"scene_id": frame.sequence, "im_id": frame.image, "obj_id": index, "inst_count": 1}
             for frame in frames
@@ -159,10 +152,6 @@ def write_data_set(folder: Path, models: Path, out: Path) -> Path:
         ]
         _write_json(out / "test_targets_bop19.json", targets)
     return out
-
-
-def _scene_folder(out: Path, sequence: int) -> Path:
-    return out / SPLIT / f"{sequence:06d}"
 
 
 def _write_json(path: Path, content: Any) -> None:
@@ -184,11 +173,15 @@ def _copy_models(models: Path, object_ids: Sequence[int], out: Path) -> None:
                 shutil.copyfile(source, out / name / source.name)
 
 
-def _write_annotations(frames: Sequence[RealFrame], scene: Path) -> None:
-    """Write scene_camera.json and scene_gt.json; an object's `instance_id` is its place in the sequence's first frame."""
-    cameras, truth = {}, {}
+def _write_scene(folder: Path, frames: Sequence[RealFrame], scene: Path) -> None:
+    """Write images, both kinds of masks, and annotations of a sequence; an object's `instance_id` is its place in the first frame."""
+    for kind in ("rgb", "depth", "mask", "mask_visib"):
+        (scene / kind).mkdir(parents=True)
     instances = {index: instance for instance, index in enumerate(frames[0].object_ids)}
+    cameras, truth, infos = {}, {}, {}
     for frame in frames:
+        for part, kind in (("color", "rgb"), ("depth", "depth")):
+            shutil.copyfile(folder / f"{frame.name}-{part}.png", scene / kind / f"{frame.image:06d}.png")
         cameras[frame.image] = {
             "cam_K": frame.intrinsics.ravel().tolist(),
             "depth_scale": DEPTH_SCALE,
@@ -206,26 +199,18 @@ def _write_annotations(frames: Sequence[RealFrame], scene: Path) -> None:
         ]
     _write_json(scene / "scene_camera.json", cameras)
     _write_json(scene / "scene_gt.json", truth)
-
-
-def _write_masks(frames: Sequence[RealFrame], out: Path) -> None:
-    """Write both kinds of masks, and scene_gt_info.json as measured in them."""
-    renderer = ObjectRenderer(Layout(out))
-    infos: dict[int, dict[int, list[dict[str, Any]]]] = {}
+    renderer = ObjectRenderer(Layout(scene.parents[1]))
     for frame in frames:
-        scene = _scene_folder(out, frame.sequence)
-        visible = [frame.mask(index) for index in range(len(frame.object_ids))]
-        amodal = [_render_silhouette(renderer, frame, index) for index in range(len(frame.object_ids))]
+        count = range(len(frame.object_ids))
+        visible, amodal = [frame.mask(index) for index in count], [_render_silhouette(renderer, frame, index) for index in count]
         for kind, masks in (("mask", amodal), ("mask_visib", visible)):
-            (scene / kind).mkdir(exist_ok=True)
             for index, mask in enumerate(masks):
                 cv2.imwrite(str(scene / kind / f"{frame.image:06d}_{index:06d}.png"), np.uint8(255) * mask.astype(np.uint8))
-        entries = measure_info(visible, amodal)
-        for entry, mask in zip(entries, amodal, strict=True):
-            entry["px_count_valid"] = int(np.count_nonzero(mask & (frame.depth > 0)))
-        infos.setdefault(frame.sequence, {})[frame.image] = entries
-    for sequence, content in infos.items():
-        _write_json(_scene_folder(out, sequence) / "scene_gt_info.json", content)
+        infos[frame.image] = [
+            entry | {"px_count_valid": int(np.count_nonzero(mask & (frame.depth > 0)))}
+            for entry, mask in zip(measure_info(visible, amodal), amodal, strict=True)
+        ]
+    _write_json(scene / "scene_gt_info.json", infos)
 
 
 def _render_silhouette(renderer: ObjectRenderer, frame: RealFrame, index: int) -> np.ndarray:
