@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial, reduce
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -241,45 +241,40 @@ class Reading:
     """Bytes of device memory in use, by all processes; 0 on the CPU."""
 
 
+@dataclass(eq=False)
 class SteadyMeter(SilentProgress):
     """Progress observer that takes a reading after each tick of the steady state, and then stops the bake by SIGINT.
 
     It stops after `seconds` of readings, when no episode waits for a world any more, or when verification finds a damaged file.
     """
 
-    def __init__(
-        self,
-        seconds: float,
-        folder: Path,
-        steady_count: float,
-        worlds: int,
-        device: wp.Device,
-        cleaner: Cleaner | None = None,
-        counter: Callable[[], int] | None = None,
-        devices: int = 1,
-    ) -> None:
-        """
-        Args:
-            seconds: Time to measure [s].
-            folder: Where the bake writes.
-            steady_count: Steady-state threshold: views, or frames, of a device's tick.
-            worlds: Worlds of a device.
-            device: First device of the bake.
-            cleaner: Processes that verify and delete; None: there are none.
-            counter: Function that returns the number of frames so far; None: views are counted.
-            devices: Devices of the bake, with a process each if there are several.
-        """
-        self.seconds, self.folder, self.steady_count, self.worlds = seconds, folder, steady_count, worlds
-        self.device, self.cleaner, self.counter, self.devices = device, cleaner, counter, devices
-        self.ticks = 0
-        self._counts = deque([0], maxlen=devices)
+    seconds: float
+    """Time to measure [s]."""
+    folder: Path
+    """Where the bake writes."""
+    steady_count: float
+    """Steady-state threshold: views, or frames, of a device's tick."""
+    worlds: int
+    """Worlds of a device."""
+    device: wp.Device
+    """First device of the bake."""
+    cleaner: Cleaner | None = None
+    """Processes that verify and delete; None: there are none."""
+    counter: Callable[[], int] | None = None
+    """Function that returns the number of frames so far; None: views are counted."""
+    devices: int = 1
+    """Devices of the bake, with a process each if there are several."""
+    ticks: int = 0
+    first_count: float = 0.0
+    """Time to the first view or frame [s]."""
+    readings: list[Reading] = field(default_factory=list)
+    is_stopped: bool = False
+
+    def __post_init__(self) -> None:
+        self._counts = deque([0], maxlen=self.devices)
         # Devices with processes of their own leave this one without a CUDA context; each query of free memory would make one, for seconds.
-        _ = device.context
-        self.started = time.perf_counter()
-        self.first_count = 0.0
-        self.initial_disk = shutil.disk_usage(folder).used
-        self.readings: list[Reading] = []
-        self.is_stopped = False
+        _ = self.device.context
+        self.started, self.initial_disk = time.perf_counter(), shutil.disk_usage(self.folder).used
 
     def update(self, *, episodes_done: int, episodes: int, views: int, **_: Any) -> None:
         """Take a reading after each tick from the steady state on; interrupts the bake when it has measured long enough."""

@@ -48,15 +48,8 @@ class SensorScene:
     ) -> None:
         """Build the worlds of the first `count` views, which are ordered by world, then by camera.
 
-        Args:
-            render: Settings of the renderer.
-            catalog: Objects that the snapshot's catalog indices refer to.
-            fixtures: Tote, gripper shaft, cup.
-            cameras: Cameras with equal intrinsics, since the sensor uses the same rays for all views.
-            table: Height of the table [m], which is built if `render.table` is set.
-            snapshot: Poses of the worlds.
-            count: Count of views.
-            device: Device of both renderers.
+        Cameras have equal intrinsics, since the sensor uses the same rays for all views. `table`: height of the table [m], which is built
+        if `render.table` is set.
         """
         self.model, segment = _build_model(render, catalog, fixtures, table, snapshot, -(-count // len(cameras)), device)
         self.segment = np.array([*segment, Segment.NOTHING])

@@ -14,8 +14,8 @@ import itertools
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import warp as wp
 
@@ -42,38 +42,24 @@ ROUNDS = 5
 """Passes of each renderer; the renderers alternate, so that changes of the device's clock affect both."""
 
 
-@dataclass(frozen=True, eq=False)
-class KeptTick:
+class KeptTick(NamedTuple):
     """Copy of a tick's snapshot and batches of views, which stays valid while the simulation goes on."""
 
     snapshot: Snapshot
     batches: list[Any]
     """Its views in the batches of a bake, each a struct `Views`."""
 
-    @property
-    def views(self) -> int:
-        """Number of views of all batches."""
-        return sum(batch.count for batch in self.batches)
-
-
-class SavedHistory:
-    """Copy of a renderer's light histories on the device; empty if it keeps none."""
-
-    def __init__(self, renderer: Renderer) -> None:
-        history = light_history(renderer)
-        arrays = [] if history is None else [getattr(history, name) for name in LIGHT_HISTORY.specs]
-        self._pairs = [(array, wp.clone(array)) for array in arrays]
-
-    def restore(self) -> None:
-        """Write the saved copy back to the renderer's history."""
-        for array, saved in self._pairs:
-            wp.copy(array, saved)
-
 
 def light_history(renderer: Renderer) -> Any:
     """The struct `LightHistory` of a renderer; None: it keeps none."""
     shading = renderer.shading
     return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
+
+
+def _history_arrays(renderer: Renderer) -> list[wp.array]:
+    """Arrays of a renderer's light histories; none if it keeps none."""
+    history = light_history(renderer)
+    return [] if history is None else [getattr(history, name) for name in LIGHT_HISTORY.specs]
 
 
 def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
@@ -92,7 +78,7 @@ def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
     for _ in range(HISTORY_TICKS):
         render_ticks(stream, ring.renderer, [keep_tick(factory)])
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
-    views = sum(tick.views for tick in ticks)
+    views = sum(batch.count for tick in ticks for batch in tick.batches)
     wp.synchronize_device(stream.device)
     yield MeasuredRow(f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
     yield MeasuredRow("ticks in a pass", len(ticks), "")
@@ -149,13 +135,14 @@ def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick])
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:
     """Times of ROUNDS passes of each renderer [s], by its name, after a warm-up pass over the first tick."""
-    saved = {name: SavedHistory(renderer) for name, renderer in renderers.items()}
+    saved = {name: list(map(wp.clone, _history_arrays(renderer))) for name, renderer in renderers.items()}
     times: dict[str, list[float]] = {name: [] for name in renderers}
     for renderer in renderers.values():
         render_ticks(stream, renderer, ticks[:1])
     for _ in range(ROUNDS):
         for name, renderer in renderers.items():
-            saved[name].restore()
+            for array, copy in zip(_history_arrays(renderer), saved[name], strict=True):
+                wp.copy(array, copy)
             wp.synchronize_device(stream.device)
             started = time.perf_counter()
             render_ticks(stream, renderer, ticks)

@@ -185,12 +185,9 @@ def _measure_pile_steps(bench: Bench, simulation: Simulation) -> float:
 def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[MeasuredRow]:
     """Benchmark of ticks in which worlds pick, and of their perception.
 
-    Args:
-        simulation: Worlds in the middle of an attempt.
-        pile_seconds: Time of a tick's steps with the pile alone, for comparison [s]; 0: not measured.
+    `pile_seconds`: time of a tick's steps with the pile alone, for comparison [s]; 0: not measured.
     """
-    device, worlds = simulation.device, simulation.layout.worlds
-    reader = TickReader(simulation.record)
+    device, worlds, reader = simulation.device, simulation.layout.worlds, TickReader(simulation.record)
     perceptions, attached, acting = 0, 0, 0
     wp.synchronize_device(device)
     with timing.record() as recorder:

@@ -24,7 +24,8 @@ import trimesh
 
 from synpick_warp.configs.calibration.lens import LensMap, read_lens
 from synpick_warp.configs.files.load import load_config
-from tools.checks.measures import MeasuredValue, UnusableError, run_check
+from synpick_warp.errors import DatasetError
+from tools.checks.measures import MeasuredValue, run_check
 
 DEPTH_TOLERANCE = 0.2
 """Largest allowed difference between a depth image and the models [mm]."""
@@ -81,7 +82,7 @@ def cast_rays(corners: np.ndarray, matrix: np.ndarray, height: int, width: int, 
     its depth then is a·(b x c) over their sum.
     """
     if not (corners[..., 2] > 0).all():
-        raise UnusableError("an object reaches behind a camera; this check does not support that")
+        raise DatasetError("an object reaches behind a camera; this check does not support that")
     slope, beside = corners / corners[..., 2:], np.zeros((len(corners), 1))
     pixel = (slope @ matrix.T)[..., :2] - 0.5
     if lens is not None:
@@ -135,14 +136,14 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise UnusableError(f"cannot read {path}: {error}") from error
+        raise DatasetError(f"cannot read {path}: {error}") from error
 
 
 def read_image(path: Path) -> np.ndarray:
     """Read an image with its own depth and channels."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise UnusableError(f"cannot read {path}")
+        raise DatasetError(f"cannot read {path}")
     return image
 
 
@@ -152,7 +153,7 @@ def read_model(path: Path) -> np.ndarray:
     try:
         mesh = trimesh.load_mesh(path, process=False)
     except (OSError, ValueError) as error:
-        raise UnusableError(f"cannot read {path}: {error}") from error
+        raise DatasetError(f"cannot read {path}: {error}") from error
     return np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces)]
 
 
@@ -280,7 +281,7 @@ def check(dataset: Path, views: int) -> Report:
     """Check `views` views spread evenly over a data set."""
     scenes = sorted(path.parent for path in dataset.glob("[!.]*/*/scene_camera.json"))
     if not scenes:
-        raise UnusableError(f"{dataset} has no scene")
+        raise DatasetError(f"{dataset} has no scene")
     report = Report()
     cameras = count_cameras(dataset, scenes)
     order = [(scene, frame) for scene in scenes for frame in sorted(read_json(scene / "scene_gt.json"), key=int)]

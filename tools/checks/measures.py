@@ -10,11 +10,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from synpick_warp.errors import SynpickError
 from tools.options import fail, positive_count
-
-
-class UnusableError(Exception):
-    """The folder is not a data set that can be checked, or a file of it cannot be read."""
 
 
 @dataclass
@@ -71,14 +68,9 @@ def print_measures(measures: Iterable[MeasuredValue]) -> bool:
 def run_check(
     doc: str | None, samples: str, default: int, check: Callable[[Path, int], Mapping[str, MeasuredValue]], needed: Iterable[str]
 ) -> int:
-    """Run the command line of a check; returns the exit code.
+    """Run the command line of a check that takes `default` or other numbers of `samples`, such as "views"; returns the exit code.
 
-    Args:
-        doc: Docstring of the check, whose first line describes it.
-        samples: Name of what it takes samples of, such as "views".
-        default: Number of samples.
-        check: The check of a folder, with that many samples.
-        needed: Quantities without which nothing was checked.
+    Without values of the quantities `needed` nothing was checked.
     """
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     parser.add_argument("dataset", type=Path, metavar="DIR", help="folder of the data set")
@@ -87,8 +79,8 @@ def run_check(
     given = parser.parse_args()
     try:
         measures = check(given.dataset, given.count)
-    except UnusableError as error:
-        return fail(parser.prog, str(error))
+    except SynpickError as error:
+        return fail(parser.prog, error)
     held = print_measures(measures.values())
     missing = next((measures[name].name for name in needed if not measures[name].total), None)
     if missing is not None:

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 import zarr
 
-from tools.checks.measures import MeasuredValue, UnusableError, run_check
+from synpick_warp.errors import DatasetError
+from tools.checks.measures import MeasuredValue, run_check
 
 STORE = "trajectory.zarr"
 MAX_SPEED = 5.0
@@ -132,7 +133,7 @@ def check(dataset: Path, count: int) -> dict[str, MeasuredValue]:
         settings = tomllib.loads((dataset / "config.toml").read_text())
         names = sorted(store["episodes"].group_keys())  # type: ignore[union-attr]
     except (OSError, KeyError, ValueError) as error:
-        raise UnusableError(f"{dataset} has no trajectories and settings: {error}") from error
+        raise DatasetError(f"{dataset} has no trajectories and settings: {error}") from error
     measures: dict[str, MeasuredValue] = make_measures()
     root: dict[str, Any] = dict(store.attrs)
     # The diameter bounds the distance of an object's origin from its centre of mass.

@@ -116,13 +116,8 @@ class PictureDifference:
 
 
 def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> PictureDifference:
-    """Compare one output of two devices.
-
-    Args:
-        mode: Rendering mode.
-        output: Name of the output.
-        a: Image (view, row, column[, channel]), where a pixel differs if any of its channels does; or counts or boxes of any shape.
-        b: The same from the other device. NaN equals NaN.
+    """Compare one output of two devices: images (view, row, column[, channel]), where a pixel differs if any of its channels does, or
+    counts or boxes of any shape. NaN equals NaN.
     """
     tolerance = COLORS[mode] if output == "color" else TOLERANCES[output]
     if tolerance.difference is None:

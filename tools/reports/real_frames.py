@@ -123,12 +123,7 @@ def _image(path: Path) -> np.ndarray:
 
 
 def write_data_set(folder: Path, models: Path, out: Path) -> Path:
-    """Write the frames as a BOP data set, with the models of their objects; returns its folder `out`.
-
-    Args:
-        folder: Frames.
-        models: BOP models of the objects [mm].
-        out: Folder that does not exist.
+    """Write the frames of a folder as a BOP data set, with the BOP models of their objects [mm]; returns its folder `out`.
 
     Raises:
         DatasetError: A frame or a model is missing or damaged.

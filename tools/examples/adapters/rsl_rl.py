@@ -30,13 +30,7 @@ class RslRlEnv(VecEnv):
     """
 
     def __init__(self, env: PickingVectorEnv) -> None:
-        """
-        Args:
-            env: Environment with actions "point" or "twist", autoreset "same_step" and backend "torch".
-
-        Raises:
-            ConfigError: The environment has another action, autoreset or backend.
-        """
+        """Wrap an environment with action "point" or "twist", autoreset "same_step", backend "torch"; raises ConfigError for another."""
         choice = env.environment.choice
         if choice.action == PIXEL or choice.autoreset != SAME_STEP or choice.backend != TORCH:
             raise ConfigError(f'rsl_rl needs action "point" or "twist", autoreset "{SAME_STEP}" and backend "{TORCH}"')

@@ -18,14 +18,7 @@ class TorchRlEnv(GymWrapper):
     """TorchRL environment (`EnvBase`): tensors stay on the device, actions of pixels are categorical."""
 
     def __init__(self, env: PickingVectorEnv | None = None, **options: Any) -> None:
-        """
-        Args:
-            env: Environment with autoreset "disabled" and backend "torch".
-            options: Further arguments of `GymWrapper`.
-
-        Raises:
-            ConfigError: The environment has another autoreset or backend.
-        """
+        """Wrap an environment with autoreset "disabled" and backend "torch" by `GymWrapper`; raises ConfigError for another."""
         if env is not None:
             choice = env.environment.choice
             if choice.autoreset != DISABLED or choice.backend != TORCH:

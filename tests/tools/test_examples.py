@@ -1,4 +1,5 @@
-"""The picker on drawn boxes whose tops are flat in the middle alone; skipped without PyTorch."""
+"""Examples of training: a network on the stream of tiny boxes; the picker on drawn boxes whose tops are flat in the middle alone. Skipped
+without PyTorch."""
 
 from __future__ import annotations
 
@@ -8,10 +9,12 @@ import pytest
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.settings import make_choice
-from tests.builders import PICKING, boxes
+from tests.builders import PICKING, assignments, boxes
+from tests.online.conftest import TINY
 from tests.worlds.small_worlds import QUICK
 
 torch = pytest.importorskip("torch", exc_type=ImportError)
+train_online = pytest.importorskip("tools.examples.train_online", exc_type=ImportError)
 picker = pytest.importorskip("tools.examples.train_picker", exc_type=ImportError)
 
 SIZE = (32, 56)
@@ -25,6 +28,56 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
+
+
+@pytest.mark.parametrize(
+    ("example", "arguments", "said"),
+    [
+        (train_online, ["--device", "cuda:99"], "cuda:99 was requested"),
+        (train_online, ["--device", "gpu"], 'bake.device is "gpu"'),
+        (train_online, ["--resolution", "16x4"], "--resolution is 16x4; allowed: at least 8 px on each side"),
+        (train_online, ["--models", "/nowhere"], "/nowhere"),
+        (train_online, ["--set", "bake.world=3"], "did you mean worlds"),
+        (picker, ["train", "/nowhere"], "/nowhere"),
+        (picker, ["run", "--picker", "/nowhere.pt"], "/nowhere.pt is no picker"),
+        (picker, ["run", "--device", "gpu"], 'bake.device is "gpu"'),
+    ],
+)
+def test_a_mistake_is_one_line(capsys, example, arguments, said):
+    assert example.main([*arguments, *(() if "--device" in arguments else ("--device", "cpu"))]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"{example.__name__.rpartition('.')[2]}: ")
+    assert said in line
+
+
+# ---- the stream ----
+
+
+def test_a_network_learns_from_the_stream(capsys):
+    given = QUICK | TINY | {"bake.mode": "move", "arrangement.volume": 3e-4}
+    chosen = assignments({key: value for key, value in given.items() if key not in ("bake.device", "bake.worlds")})
+    small = ["--device", "cpu", "--worlds", "2", "--resolution", "48x27", "--batch", "3", "--width", "8", "--stride", "1"]
+    options = train_online.parse([*small, *chosen, "--held-out", "6", "--views", "6,24,96"])
+    with boxes():
+        results = train_online.run(options, torch.device("cpu"))
+    assert all(0 <= value <= 1 for value in results)
+    said = capsys.readouterr().out.splitlines()
+    assert len(results) == 3
+    assert said[0] == "held out: 6 views, obj_id up to 3"
+    assert [line.split()[0] for line in said[1:]] == ["6", "24", "96"]
+    first, last = (float(word) for word in said[-1].split("cross entropy ")[1].split(",")[0].split(" to "))
+    assert last < 0.9 * first
+
+
+@pytest.mark.parametrize("arguments", [["--views", "0"], ["--views", "abc"], ["--held-out", "0"], ["--stride", "0"], ["--width", "0"]])
+def test_numbers_are_positive(capsys, arguments):
+    with pytest.raises(SystemExit) as ended:
+        train_online.main(arguments)
+    assert ended.value.code == 2
+    assert "is no count; allowed: 1 to" in capsys.readouterr().err
+
+
+# ---- the picker ----
 
 
 def draw_samples(states: int, tried: int = 40):
@@ -58,21 +111,6 @@ def test_normals_of_a_plane_are_its_own():
     x = np.arange(-28, 28) / 2000.0
     depth = torch.from_numpy(np.tile(1.0 + np.tan(np.radians(30.0)) * x, (32, 1)).astype(np.float32))[None]
     np.testing.assert_allclose(picker.find_normals(depth, 2000.0)[0, :, 16, 28].numpy(), [0.5, 0.0, -np.sqrt(0.75)], atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["train", "/nowhere"], "/nowhere"),
-        (["run", "--picker", "/nowhere.pt"], "/nowhere.pt is no picker"),
-        (["run", "--device", "gpu"], 'bake.device is "gpu"'),
-    ],
-)
-def test_a_mistake_is_one_line(capsys, arguments, said):
-    assert picker.main([*arguments, *(() if "--device" in arguments else ("--device", "cpu"))]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("train_picker: ")
-    assert said in line
 
 
 class Middle(torch.nn.Module):
