@@ -125,7 +125,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert {row["part"] for row in rows} == {"setup", *bench.DEFAULT_PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
-    for name in ("views, all stages", "picking, steps alone", "perception and planning: fraction of simulation and rendering"):
+    for name in ("views, all stages", "picking, steps alone", "perception and planning: fraction of the simulation's time"):
         assert name in printed
 
 

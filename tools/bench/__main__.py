@@ -131,13 +131,11 @@ def _config(options: argparse.Namespace) -> Config:
 
 
 def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[MeasuredRow]:
-    """Measure the parts, which may be in any order, then the peers; yields rows as they arrive, and keeps their values in `bench`."""
+    """Measure the parts, which may be in any order, then the peers; rows come as they are measured."""
     runs: list[Iterator[MeasuredRow]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
     runs += [of_part(part, make(bench)) for part, make in OWN_PARTS.items() if part in parts]
     runs += [measure_peers(bench, peers)] if peers else []
-    for row in itertools.chain.from_iterable(runs):
-        bench.values[row.name] = row.value
-        yield row
+    return itertools.chain.from_iterable(runs)
 
 
 if __name__ == "__main__":

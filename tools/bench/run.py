@@ -6,7 +6,7 @@ import contextlib
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from unittest import mock
 
 import warp as wp
@@ -30,7 +30,7 @@ SPARE_EPISODES = 16
 
 @dataclass(eq=False)
 class Bench:
-    """Run of the benchmark: its settings and options, and what its parts have measured so far."""
+    """Run of the benchmark: its settings and options."""
 
     config: Config
     seconds: float
@@ -41,8 +41,6 @@ class Bench:
     """Ticks simulated before the part pictures."""
     instances: tuple[int, ...] = ()
     """Numbers of like parts that the part growth measures, instead of its factors."""
-    values: dict[str, float] = field(default_factory=dict)
-    """Value of each row so far, by name."""
 
     @property
     def device(self) -> wp.Device:

@@ -62,7 +62,6 @@ def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[MeasuredRow
         yield from of_part("render", _measure_rendering(bench, factory))
     if "encode" in parts:
         yield from of_part("encode", _measure_encoding(bench, factory))
-    yield from _perception_fraction(bench)
     if "stream" in parts:
         yield from of_part("stream", measure_stream(bench, factory, _mark_live(simulation, simulation.layout.worlds)))
     yield _memory_in_use(device)
@@ -241,16 +240,6 @@ def measure_perception(perception: Perception, snapshot: Snapshot, device: wp.De
     for name, path in (*zip(names, names, strict=True), (graph, f"{names[-1]}: {graph}")):
         yield MeasuredRow(f"a view: {name}", 1e3 * seconds[path] / views, "ms")
     yield MeasuredRow("a view", 1e3 * sum(map(seconds.__getitem__, names)) / views, "ms")
-
-
-def _perception_fraction(bench: Bench) -> Iterator[MeasuredRow]:
-    """Fraction of perception and planning in a tick in which all worlds pick and are rendered, if all of these were measured."""
-    names = ("perception and planning, a tick", "picking: a step of all worlds", "views, all stages")
-    perceive, step, rate = map(bench.values.get, names)
-    if perceive is not None and step and rate:
-        render = 1e3 * bench.config.bake.worlds * len(bench.config.rig) / rate
-        fraction = perceive / (step * bench.config.physics.steps_per_tick + render)
-        yield MeasuredRow("perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%", part="perception")
 
 
 # ---- rendering and encoders ----
