@@ -269,6 +269,12 @@ def symmetry(*matrix: float) -> Plant:
     return whole(MODELS, lambda content: content["7"].update(symmetries_discrete=[list(matrix)]))
 
 
+def camera_turned(content: dict[str, Any]) -> None:
+    """The camera is turned by 90° about its optical axis."""
+    right, down, forward = np.reshape(content["1"]["cam_R_w2c"], (3, 3)).tolist()
+    content["1"]["cam_R_w2c"] = [*(-value for value in down), *right, *forward]
+
+
 def shard_without_a_mask(folder: Path) -> None:
     path, kept = folder / SHARD, []
     with tarfile.open(path) as tar:
@@ -301,6 +307,7 @@ SETS: Faults = {
     "wrong target count": ("target-counts", "", put(TARGETS, 0, "inst_count", 9)),
     "camera missing": ("rig-complete", "", named("train/000002", "gone")),
     "camera moved": ("world-poses", "mm", put(CAMERA, "1", "cam_t_w2c", [0.0, 0.0, 1490.0])),
+    "camera turned": ("world-poses", " mm and 90° off", whole(CAMERA, camera_turned)),
     "shard missing": ("shard-index", "no shard-000000.tar", gone(SHARD)),
     "shard cut short": ("shard-files", "", raw(SHARD, lambda data: data[:5000])),
     "shard without a mask": ("mask-entries", "", shard_without_a_mask),

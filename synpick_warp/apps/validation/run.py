@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from synpick_warp.apps.validation.registry import Level, Tolerance, Violation, apply_rules
+from synpick_warp.apps.validation.rules.cross_file import RigSubject
 from synpick_warp.apps.validation.rules.models import ModelsFolder, ModelSubject
 from synpick_warp.apps.validation.rules.poses import DiagnosedView
-from synpick_warp.apps.validation.rules.sets import RigSubject
 from synpick_warp.apps.validation.rules.trials import PicksSubject
 from synpick_warp.apps.validation.scene_files import FolderScene, open_scene
 from synpick_warp.apps.validation.subjects import SceneSubject, TargetLists, TreeSubject, ViewSubject

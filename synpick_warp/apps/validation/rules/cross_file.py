@@ -1,4 +1,4 @@
-"""Rules about what belongs together: target lists and scenes, scenes of cameras that recorded at the same time, shards and their keys."""
+"""Rules that compare files with each other: target lists with scenes, scenes of cameras that recorded together, shards with their keys."""
 
 from __future__ import annotations
 
@@ -81,9 +81,10 @@ DISTANCE_TOLERANCE, ANGLE_TOLERANCE = 0.1, 1e-3
 
 @dataclass(frozen=True, eq=False)
 class RigSubject:
-    """Scenes of the cameras of one episode, or of the sensors of one scene."""
+    """Scenes recorded together: of the cameras of one episode, or of the sensors of one scene in the layout `multisensor`."""
 
     place: str
+    """Where violations are reported: the first scene."""
     scenes: tuple[SceneSubject, ...]
     cameras: int
     """Number of cameras that the rig has."""
@@ -115,9 +116,11 @@ def check_world_poses(rig: RigSubject) -> Findings:
                 pose = to_world @ _transform(item.cam_R_m2c, item.cam_t_m2c)
                 first, other = known.setdefault((image, int(item.instance_id)), (record.where(image), pose))
                 distance = float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
-                angle = float(np.linalg.norm(pose[:3, :3] - other[:3, :3]) / np.sqrt(2.0))
+                # The Frobenius norm of the difference of two rotations is 2 √2 sin(angle / 2).
+                sine = float(np.linalg.norm(pose[:3, :3] - other[:3, :3])) / np.sqrt(8.0)
+                angle = 2.0 * float(np.arcsin(min(sine, 1.0)))
                 if distance > DISTANCE_TOLERANCE or angle > ANGLE_TOLERANCE:
-                    off = f"{distance:.3g} mm and {np.degrees(min(angle, np.pi)):.2g}° off"
+                    off = f"{distance:.3g} mm and {np.degrees(angle):.2g}° off"
                     yield record.where(image), f"image {image}, instance {index}: its world pose is {off} that in {first}"
 
 
