@@ -281,8 +281,8 @@ def test_kernels_are_compared_by_source(tmp_path, old, new, verdict, detail):
     files = [tmp_path / name for name in ("old.json", "new.json")]
     for file, content in zip(files, (old, new), strict=True):
         file.write_text(json.dumps(content))
-    line = guard._compare_kernels("modules", *files)
-    assert (line.verdict, line.detail) == (verdict, detail)
+    result = guard._compare_kernels("modules", *files)
+    assert (result.verdict, result.detail) == (verdict, detail)
 
 
 def sides(tmp_path: Path) -> list[guard.Side]:
@@ -310,12 +310,12 @@ def test_texts_are_compared_without_times_and_progress(tmp_path, old, new, verdi
     step = Step("verify picks", ("verify", "picks"))
     for side, text in zip(both := sides(tmp_path), (old, new), strict=True):
         side.text_file(step).write_text(f"exit code 0\n{side.folder}/picks\n{text}\n")
-    (line,) = guard._compare_step(*both, step, ("commands",))
-    assert line.verdict == verdict
+    (result,) = guard._compare_step(*both, step, ("commands",))
+    assert result.verdict == verdict
     for side in both:  # A command that fails in both is not equal.
         side.text_file(step).write_text("exit code 2\nsynpick-warp: error: no\n")
-    (line,) = guard._compare_step(*both, step, ("commands",))
-    assert (line.verdict, line.detail) == ("failed", "old: exit code 2: synpick-warp: error: no")
+    (result,) = guard._compare_step(*both, step, ("commands",))
+    assert (result.verdict, result.detail) == ("failed", "old: exit code 2: synpick-warp: error: no")
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,17 @@
-"""Guard of a refactoring: two checkouts write, read and compile the same.
+"""Regression test for refactorings: runs the same commands in two checkouts, and compares files, printed text and generated kernels.
 
-Each part runs the commands of both checkouts in processes of their own, in equal folders, and prints a line for everything compared: equal,
-different with the first difference, or failed. Exits with 0 if all is equal, with 1 if something differs or has failed, with 2 if nothing
-can be compared.
+Each command runs in a process of its own, in folders of the same content, and a line is printed for everything compared: equal, different
+with the first difference, or failed. Exits with 0 if all is equal, with 1 if something differs or has failed, with 2 if nothing can be
+compared.
 
     python -m tools.compare guard OLD NEW                              # on the CPU: sets, commands, kernels
     python -m tools.compare guard OLD NEW --device cuda:0 --models DIR --lights DIR     # on a GPU: worlds, pictures
 
 - sets: six small data sets, every byte.
-- commands: what verifies, validates, counts, converts, estimates, scores and draws them: files and text, up to paths and times.
-- kernels: generated CUDA source of every kernel, up to its names, and of those of Newton that get our functions.
-- worlds: a digest of eight mixed episodes in 8 and in 512 worlds and, if there are two, on two GPUs.
-- pictures: the renderer's rate, in turns; the checkouts may differ by 1 %.
+- commands: verify, validate, stats, convert, estimate, eval, explain, preview, report: files and printed text, without paths and times.
+- kernels: generated CUDA source of every kernel without its names; of Newton's, those that call our functions.
+- worlds: a digest of eight episodes in mode mixed, in 8 and in 512 worlds and, if there are two, on two GPUs.
+- pictures: the rendering rate, measured alternately; NEW may be slower by 1 %.
 
 With `--work DIR` results are kept, by the content of the checkout: the next run repeats only what it lacks. Neither checkout needs git.
 """
@@ -47,21 +47,21 @@ from tools.options import fail, make_names_parser, make_parser, write_json
 CPU_PARTS = ("sets", "commands", "kernels")
 GPU_PARTS = ("worlds", "pictures")
 MAX_NAMED = 8
-"""Kernels that a line about different kernels shows."""
+"""Most changed kernels that are shown with their first difference."""
 PACKAGE_FOLDERS = ("synpick_warp", "kernels", "scenes", "configs")
 """Folders of a checkout on which results depend."""
 WORLDS = (8, 512)
 """World counts in which the same episodes are baked."""
 ROUNDS = 2
-"""Measurements of each checkout, in turns."""
+"""Measurements of each checkout, alternately."""
 PICTURE_WORLDS = 128
 """Worlds of these: four measurements take less than ten minutes."""
 TOLERANCE = 0.01
-"""How much slower pictures may become; they may become faster."""
+"""Fraction by which the rendering rate may fall; it may rise by any."""
 LEFT_OUT = ("config.toml", "manifest.json")
 """Files that differ with the number of worlds, or with the program's version."""
 _PROGRESS = re.compile(r"^(?: +\d+:\d\d  .*|\w+ [\d,]+/[\d,]+)\n", re.MULTILINE)
-"""Lines of progress, which come as time passes."""
+"""Progress lines, whose number depends on how long a command runs."""
 _TIMES = re.compile(
     r"(?<= poses in )[^\n]*|\b\d+:\d\d(?::\d\d)?\b|\b[\d.,]+(?= (?:views/s|s\b))|(?<=\"seconds_per_image\": )[\d.e-]+"
     r"|(?<=peak memory )[\d,]+(?= MiB)"
@@ -72,8 +72,8 @@ _LAST_COLUMN = re.compile(rb",[^,\n]*$", re.MULTILINE)
 _VERSION = re.compile(r'^__version__ = "([^"]+)"', re.MULTILINE)
 
 
-class Line(NamedTuple):
-    """Result of one comparison."""
+class ComparisonResult(NamedTuple):
+    """Result of one comparison, printed as a line."""
 
     part: str
     name: str
@@ -100,14 +100,14 @@ class Side:
         return match[1] if match else "unknown"
 
     def call(self, arguments: Sequence[str]) -> subprocess.CompletedProcess[str]:
-        """Run a Python command in the folder: with this checkout's code before all other places of packages, and a fixed width of text."""
+        """Run a Python command in the folder, with this checkout first on PYTHONPATH and a plain terminal of fixed width."""
         places = [str(self.checkout), *filter(None, [os.environ.get("PYTHONPATH")])]
         fixed = {"PYTHONPATH": os.pathsep.join(places), "COLUMNS": "160", "TERM": "dumb", "NO_COLOR": "1", "PYTHONUTF8": "1"}
         command = [sys.executable, *arguments]
         return subprocess.run(command, cwd=self.folder, env=os.environ | fixed, capture_output=True, text=True, check=False)
 
     def run(self, step: Step) -> None:
-        """Run a step, unless its text is there, which is written last: exit code, standard output and errors."""
+        """Run a step and save exit code, stdout and stderr. Skipped if that file exists: written last, it marks a finished step."""
         text = self.text_file(step)
         if text.exists():
             return
@@ -143,13 +143,13 @@ def main(arguments: list[str] | None = None) -> int:
         for side in sides:
             side.folder.mkdir(parents=True, exist_ok=True)
             (side.folder / guard_steps.SPLITS_FILE).write_text(guard_steps.SPLITS)
-        lines = []
-        for line in compare(sides[0], sides[1], options):
-            print(line, flush=True)
-            lines.append(line)
-    write_json(options.json, [line._asdict() for line in lines])
-    different = [line for line in lines if line.verdict != "equal"]
-    print(f"{len(lines) - len(different)} of {len(lines)} equal: {sides[0].checkout} and {sides[1].checkout}")
+        results = []
+        for result in compare(sides[0], sides[1], options):
+            print(result, flush=True)
+            results.append(result)
+    write_json(options.json, [result._asdict() for result in results])
+    different = [result for result in results if result.verdict != "equal"]
+    print(f"{len(results) - len(different)} of {len(results)} equal: {sides[0].checkout} and {sides[1].checkout}")
     return int(bool(different))
 
 
@@ -174,7 +174,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def _folder_names(checkouts: list[Path]) -> list[str]:
-    """Names of folders for the results of both checkouts: digests of all that these depend on, made different if they are not."""
+    """Folder names of both checkouts' results: a digest of everything that these depend on; for equal ones the second ends in -again."""
     names = []
     for checkout in checkouts:
         digest = hashlib.sha256(repr((wp.__version__, newton.__version__, np.__version__, sys.version)).encode())
@@ -187,7 +187,7 @@ def _folder_names(checkouts: list[Path]) -> list[str]:
     return names if names[0] != names[1] else [names[0], f"{names[1]}-again"]
 
 
-def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
+def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[ComparisonResult]:
     """Run and compare all parts that the options name; yields the results."""
     if set(options.parts) & set(CPU_PARTS):
         steps = list(cpu_steps(options.parts))
@@ -203,26 +203,26 @@ def compare(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]
         yield from compare_pictures(old, new, options)
 
 
-def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> Iterator[Line]:
+def _compare_step(old: Side, new: Side, step: Step, parts: tuple[str, ...]) -> Iterator[ComparisonResult]:
     """Compare what both checkouts wrote and printed in a step; yields the results."""
     baked = step.arguments[:1] == ("bake",)
     part = "sets" if baked else "commands" if step.arguments else "kernels"
     texts = [side.text(step) for side in (old, new)]
     for side, text in zip(("old", "new"), texts, strict=True):
         if not text.startswith("exit code 0\n"):
-            yield Line(part, step.name, "failed", f"{side}: {text.splitlines()[0]}: {text.splitlines()[-1]}")
+            yield ComparisonResult(part, step.name, "failed", f"{side}: {text.splitlines()[0]}: {text.splitlines()[-1]}")
             return
     if step.output and (part in parts):
         yield _compare_output(part, old, new, step.output)
     if "commands" in parts and step.arguments:
         difference = kernel_sources.first_difference([texts[0]], [texts[1]])
-        yield Line("commands", f"text of {step.name}", "different" if difference else "equal", difference)
+        yield ComparisonResult("commands", f"text of {step.name}", "different" if difference else "equal", difference)
     if "kernels" in parts and step.kernels:
         yield _compare_kernels(step.name, old.folder / step.kernels, new.folder / step.kernels)
 
 
-def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Line:
-    """Line about a file or folder that a step has written; estimates have no time, pages no version."""
+def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> ComparisonResult:
+    """Compare a file or folder that a step has written, without the column of times of a .csv file and the version in an .html page."""
     old, new = old_side.folder / name, new_side.folder / name
     if old.suffix:
         contents = [path.read_bytes() for path in (old, new)]
@@ -231,13 +231,13 @@ def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Lin
         if old.suffix == ".html":
             contents = [content.replace(side.version.encode(), b"") for content, side in zip(contents, (old_side, new_side), strict=True)]
         verdict = "equal" if contents[0] == contents[1] else "different"
-        return Line(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
+        return ComparisonResult(part, name, verdict, " and ".join(f"{len(content):,}" for content in contents) + " bytes")
     try:
         layers, difference = runs.compare(old, new)
     except DatasetError as error:
-        return Line(part, name, "failed", str(error))
+        return ComparisonResult(part, name, "failed", str(error))
     files, differing = (sum(getattr(layer, name) for layer in layers.values()) for name in ("files", "differing"))
-    return Line(
+    return ComparisonResult(
         part,
         old.name,
         "different" if difference else "equal",
@@ -245,8 +245,8 @@ def _compare_output(part: str, old_side: Side, new_side: Side, name: str) -> Lin
     )
 
 
-def _compare_kernels(name: str, old_file: Path, new_file: Path) -> Line:
-    """Line about the kernels of both checkouts, by key; a key that one of them lacks is looked for by its source."""
+def _compare_kernels(name: str, old_file: Path, new_file: Path) -> ComparisonResult:
+    """Compare the kernels of both checkouts by key; a key that one of them lacks is looked for by its source (renamed)."""
     old, new = (json.loads(path.read_text()) for path in (old_file, new_file))
     changed = [key for key in sorted(old.keys() & new.keys()) if old[key] != new[key]]
     added = {key: new[key] for key in sorted(new.keys() - old.keys())}
@@ -262,10 +262,10 @@ def _compare_kernels(name: str, old_file: Path, new_file: Path) -> Line:
     details += [f"{key}: {kernel_sources.first_difference(old[key], new[key])}" for key in changed[:MAX_NAMED]]
     details += [f"only old: {key}" for key in missing] + [f"only new: {key}" for key in added]
     details += [f"{key} is now {partner}" for key, partner in renamed.items()]
-    return Line("kernels", name, "different" if changed or missing or added else "equal", "; ".join(details))
+    return ComparisonResult("kernels", name, "different" if changed or missing or added else "equal", "; ".join(details))
 
 
-def compare_worlds(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
+def compare_worlds(old: Side, new: Side, options: argparse.Namespace) -> Iterator[ComparisonResult]:
     """Bake the same episodes in each number of worlds, and on two GPUs if there are two; all digests of both checkouts are one."""
     runs = [(options.device, worlds) for worlds in WORLDS]
     if wp.get_cuda_device_count() > 1:
@@ -276,11 +276,11 @@ def compare_worlds(old: Side, new: Side, options: argparse.Namespace) -> Iterato
             title, out = f"{name}, {worlds} worlds on {device}", f"worlds-{device.replace(':', '')}-{worlds}"
             command = ("-m", "synpick_warp", *mixed_episodes(device, worlds, out, options.models, options.lights))
             if failure := _run(side, command):
-                yield Line("worlds", title, "failed", failure)
+                yield ComparisonResult("worlds", title, "failed", failure)
                 continue
             digest = digest_folder(side.folder / out)
             expected = expected or digest
-            yield Line("worlds", title, "equal" if digest == expected else "different", digest)
+            yield ComparisonResult("worlds", title, "equal" if digest == expected else "different", digest)
 
 
 def digest_folder(folder: Path) -> str:
@@ -291,8 +291,8 @@ def digest_folder(folder: Path) -> str:
     return digest.hexdigest()[:16]
 
 
-def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Iterator[Line]:
-    """Measure the renderer's rate of both checkouts in turns, and compare the medians of all rows in views/s."""
+def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Iterator[ComparisonResult]:
+    """Measure the renderer's rate of both checkouts alternately, and compare the medians of all rows in views/s."""
     rates: dict[str, dict[str, list[float]]] = {"old": {}, "new": {}}
     fixed = ["--device", options.device, "--parts", "pictures", "--worlds", str(PICTURE_WORLDS)]
     fixed += [argument for name in ("models", "lights") if (folder := getattr(options, name)) for argument in (f"--{name}", folder)]
@@ -301,18 +301,18 @@ def compare_pictures(old: Side, new: Side, options: argparse.Namespace) -> Itera
             file = f"pictures-{turn}.json"
             command = ("-m", "tools.bench", *fixed, "--json", file)
             if failure := _run(side, command):
-                yield Line("pictures", f"{name}, turn {turn}", "failed", failure)
+                yield ComparisonResult("pictures", f"{name}, turn {turn}", "failed", failure)
                 return
             for row in json.loads((side.folder / file).read_text())["rows"]:
                 if row["unit"] == "1/s" and "median" in row["name"]:
                     rates[name].setdefault(row["name"], []).append(row["value"])
     if not rates["old"] or rates["old"].keys() != rates["new"].keys():
-        yield Line("pictures", "rows", "failed", f"{', '.join(rates['old']) or 'none'} and {', '.join(rates['new']) or 'none'}")
+        yield ComparisonResult("pictures", "rows", "failed", f"{', '.join(rates['old']) or 'none'} and {', '.join(rates['new']) or 'none'}")
     for row in rates["old"].keys() & rates["new"].keys():
         before, after = (statistics.median(rates[name][row]) for name in ("old", "new"))
         change = after / before - 1.0
         verdict = "equal" if change > -TOLERANCE else "different"
-        yield Line("pictures", row, verdict, f"{before:.1f} and {after:.1f} views/s, {100 * change:+.2f} %")
+        yield ComparisonResult("pictures", row, verdict, f"{before:.1f} and {after:.1f} views/s, {100 * change:+.2f} %")
 
 
 def _run(side: Side, arguments: tuple[str, ...]) -> str:

@@ -1,4 +1,5 @@
-"""Commands of the guard: six small data sets on the CPU, and all that reads them."""
+"""Commands that `tools.compare guard`, the regression test of two checkouts, runs: bakes of six small data sets on the CPU, the commands
+that read them, and the bake of its GPU part."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ SMALL: dict[str, object] = {
     "move.speed": 2.0,
     "settle.rest_ticks": 2,
 }
-"""Settings of all sets, beside those of the preset `smoke`: two worlds that are done after a few dozen frames."""
+"""Settings of all sets, on top of the preset `smoke`: two worlds whose episodes end after a few dozen frames."""
 PICKING: dict[str, object] = {
     "bake.mode": "cycle",
     "pick.speed": 4.0,
@@ -51,7 +52,7 @@ SETS: dict[str, dict[str, object]] = {
     "reference": {**TINY, "render.mode": "reference", "render.samples": 4, "bake.models": "smoke/models", "arrangement.fill": "within"},
     "unoccluded": {**PICKING, **TINY, "bake.formats": ["shards", "zarr"], "render.mode": "unoccluded", "bake.seed": 7},
 }
-"""Data set -> settings of its bake beside those of `SMALL`."""
+"""Data set -> settings of its bake, on top of `SMALL`."""
 SPLITS_FILE = "splits.toml"
 """File of settings that the guard writes before the bakes: `SPLITS`."""
 SPLITS = 'preset = "smoke"\n[splits.train]\nepisodes = 1\n[splits.test]\nepisodes = 1\nmode = "pick"\n'
@@ -60,12 +61,12 @@ SPLIT_SET = "unoccluded"
 CONVERSIONS = {"picks": "shards,usd,lerobot,coco,yolo", "smoke": "shards,coco", "unoccluded": "bop,usd,lerobot,coco"}
 """Data set -> formats that it is converted to."""
 RECORDED = ("bake all", "bake reference", "bake unoccluded", "estimate refine")
-"""Steps of which the kernels that they have loaded are compared."""
+"""Steps whose loaded kernels are compared."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A command of the guard, run in the folder of a checkout's results."""
+    """A command that is run with each checkout, in the folder of its results."""
 
     name: str
     """Unique name, under which its text is kept and reported."""
@@ -100,7 +101,7 @@ def cpu_steps(parts: tuple[str, ...]) -> Iterator[Step]:
 
 
 def _readers() -> Iterator[Step]:
-    """Yield the steps that read a data set, for people and for estimates."""
+    """Yield the steps that print, draw or evaluate a data set, or estimate poses from it."""
     yield Step("stats tables", ("stats", "picks", "--threads", "1", "--paper"))
     yield Step(
         "estimate single",
@@ -117,7 +118,7 @@ def _readers() -> Iterator[Step]:
 
 
 def mixed_episodes(device: str, worlds: int, out: str, models: str, lights: str) -> tuple[str, ...]:
-    """Arguments of a bake of eight short mixed episodes with all layers, on a GPU or several (joined by commas)."""
+    """Arguments of a bake of eight short episodes in mode `mixed` (each draws its task) with all layers, on GPUs (joined by commas)."""
     settings = {
         "bake.mode": "mixed",
         "bake.episodes": 8,
@@ -137,5 +138,5 @@ def mixed_episodes(device: str, worlds: int, out: str, models: str, lights: str)
 
 
 def _assignments(settings: dict[str, object]) -> tuple[str, ...]:
-    """Command-line options (--set NAME=VALUE) that make settings."""
+    """Command-line options (--set NAME=VALUE) for settings."""
     return tuple(part for name, value in settings.items() for part in ("--set", f"{name}={json.dumps(value)}"))

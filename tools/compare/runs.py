@@ -63,7 +63,7 @@ class LayerImages:
 
 
 def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
-    """Compare two folders; returns layers by name, and the first difference as one line (empty: none).
+    """Compare two folders; returns counts by type of file (`layer_of`), and the first difference as one line (empty: none).
 
     Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
 
