@@ -120,9 +120,9 @@ INFRARED = {"render__layers": ["depth_sensor", "ir_left"]}
         ((LENS,), {}, "Lenses.ray", []),
         ((DRAWN,), {}, "Lenses.ray", [(5, 180, 320)]),
         ((LENS, DRAWN), {}, "Lenses.ray", [(5, 180, 320)]),
-        ((), {}, "DressedSurfaces.recolor", []),
+        ((), {}, "RandomizedSurfaces.recolor", []),
         # Of 20 objects, 3 fixtures, table and background.
-        ((), {"randomize__lamps": 1}, "DressedSurfaces.recolor", [(5 * 25,)]),
+        ((), {"randomize__lamps": 1}, "RandomizedSurfaces.recolor", [(5 * 25,)]),
         # One cost volume for all views.
         ((), STEREO, "MatchingScratch.cost", [(1, 180, 320, 256)]),
         ((), STEREO | {"depth_sensor__max_disparity": 100.0}, "MatchingScratch.cost", [(1, 180, 320, 102)]),

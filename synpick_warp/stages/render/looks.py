@@ -16,8 +16,8 @@ from synpick_warp.configs.fields import settings_of
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
-from synpick_warp.kernels.render.lighting.materials import DressedSurfaces, Surfaces
-from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene, PathScene
+from synpick_warp.kernels.render.lighting.materials import RandomizedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, RandomizedScene
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -49,9 +49,9 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_TYPES = {name: DressedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
+_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
 _MATERIALS = StructArrays(
-    DressedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
+    RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )
 """... and all that the materials of views have."""
 
@@ -119,7 +119,7 @@ def materials_of_view(instances: int, background: bool = True) -> int:
 
 
 def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
-    """Allocate the members of the struct `DressedSurfaces` that materials have, for a number of these and of mip levels."""
+    """Allocate the members of the struct `RandomizedSurfaces` that materials have, for a number of these and of mip levels."""
     return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
 
 
@@ -145,7 +145,7 @@ class Dresser:
             else:
                 setattr(surfaces, name, values)
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
-        paths = DressedScene()
+        paths = RandomizedScene()
         for name in PathScene.vars:
             setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
         self.scene = replace(scene, surfaces=surfaces, paths=paths)

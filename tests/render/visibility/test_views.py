@@ -6,7 +6,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.lighting.materials import AnySurfaces, DressedSurfaces, Surfaces, material_of
+from synpick_warp.kernels.render.lighting.materials import AnySurfaces, RandomizedSurfaces, Surfaces, material_of
 from synpick_warp.kernels.render.visibility.camera import (
     AnyViews,
     CameraTable,
@@ -173,14 +173,14 @@ def read_rows_kernel(surfaces: AnySurfaces, views: AnyViews, rows_out: wp.array[
     [
         (Surfaces, Views, [-1, MESH]),
         (Surfaces, LensViews, [LENS, MESH]),
-        (DressedSurfaces, Views, [-1, ROW]),
-        (DressedSurfaces, LensViews, [LENS, ROW]),
+        (RandomizedSurfaces, Views, [-1, ROW]),
+        (RandomizedSurfaces, LensViews, [LENS, ROW]),
     ],
 )
 def test_structs_of_the_arguments_choose_the_kernel(surfaces, views, rows, device):
     arguments = [surfaces(), views(), wp.zeros(2, dtype=wp.int32, device=device)]
     arguments[1].cameras.lens = wp.full(1, LENS, dtype=wp.int32, device=device)
-    if surfaces is DressedSurfaces:
+    if surfaces is RandomizedSurfaces:
         arguments[0].row = wp.full((1, 1), ROW, dtype=wp.int32, device=device)
     wp.launch(kernel_for(read_rows_kernel, *arguments), dim=1, inputs=arguments, device=device)
     assert arguments[2].numpy().tolist() == rows
@@ -188,4 +188,4 @@ def test_structs_of_the_arguments_choose_the_kernel(surfaces, views, rows, devic
 
 def test_plain_structs_have_nothing_of_looks():
     """Known: a cell without looks has neither the rows nor the code that reads them."""
-    assert set(DressedSurfaces.vars) - set(Surfaces.vars) == {"row", "recolor", "repeats"}
+    assert set(RandomizedSurfaces.vars) - set(Surfaces.vars) == {"row", "recolor", "repeats"}

@@ -9,7 +9,7 @@ from synpick_warp.kernels.render.lighting.environment import (
     sh_irradiance,
 )
 from synpick_warp.kernels.render.lighting.materials import Surface, map_table, sample_base_color
-from synpick_warp.kernels.render.lighting.paths.tracing import DressedScene
+from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -23,7 +23,7 @@ HORIZON = wp.constant(0.02)
 
 @wp.func
 def floor_radiance(
-    scene: DressedScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
+    scene: RandomizedScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
 ) -> wp.vec3:
     """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
     light.
@@ -43,7 +43,7 @@ def floor_radiance(
 @kernel_of_views
 def shade_floor_kernel(
     # Scene:
-    scene: DressedScene,
+    scene: RandomizedScene,
     grid: ImageGrid,
     drop: float,
     # State:

@@ -8,7 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
-from synpick_warp.kernels.render.lighting.materials import DressedSurfaces
+from synpick_warp.kernels.render.lighting.materials import RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -64,15 +64,15 @@ class DrawnMaterial:
     metallic: float
     roughness: float
     recolor: wp.mat33
-    """As in `DressedSurfaces`."""
+    """As in `RandomizedSurfaces`."""
     texture: int
-    """Row of `DressedSurfaces` whose texture it has."""
+    """Row of `RandomizedSurfaces` whose texture it has."""
     repeats: float
-    """As in `DressedSurfaces`."""
+    """As in `RandomizedSurfaces`."""
 
 
 @wp.func
-def draw_material(table: LookTable, surfaces: DressedSurfaces, base: int, key: wp.uint64, part: int) -> DrawnMaterial:
+def draw_material(table: LookTable, surfaces: RandomizedSurfaces, base: int, key: wp.uint64, part: int) -> DrawnMaterial:
     """Change material `base` by what is drawn for a part; of part -1 nothing is."""
     result = DrawnMaterial()
     result.color = surfaces.color[base]
@@ -110,12 +110,12 @@ def dress_bodies_kernel(
     views: AnyViews,
     bodies: ViewBodies,
     first_row: int,
-    surfaces_inout: DressedSurfaces,
+    surfaces_inout: RandomizedSurfaces,
 ):
     """Materials of the bodies of each view, of its table and of its background: those of their meshes, changed by what the episode draws.
 
-    `first_row`: row of `DressedSurfaces` of the first view's first body; the rows before are those of meshes, table and textures. Launched
-    over view, material.
+    `first_row`: row of `RandomizedSurfaces` of the first view's first body; the rows before are those of meshes, table and textures.
+    Launched over view, material.
     """
     view, body = wp.tid()
     instances = bodies.mesh.shape[1] - FIXTURES

@@ -61,15 +61,15 @@ class Surfaces:
     """Directional albedo of the specular lobe, the same for all surfaces."""
 
 
-DressedSurfaces = variant_of(Surfaces, "DressedSurfaces", row=wp.array2d[int], recolor=wp.array[wp.mat33], repeats=wp.array[float])
-"""Surfaces where episodes draw their looks (`looks`): constant, but for the materials of views.
+RandomizedSurfaces = variant_of(Surfaces, "RandomizedSurfaces", row=wp.array2d[int], recolor=wp.array[wp.mat33], repeats=wp.array[float])
+"""Surfaces whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
 More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
 clamped to 0..1, and `repeats` the factor on its texture coordinates."""
 AnySurfaces = Any
-"""`Surfaces`, or `DressedSurfaces`: functions are compiled for each; see `variants`."""
-VARIANTS["surfaces"] = Surfaces, DressedSurfaces
+"""`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
+VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
 
 
 @wp.struct
@@ -104,7 +104,7 @@ def material_of(surfaces: Surfaces, view: int, body: int, mesh: int) -> int:
 
 
 @wp.func
-def material_of(surfaces: DressedSurfaces, view: int, body: int, mesh: int) -> int:  # noqa: F811
+def material_of(surfaces: RandomizedSurfaces, view: int, body: int, mesh: int) -> int:  # noqa: F811
     """Row of the material of a body of a view, which its episode has drawn."""
     return surfaces.row[view, body]
 
@@ -130,7 +130,7 @@ def map_table(surfaces: Surfaces, surface: Surface, position: wp.vec3, view_dire
 
 @wp.func
 def map_table(  # noqa: F811
-    surfaces: DressedSurfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float
+    surfaces: RandomizedSurfaces, surface: Surface, position: wp.vec3, view_direction: wp.vec3, pixel_width: float
 ) -> Surface:
     """The table's shading data with texture coordinates."""
     result = surface
@@ -148,7 +148,7 @@ def repeat_texture(surfaces: Surfaces, surface: Surface) -> Surface:
 
 
 @wp.func
-def repeat_texture(surfaces: DressedSurfaces, surface: Surface) -> Surface:  # noqa: F811
+def repeat_texture(surfaces: RandomizedSurfaces, surface: Surface) -> Surface:  # noqa: F811
     """Shading data with its texture coordinates, and their footprint, scaled as the material says."""
     result = surface
     result.uv = surfaces.repeats[surface.row] * surface.uv
@@ -245,7 +245,7 @@ def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
 
 
 @wp.func
-def sample_base_color(surfaces: DressedSurfaces, surface: Surface) -> wp.vec3:  # noqa: F811
+def sample_base_color(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec3:  # noqa: F811
     """Linear base colour: material colour times texture, changed by the material's matrix."""
     turned = surfaces.recolor[surface.row] * sample_texture(surfaces, surface)
     return wp.vec3(wp.clamp(turned[0], 0.0, 1.0), wp.clamp(turned[1], 0.0, 1.0), wp.clamp(turned[2], 0.0, 1.0))

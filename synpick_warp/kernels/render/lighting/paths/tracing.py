@@ -1,10 +1,12 @@
 """Path tracer: paths from the camera that scatter at surfaces until they leave the scene for the environment map.
 
-A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f L / p_l + w_s L_s), T the throughput: the product of f cos / p along the path.
-At each surface one direction is sampled by the map's radiance (next-event estimation) and one by the BRDF, combined by multiple importance
-sampling with the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + p_s²). Only the map emits light.
+A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f_l L_l / p_l + w_s f_s L_s / p_s). At surface k, one direction l is sampled by
+the map's radiance (next-event estimation) and one, s, by the BRDF. f: BRDF times cosine in that direction; L: the map's radiance there, 0
+if another surface is hit; p: density of the sampling. T_k, the throughput, is the product of f_s / p_s of the surfaces before. w: weights
+of multiple importance sampling by the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + q²), q the BRDF's density for l. Only the map
+emits light.
 
-`trace_paths_kernel` is the path-traced reference; `coarse` uses the same functions at few paths per coarse pixel.
+`trace_paths_kernel` is the path-traced reference; `coarse` uses the same functions with a few paths per pixel of a smaller image.
 """
 
 from typing import Any
@@ -15,7 +17,7 @@ from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.materials import (
-    DressedSurfaces,
+    RandomizedSurfaces,
     Surfaces,
     interpolate_surface,
     make_table_surface,
@@ -66,11 +68,11 @@ class PathScene:
     """Rows are those of `Lights.radiance`."""
 
 
-DressedScene = variant_of(PathScene, "DressedScene", surfaces=DressedSurfaces)
-"""Scene where episodes draw their looks."""
+RandomizedScene = variant_of(PathScene, "RandomizedScene", surfaces=RandomizedSurfaces)
+"""Scene whose materials are drawn at random for each episode."""
 AnyScene = Any
-"""`PathScene`, or `DressedScene`: functions are compiled for each; see `variants`."""
-VARIANTS["scene"] = PathScene, DressedScene
+"""`PathScene`, or `RandomizedScene`: functions are compiled for each; see `variants`."""
+VARIANTS["scene"] = PathScene, RandomizedScene
 
 
 @wp.struct
@@ -80,7 +82,7 @@ class PathRules:
     samples: int
     """Paths per pixel, or per coarse pixel."""
     first_samples: int
-    """Paths per coarse pixel in the first frame of an episode, if histories accumulate; at least `samples`."""
+    """Paths per coarse pixel in the first frame of an episode, if light is accumulated over frames (`LightHistory`); at least `samples`."""
     bounces: int
     """Largest number of surfaces at which a path scatters."""
     roulette: int
@@ -90,7 +92,7 @@ class PathRules:
     min_roughness: float
     """Path regularization: smallest roughness of surfaces after the first. Caustics through two mirrors are rare, bright and noisy."""
     firefly_clamp: float
-    """Maximum light of a path of the coarse path pass, relative to the unoccluded light; the reference has no clamp."""
+    """Upper limit of a path's light in `coarse`, in units of what the surface would reflect of the map without occluders (`clamp_path`)."""
     seed: wp.uint64
 
 
@@ -102,15 +104,15 @@ class PathContext:
     instances: int
     """Instance capacity of a world."""
     first_light: int
-    """Environment map that lights the surface which the camera sees: row of `Lights.radiance`."""
+    """Environment map for the first surface, row of `Lights.radiance`; `coarse` takes the one without lamps, whose light is added apart."""
     light: int
-    """Environment map that lights all other surfaces: row of `Lights.radiance`."""
+    """Environment map for all other surfaces: row of `Lights.radiance`."""
     yaw: float
     """Rotation of the map about +z [rad]."""
     key: wp.uint64
     """Key of the scrambled Sobol' points."""
     shift: wp.vec2
-    """Cranley-Patterson rotation: times a dimension's index, added to its sample points modulo 1."""
+    """Cranley-Patterson rotation: sample points of dimension d are shifted by d · shift, modulo 1."""
 
 
 @wp.struct
@@ -173,7 +175,7 @@ def make_vertex(
         body = body_of(hit.segment, instances)
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
     else:
-        # Far away, rounding would lift or sink it by more than the rays' offset.
+        # Exactly on the table: far away, float32 rounding moves a hit off its plane by more than RAY_OFFSET.
         at = wp.vec3(position[0], position[1], scene.table.height)
         surface = map_table(scene.surfaces, surface, at, outgoing, width)
     vertex = Vertex()
@@ -199,7 +201,7 @@ def mis_weight(strategy: int, own: int, own_pdf: float, other_pdf: float) -> flo
 
 @wp.func
 def extend_throughput(throughput: Throughput, value: BrdfValue, color: wp.vec3, bounce: int) -> Throughput:
-    """Multiply the throughput by the BRDF of one more surface, of diffuse colour `color`. Only the first keeps its lobes apart."""
+    """Multiply the throughput by BRDF · cosine (`value`) of one more surface, of diffuse colour `color`. Only the first splits lobes."""
     result = Throughput()
     if bounce == 0:
         result.diffuse = wp.vec3(value.diffuse, value.diffuse, value.diffuse)
@@ -213,7 +215,7 @@ def extend_throughput(throughput: Throughput, value: BrdfValue, color: wp.vec3, 
 
 @wp.func
 def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, bounce: int) -> SplitRadiance:
-    """Add light that arrives at the end of a path of `bounce` + 1 surfaces."""
+    """Add light that arrives at the end of a path of `bounce` + 1 surfaces; diffuse light by way of others is `indirect`."""
     result = total
     result.specular += wp.cw_mul(throughput.specular, radiance)
     if bounce == 0:
@@ -225,7 +227,7 @@ def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, b
 
 @wp.func
 def sample_point(context: PathContext, index: int, dimension: int) -> wp.vec2:
-    """Sample point of path `index` in a two-dimensional dimension, in [0, 1)²: scrambled Sobol' with Cranley-Patterson rotation."""
+    """Sample point in [0, 1)² of path `index`, pair `dimension` of its random numbers: scrambled Sobol' with Cranley-Patterson rotation."""
     point = scrambled_point(context.key, index, dimension)
     x = point[0] + context.shift[0] * float(dimension)
     y = point[1] + context.shift[1] * float(dimension)
