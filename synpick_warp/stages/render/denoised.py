@@ -13,8 +13,8 @@ import warp as wp
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import (
     CHUNK_TILES,
-    FewBodies,
-    ManyBodies,
+    MultiWordMask,
+    SingleWordMask,
     find_footprints_kernel,
     resolve_footprints_kernel,
 )
@@ -401,7 +401,7 @@ class DenoisedRenderer:
         )
         threads = FOOTPRINT_THREADS if scene.device.is_cuda else CPU_FOOTPRINT_THREADS
         inputs = [scene.meshes, scene.table, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
-        inputs += [views, image.samples, threads, crowd_of(bodies)]
+        inputs += [views, image.samples, threads, mask_width_of(bodies)]
         samples = views.count * lists.count.shape[1] * threads
         wp.launch(
             kernel_for(resolve_footprints_kernel, *inputs),
@@ -417,8 +417,8 @@ class DenoisedRenderer:
         launch_pixels(kernel, views.count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)
 
 
-def crowd_of(bodies: Any) -> Any:
-    """The struct that chooses the kernel for the number of words of the struct `ViewBodies`' masks."""
-    crowd = FewBodies() if bodies.body_mask.shape[2] == 1 else ManyBodies()
-    crowd.words = bodies.body_mask.shape[2]
-    return crowd
+def mask_width_of(bodies: Any) -> Any:
+    """Tag that selects the kernel for the number of words of `ViewBodies.body_mask`."""
+    width = SingleWordMask() if bodies.body_mask.shape[2] == 1 else MultiWordMask()
+    width.words = bodies.body_mask.shape[2]
+    return width

@@ -299,5 +299,5 @@ def test_coverage_rays_meet_the_bodies_of_later_words(device, monkeypatch):
     alone, among = render(seen, device), render(crowded, device)
     assert_same(among, alone, "instance", "resolve")
     assert (alone.resolve != 0).sum() > 100
-    monkeypatch.setattr(denoised, "crowd_of", lambda _: denoised.ManyBodies())
+    monkeypatch.setattr(denoised, "mask_width_of", lambda _: denoised.MultiWordMask())
     assert (render(crowded, device).resolve != among.resolve).any()

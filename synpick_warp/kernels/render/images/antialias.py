@@ -1,4 +1,4 @@
-"""Morphological anti-aliasing by coverage rays: extra primary rays only where the G-buffer shows a discontinuity, without shading them.
+"""Adaptive anti-aliasing by coverage rays (like SRAA, CSAA): unshaded primary rays, only where the G-buffer shows a discontinuity.
 
 The unit is the AA footprint, the square between the centres of four neighbouring pixels. Where all four show one smooth surface, so does
 the whole footprint. Where they do not, coverage rays within the footprint find the visible surface, and each takes the radiance of
@@ -29,7 +29,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views, variant_of
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
-AnyCrowd = Any
+AnyMaskWidth = Any
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -42,21 +42,21 @@ SOURCE_BITS = wp.constant(2)
 SOURCE_MASK = wp.constant(wp.uint32(3))
 """The lowest SOURCE_BITS."""
 RANK_BITS, RANK_MASK = wp.constant(8), wp.constant(wp.uint32(0xFF))
-"""Bits of a body's rank in `find_ranks`, and these bits: there are as many bodies as ids, which are bytes."""
+"""Bits of a rank packed by `find_ranks`, and their mask: segmentation ids are bytes, so a view has at most 256 bodies."""
 CHUNK_TILES = wp.constant(32)
 """Tiles of footprints that share a list and its counter: one counter per view would serialize the atomic additions of all threads."""
 CREASE_SLOPE = wp.constant(1.5)
-"""Change of a body's slope [m/m] across a footprint from which it counts as a crease: at a box's edge that points here it is 2."""
+"""Change of a body's slope [m/m] across a footprint that makes a crease. A 90° edge that faces the camera has 2: slopes -1 and 1."""
 CREASE_TURN = wp.constant(0.36)
-"""Tangent of the smallest angle of a crease, 20°, between the surface across the footprint and that before or behind it. At grazing view
+"""Tangent of the smallest angle of a crease, 20°, between the surface across the footprint and that before or after it. At grazing view
 angles slopes change much where a surface hardly turns: without this test a third of the coverage rays were traced there."""
 FLAT_SLOPE = wp.constant(0.1)
 JUMP_SLOPE = wp.constant(8.0)
-"""A surface whose slope seems to change by more than JUMP_SLOPE [m/m], but seen from one side of a footprint by less than FLAT_SLOPE, ends
-at that side and has no crease within the footprint. This saves rays, and changes no image."""
+"""If the slope changes by more than JUMP_SLOPE [m/m] in all, but by less than FLAT_SLOPE on one side of two pixels, both show the surface
+of that side: the jump lies beyond them, not within the footprint. This saves rays, and changes no image."""
 MIN_CONTRAST = wp.constant(0.08)
-"""Footprints whose colours differ by at most this fraction in every channel are left out: half of it, the largest error, is four grey
-levels."""
+"""Footprints whose colours differ by at most this fraction in every channel are left out, at an error of at most half of it, some four of
+255 grey levels."""
 MIN_CHANNEL = wp.constant(0.1)
 """Contrast is relative to a channel's value, but at least to this fraction of the brightest channel: dark channels are hardly visible."""
 DISTANCE_WEIGHT = wp.constant(0.1)
@@ -100,7 +100,7 @@ def sample_offset(sample: int, samples: int) -> wp.vec2:
 
 @wp.func
 def source_offset(resolve: wp.uint32, sample: int, quadrant: int) -> wp.vec2i:
-    """Offset (rows, columns) from a pixel to the pixel whose radiance a sample takes, one of the four corners of the sample's footprint."""
+    """Offset (rows, columns) from a pixel to the pixel whose radiance a sample takes: a corner of its footprint, itself for 0."""
     source = int((resolve >> wp.uint32(SOURCE_BITS * sample)) & SOURCE_MASK)
     return wp.vec2i((source // 2) * (2 * (quadrant // 2) - 1), (source % 2) * (2 * (quadrant % 2) - 1))
 
@@ -121,7 +121,7 @@ def resolve_radiance(image: ShadedImage, view: int, row: int, column: int) -> wp
 
 @wp.func
 def has_crease(gbuffer: GBuffer, grid: ImageGrid, focal: float, view: int, row: int, column: int, down: int, right: int) -> bool:
-    """Crease or depth jump of one body between a pixel and the next one `down` or `right`, by its slopes before, across and behind.
+    """Crease or depth jump of one body between two pixels (step `down` or `right`), by the slopes before, across and after.
 
     1/z of a plane is linear in the image, so slopes are differences of 1/z over its value. At the image border, where one side is missing,
     the other's change of slope counts twice.
@@ -133,22 +133,22 @@ def has_crease(gbuffer: GBuffer, grid: ImageGrid, focal: float, view: int, row: 
     starts = row >= down and column >= right
     ends = row + 2 * down < grid.height and column + 2 * right < grid.width
     before = across
-    behind = across
+    after = across
     if starts:
         before = scale * (middle - 1.0 / gbuffer.depth[view, row - down, column - right])
     if ends:
-        behind = scale * (1.0 / gbuffer.depth[view, row + 2 * down, column + 2 * right] - next)
+        after = scale * (1.0 / gbuffer.depth[view, row + 2 * down, column + 2 * right] - next)
     if not starts:
-        before = 2.0 * across - behind
+        before = 2.0 * across - after
     elif not ends:
-        behind = 2.0 * across - before
+        after = 2.0 * across - before
     first = wp.abs(across - before)
-    second = wp.abs(behind - across)
+    second = wp.abs(after - across)
     bend = first + second
     if bend <= CREASE_SLOPE or (bend >= JUMP_SLOPE and wp.min(first, second) <= FLAT_SLOPE):
         return False
     # The difference of two angles has the tangent (a - b) / (1 + a b).
-    return first > CREASE_TURN * (1.0 + before * across) or second > CREASE_TURN * (1.0 + across * behind)
+    return first > CREASE_TURN * (1.0 + before * across) or second > CREASE_TURN * (1.0 + across * after)
 
 
 @wp.func
@@ -255,20 +255,20 @@ def corner_column(column: int, corner: int) -> int:
 
 
 @wp.struct
-class FewBodies:
-    """Marks views whose bodies fit a word of `ViewBodies.body_mask`, without its highest bit."""
+class SingleWordMask:
+    """Compile-time tag: at most 63 bodies, in one word of `ViewBodies.body_mask`, so that no bit shift reaches 64."""
 
     words: int
 
 
-ManyBodies = variant_of(FewBodies, "ManyBodies")
-"""Marks views whose bodies take several words of `ViewBodies.body_mask`."""
-VARIANTS["crowd"] = FewBodies, ManyBodies
+MultiWordMask = variant_of(SingleWordMask, "MultiWordMask")
+"""Compile-time tag: more bodies, in several words of `ViewBodies.body_mask`."""
+VARIANTS["mask_width"] = SingleWordMask, MultiWordMask
 
 
 @wp.func
 def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
-    """Bit mask, by body index, of the bodies that a footprint's corners show."""
+    """Bit mask, by body index, of the bodies that a footprint's corners show, if there are at most 64."""
     mask = wp.uint64(0)
     for corner in range(FOOTPRINT_PIXELS):
         # Clamped, a corner outside the image is another corner within it.
@@ -282,7 +282,7 @@ def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, colum
 
 @wp.func
 def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint64) -> wp.uint64:
-    """Body mask of a tile without the bodies that have no bit in `visible`: rays test no others."""
+    """Keep those bodies of a tile's mask (bits by rank, see `ViewBodies.order`) that are in `visible` (bits by body index)."""
     body_mask = bodies.body_mask[view, tile, 0]
     result = wp.uint64(0)
     rank = int(0)
@@ -307,8 +307,8 @@ def visible_segments(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, col
 
 @wp.func
 def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: wp.vec4i, instances: int) -> tuple[wp.uint32, int]:
-    """Ranks, ascending, of those bodies in a tile's body mask of `words` words that have one of four segmentation ids, each in RANK_BITS
-    from the lowest on; and their number."""
+    """Find the bodies of a tile's mask of `words` words whose segmentation id is one of the four. Returns their ranks (places in
+    `ViewBodies.order`), ascending, packed in RANK_BITS each from the lowest bits on, and their number."""
     ranks = wp.uint32(0)
     found = int(0)
     for word in range(words):
@@ -327,7 +327,7 @@ def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: w
 
 @wp.func
 def trace_visible(
-    crowd: FewBodies,
+    mask_width: SingleWordMask,
     meshes: Meshes,
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -347,7 +347,7 @@ def trace_visible(
 
 @wp.func
 def trace_visible(  # noqa: F811
-    crowd: ManyBodies,
+    mask_width: MultiWordMask,
     meshes: Meshes,
     bodies: ViewBodies,
     gbuffer: GBuffer,
@@ -363,7 +363,7 @@ def trace_visible(  # noqa: F811
 
     All are found before the first is traced, so that rays of a warp traverse BVHs at the same time.
     """
-    ranks, found = find_ranks(bodies, view, tile, crowd.words, visible_segments(gbuffer, grid, view, row, column), instances)
+    ranks, found = find_ranks(bodies, view, tile, mask_width.words, visible_segments(gbuffer, grid, view, row, column), instances)
     hit = no_hit()
     for index in range(found):
         rank = int((ranks >> wp.uint32(RANK_BITS * index)) & RANK_MASK)
@@ -429,7 +429,7 @@ def resolve_footprints_kernel(
     views: AnyViews,
     samples: int,
     threads: int,
-    crowd: AnyCrowd,
+    mask_width: AnyMaskWidth,
     # Out:
     resolve_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
@@ -458,12 +458,13 @@ def resolve_footprints_kernel(
         if in_image(grid, r, c):
             offset = sample_offset(sample, samples)
             ray = loop_ray(views.cameras, intrinsics, view, r, c, offset)
-            hit = trace_visible(crowd, meshes, bodies, gbuffer, grid, view, row, column, tile_of(grid, r, c), ray, views.instances)
+            hit = trace_visible(mask_width, meshes, bodies, gbuffer, grid, view, row, column, tile_of(grid, r, c), ray, views.instances)
             hit = hit_table(table, views.cameras, view, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
                 normal = wp.transpose(views.cameras.to_world[view]) * face_normal(meshes, bodies, view, hit, views.instances)
             plane = tangent_plane(views.cameras, intrinsics, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
+            # The plane passes through the hit of the sample's ray, not through the pixel's centre.
             plane.height = hit.depth * wp.dot(normal, ray)
             mesh = int(-1)
             if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:
