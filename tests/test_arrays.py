@@ -17,7 +17,7 @@ from synpick_warp.kernels.structs import ModeData
 from synpick_warp.stages.arrays import Row, StructArrays, allocate, allocate_struct, array_group, device_array, dry_run, struct_arrays
 from synpick_warp.stages.buffers import view_buffer_sizes
 from synpick_warp.stages.constants import fill
-from synpick_warp.stages.host_copies import HostImages
+from synpick_warp.stages.host_copies import TransferSettings
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
@@ -97,7 +97,7 @@ def test_a_dry_run_lists_what_the_same_calls_allocate(device, monkeypatch):
         allocate_record(sizes, device, steps=True, supports=True)
         sections = (config.render, config.effects, config.depth_sensor)
         Renderer(blank_scene(3, 40, 24, device), *sections, seed=0, depth_scale=0.1, instances=room, views=4, histories=6)
-        allocate_ring(view_buffer_sizes(4, 40, 24, room), layers, HostImages(jpeg_quality=95, depth_files=True), device)
+        allocate_ring(view_buffer_sizes(4, 40, 24, room), layers, TransferSettings(jpeg_quality=95, depth_files=True), device)
         allocate_slot(view_buffer_sizes(4, 40, 24, room), layers, device)
         allocate_batch(rooms, room, 2, device)
         allocate_votes(rooms, room, 2, device)

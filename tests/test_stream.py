@@ -83,7 +83,7 @@ def sizes_of(config: Config, device: wp.Device) -> dict[str, int]:
     return view_sizes(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
 
 
-def frame_stream(config: Config, renderer: FakeRenderer, device, host: host_copies.HostImages | None = None) -> FrameStream:
+def frame_stream(config: Config, renderer: FakeRenderer, device, host: host_copies.TransferSettings | None = None) -> FrameStream:
     group = CameraGroup(config.rig.groups[0], sizes_of(config, device), renderer)  # type: ignore[arg-type]
     return FrameStream([ViewRing(group, config.render.layers, device, host)], config.physics.tick_time, OBJECT_IDS, LIGHTS, device)
 
@@ -335,7 +335,7 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
-    host = host_copies.HostImages(("color", "depth", "instance", "mask_words"), 90, depth_files=True)
+    host = host_copies.TransferSettings(("color", "depth", "instance", "mask_words"), 90, depth_files=True)
     frames = frame_stream(config, renderer, device, host)
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
@@ -354,22 +354,22 @@ def test_files_and_lists_stand_for_images(device):
 @pytest.mark.parametrize(
     ("cuda", "needs_images", "settings_", "expected"),
     [
-        (False, False, {}, host_copies.HostImages(depth_files=True)),
-        (True, True, {}, host_copies.HostImages(("mask_words",), depth_files=True)),
-        (True, True, {"cameras__resolution": [300, 287]}, host_copies.HostImages(depth_files=True)),
+        (False, False, {}, host_copies.TransferSettings(depth_files=True)),
+        (True, True, {}, host_copies.TransferSettings(("mask_words",), depth_files=True)),
+        (True, True, {"cameras__resolution": [300, 287]}, host_copies.TransferSettings(depth_files=True)),
         (
             True,
             False,
             {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
-            host_copies.HostImages(("depth", "color", "instance", "mask_words"), 90, True),
+            host_copies.TransferSettings(("depth", "color", "instance", "mask_words"), 90, True),
         ),
-        (True, False, {"bop__color_format": "png"}, host_copies.HostImages(("depth", "instance", "mask_words"), depth_files=True)),
-        (True, False, {"cameras__resolution": [300, 287]}, host_copies.HostImages(("depth",), depth_files=True)),
+        (True, False, {"bop__color_format": "png"}, host_copies.TransferSettings(("depth", "instance", "mask_words"), depth_files=True)),
+        (True, False, {"cameras__resolution": [300, 287]}, host_copies.TransferSettings(("depth",), depth_files=True)),
     ],
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert host_copies.host_images(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert host_copies.choose_transfers(config.bop, config.rig.largest[1], SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("objects", [1, 24, MAX_INSTANCES])

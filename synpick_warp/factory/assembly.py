@@ -1,6 +1,6 @@
-"""Factory functions that build a bake's stages (worlds, renderer, encoders) and assets on a device from its settings.
+"""Composition root: factory functions that build the stages of a bake (simulated worlds, renderer, encoders) and load its assets.
 
-Whoever assembles stages (bake, stream, warm-up) passes the whole `Config` on; stages take what they need.
+A bake generates a data set. Callers (bake, online stream, warm-up) pass the whole `Config`; stages take the sections that they need.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from synpick_warp.scenes.fills import check_fill
 from synpick_warp.scenes.grippers.registry import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.host_copies import choose_transfers
 from synpick_warp.stages.mask_pool import MaskBounds
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.looks import draw_looks
@@ -70,23 +70,24 @@ class Stages:
 
     @property
     def tick_time(self) -> float:
-        """Time between two frames [s]."""
+        """Time between two frames (a tick) [s]."""
         return self.config.physics.tick_time
 
     @property
     def randomized(self) -> Looks | None:
-        """What episodes draw their looks from; None: nothing."""
+        """Looks (textures and colours) from which each episode samples its own at random; None: they are not randomized."""
         return self.groups[0].renderer.scene.looks
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """The cameras, without what episodes draw of them."""
+        """The nominal cameras, before the random offsets of each episode."""
         return self.episode_cameras.cameras
 
-    def draws(self, episode: int, objects: int, distractors: Mapping[int, str]) -> dict[str, Any]:
-        """Fields of `EpisodeRow` that record what an episode draws: looks and cameras; None: nothing.
+    def sampled_fields(self, episode: int, objects: int, distractors: Mapping[int, str]) -> dict[str, Any]:
+        """Fields of `EpisodeRow` that record what is sampled at random for an episode: looks and cameras; None: not randomized.
 
         Args:
+            objects: Number of instances in the episode.
             distractors: Names of its distractors, by instance.
         """
         looks = draw_looks(self.randomized, self.config.bake.seed, episode, objects, distractors) if self.randomized else None
@@ -101,7 +102,7 @@ class Stages:
 
 @dataclass(frozen=True, eq=False)
 class Factory(Stages):
-    """The stages of a bake, with copies of views to the host, and the attempt log."""
+    """The stages of a bake, with the stream of its views, which copies them to the host, and the log of pick attempts."""
 
     stream: FrameStream
     log: AttemptLog
@@ -126,10 +127,10 @@ def build_factory(
         records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
         processes: Processes of the bake, which share the host's memory.
         longest_first: Whether the episodes are reordered by `order_longest_first`.
-        expected: Number of episodes to choose worlds for, if it is larger than that of `episodes`.
+        expected: Number of episodes by which the number of worlds is chosen, if more than `episodes` has.
 
     Raises:
-        SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
+        SynpickError: The machine has too little memory, or device, models, lights, bins or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
     planned = DataLayout.of(config).planned if episodes is None else max(expected, len(episodes))
@@ -155,8 +156,8 @@ def _add_picks(factory: Factory, progress: Progress) -> Factory:
 def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progress: Progress, renders: bool = True) -> Iterator[None]:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
 
-    A minimal factory, which is freed again, shows which kernels there are. They are ready when the context is left. With a warm cache,
-    what launches compile is reported.
+    A dry run of a minimal factory, which is freed again, lists the kernels; all are compiled when the context is left. One process compiles
+    at a time. With a warm cache, kernels are compiled only when they are launched and missing, which is reported.
 
     Args:
         smallest: Builds the minimal factory, silently.
@@ -175,12 +176,12 @@ def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progre
             factory = smallest()
             submit_launches(compiler, factory.simulation, factory.stream if renders else None)
             del factory
-            gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+            gc.collect()  # Warp's code generation leaves tracebacks, whose frames keep the factory's arrays alive.
             yield
 
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
-    """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
+    """Build a factory with as few worlds as the device allows (MIN_GPU_WORLDS) and one view a batch. Arguments, errors: `build_factory`."""
     config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
     needs = Needs.of(config)
     config = fit_to_device(config, device, 1, count_writers(config.bake.writers, needs.slot_bytes))
@@ -189,11 +190,11 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 
 
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
-    """Add a stream of views to stages; arguments as of `host_images`."""
+    """Add the stream of views to stages: a ring buffer of batches for each group of cameras. Other arguments: see `choose_transfers`."""
     config, table, tick_time = stages.config, stages.light_table, stages.tick_time
     rings = []
     for index, group in enumerate(stages.groups):
-        host = host_images(config.bop, group.sizes["row"], device, needs_images, depth_files)
+        host = choose_transfers(config.bop, group.sizes["row"], device, needs_images, depth_files)
         rings.append(ViewRing(group, group_layers(config.rig, config.render, index), device, host))
     stream = FrameStream(rings, tick_time, stages.object_ids, table, device, config.cell.recorded, stages.episode_cameras)
     return Factory(**vars(stages), stream=stream, log=stages.make_log())
@@ -208,7 +209,7 @@ def build_stages(
     records_physics: bool = False,
     longest_first: bool = False,
 ) -> Stages:
-    """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
+    """Load assets, and build worlds and renderer, from settings after `fit_to_device`. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
     episode_cameras = EpisodeCameras(config.rig, config.bake.seed)
     cameras = episode_cameras.cameras
@@ -223,7 +224,7 @@ def build_stages(
     progress.stage(f"building worlds on {device.alias} (worlds: {config.bake.worlds}, objects: {len(catalog)})")
     looks = load_looks(config.randomize, progress.note, config.objects.strict)
     fixtures = make_fixtures(bins, config.gripper)
-    # Of one image size; each group gets its own, see `_build_group`.
+    # The scene is built with the first group's cameras; `_build_group` replaces them by those of each group.
     first = tuple(cameras[index] for index in config.rig.groups[0])
     scene = build_render_scene(config.render, bins[0].sizes.ground, catalog, fixtures, first, lights, device, looks, config.suction.radius)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
@@ -233,12 +234,12 @@ def build_stages(
 
 
 def group_layers(rig: Rig, render: Render, index: int) -> tuple[str, ...]:
-    """Layers of a group of cameras."""
+    """Layers that a group of cameras renders: those that `render.layers` and its cameras' modalities both name."""
     return rig.chosen(rig.groups[index][0], render.layers)
 
 
 def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...], index: int) -> CameraGroup:
-    """Renderer of a group of cameras, for `bake.worlds` worlds; they share all constant data but the cameras."""
+    """Group of cameras that are rendered together, with a renderer; renderers share the constants of `scene` but its cameras."""
     indices, worlds, objects = config.rig.groups[index], config.bake.worlds, config.arrangement.max_objects
     sizes = view_sizes(config.render, config.rig, worlds, objects, scene.device, index)
     own = tuple(cameras[camera] for camera in indices)
@@ -253,11 +254,12 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
 
 
 def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
-    """Resolve settings that depend on objects and bins: repetition of objects in an episode, and contact capacities.
+    """Resolve settings that depend on objects and bins: whether objects repeat in an episode (if they are too few to fill the bin), and
+    contact capacities.
 
     Raises:
-        ConfigError: The capacities do not fit into the device's memory, or the parts of `arrangement.counts` not into the bins; or no cup
-            reaches an object.
+        ConfigError: The capacities do not fit into the device's memory, the objects of `arrangement.counts` do not fit into the bins, or no
+            cup of the gripper can lie on any object.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
@@ -287,10 +289,9 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0, colors: bool = True) -> Renderer:
-    """Create the renderer of a bake from its sections of the settings, for `instances` instances of a world and at most `views` views of a
-    batch.
+    """Create the renderer of a bake from its sections of the settings, for `instances` instances a world and at most `views` views a batch.
 
-    `histories` and `colors` as in `Renderer`.
+    `histories`, `colors`: see `Renderer`.
     """
     return Renderer(
         scene,

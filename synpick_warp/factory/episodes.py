@@ -22,8 +22,8 @@ PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
 
 
-Draws = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
-"""Type of `Stages.draws`."""
+SampledFields = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
+"""Type of `Stages.sampled_fields`."""
 
 
 class EpisodeOutcome(NamedTuple):
@@ -139,14 +139,14 @@ def episode_row(
     layout: DataLayout,
     bins: Sequence[str],
     tick_time: float,
-    draws: Draws,
+    sampled: SampledFields,
     report: TickReport,
     world: int,
     record: EpisodeRecord,
 ) -> EpisodeOutcome:
     """Build the row of the episode that ended in a world.
 
-    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `draws`: see `Stages.draws`.
+    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `sampled`: see `Stages.sampled_fields`.
     """
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     split = layout.split_of(episode)
@@ -164,7 +164,7 @@ def episode_row(
         record.left,
         "" if split is None else split.name,
         bin=bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
-        **draws(episode, record.objects, dict(record.distractors)),
+        **sampled(episode, record.objects, dict(record.distractors)),
     )
 
 

@@ -33,7 +33,7 @@ from synpick_warp.scenes.capacities import FEW
 from synpick_warp.scenes.grippers.registry import make_head
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.host_copies import HostImages, host_images
+from synpick_warp.stages.host_copies import TransferSettings, choose_transfers
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
@@ -116,7 +116,7 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
                 allocate_materials(views["view"] * materials_of_view(objects), 1, device)
             if rig.draws_lens(group[0]):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
-        host = host_images(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
+        host = choose_transfers(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
         terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
         terms.append(_perception(config.perception, worlds, objects, device))
@@ -266,7 +266,7 @@ def _trials(sizes: dict[str, int], rows: int, physics: Physics, device: wp.Devic
 
 
 def _images(
-    arrays: list[DryArray], sizes: dict[str, int], cameras: int, layers: tuple[str, ...], host: HostImages | None, device: wp.Device
+    arrays: list[DryArray], sizes: dict[str, int], cameras: int, layers: tuple[str, ...], host: TransferSettings | None, device: wp.Device
 ) -> Iterator[Term]:
     """Scratch of the renderer, and images of a batch of views.
 

@@ -307,7 +307,7 @@ class _Run:
         """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
         config, tries = self.factory.config, self.factory.config.settle.tries
         bins, factory = config.cell.recorded, self.factory
-        row = episode_row(self.layout, bins, factory.tick_time, factory.draws, report, world, record)
+        row = episode_row(self.layout, bins, factory.tick_time, factory.sampled_fields, report, world, record)
         end = episode_end(row, record, tries)
         advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
         if advice:

@@ -168,7 +168,7 @@ class Producer:
         layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.draws, report, world, record)
+            row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.sampled_fields, report, world, record)
             if is_resampled(row, config.settle.tries):
                 self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}")

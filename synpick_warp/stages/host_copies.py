@@ -1,4 +1,7 @@
-"""Host copies of a batch's images: which are copied, which are replaced by encoded files or run boundaries, and the copies themselves."""
+"""Device-to-host copies of a batch's images: which are copied, which are replaced by encoded files or run boundaries, and the copies.
+
+Run boundaries are the positions at which masks change down a column, from which run lengths (RLE) are made; see `mask_runs`.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Bop
 
-# Image height from which the largest lists of run boundaries are no larger than the images [px].
+# Smallest image height at which the lists of run boundaries, at full length, are no larger than the images that they replace [px].
 MIN_LISTED_ROWS = 288
 # Pause between two queries of a copy's event: seconds, or a fraction of the wait so far, if that is longer. On an H200 a batch of 50
 # full-HD views takes 80 ms, and the next one is queued meanwhile.
@@ -21,7 +24,7 @@ MAX_PAUSED_SECONDS = 0.5
 
 
 class DeviceImages:
-    """Images of a batch that stay on the device, as `Images` of `frames`."""
+    """Images of a batch that stay on the device until they are indexed; implements the protocol `frames.Images`."""
 
     def __init__(self, array: wp.array) -> None:
         self.array = array
@@ -32,23 +35,23 @@ class DeviceImages:
 
 
 @dataclass(frozen=True)
-class HostImages:
-    """Transfer settings of a batch: which images are copied to the host, and which are replaced by encoded files or run boundaries."""
+class TransferSettings:
+    """Which images of a batch are copied to the host, and which are replaced by encoded files or run boundaries."""
 
     on_demand: tuple[str, ...] = ()
-    """Arrays of `ViewBuffers` that stay on the device; files or run boundaries replace them, but for single images that exporters copy."""
+    """Arrays of `ViewBuffers` that stay on the device: files or run boundaries are copied instead; single ones can still be indexed."""
     jpeg_quality: int = 0
-    """Quality of the JPEG files that are copied instead of colour images; 0: there are none."""
+    """Quality of the JPEG files that the device encodes and that are copied instead of colour images; 0: none."""
     depth_files: bool = False
-    """Whether data of PNG files (IDAT) is copied: instead of depth images, or beside them if these are needed, too."""
+    """Whether the device encodes depth as PNG data (IDAT), copied instead of depth images, or beside them if these are needed, too."""
 
 
-def host_images(bop: Bop, height: int, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
+def choose_transfers(bop: Bop, height: int, device: wp.Device, needs_images: bool, depth_files: bool) -> TransferSettings:
     """Choose which images of a batch are copied to the host and which stay on the device.
 
-    On the CPU all are copied; for an exporter that needs all images, all but masks. Else files and run boundaries replace them. Below
-    MIN_LISTED_ROWS rows masks are always copied, and depth alone is left out, since lists of run boundaries may be incomplete there, and
-    copying single images waits for the device. Depth files are made on every device, so that their bytes do not depend on it.
+    On the CPU nothing is left out: the arrays are the host's. For an exporter that needs all images, only masks stay on the device. Else
+    files and run boundaries replace images; of those lower than MIN_LISTED_ROWS only depth, since lists of run boundaries, capped at the
+    size of an image, may overflow, and fetching the image then stalls. Depth files are made on every device: their bytes are the same.
 
     Args:
         bop: Settings of the files.
@@ -58,20 +61,20 @@ def host_images(bop: Bop, height: int, device: wp.Device, needs_images: bool, de
         depth_files: Whether an exporter writes depth files.
     """
     if not device.is_cuda:
-        return HostImages(depth_files=depth_files)
+        return TransferSettings(depth_files=depth_files)
     if needs_images:
-        return HostImages(("mask_words",) if height >= MIN_LISTED_ROWS else (), depth_files=depth_files)
-    # Without files, keypoints are the only ones to read depth.
+        return TransferSettings(("mask_words",) if height >= MIN_LISTED_ROWS else (), depth_files=depth_files)
+    # Keypoints read depth: from its file, or from the image if no format has depth files.
     depth = ("depth",) if depth_files or not bop.keypoints else ()
     if height < MIN_LISTED_ROWS:
-        return HostImages(depth, depth_files=depth_files)
+        return TransferSettings(depth, depth_files=depth_files)
     if bop.color_format != "jpg":
-        return HostImages((*depth, "instance", "mask_words"), depth_files=depth_files)
-    return HostImages((*depth, "color", "instance", "mask_words"), bop.jpeg_quality, depth_files)
+        return TransferSettings((*depth, "instance", "mask_words"), depth_files=depth_files)
+    return TransferSettings((*depth, "color", "instance", "mask_words"), bop.jpeg_quality, depth_files)
 
 
 class HostCopy:
-    """Host mirror of device arrays; on CUDA with asynchronous copies."""
+    """Host mirror of device arrays: asynchronous copies into pinned memory on CUDA; on a CPU by default the arrays themselves."""
 
     def __init__(self, arrays: list[wp.array], target: list[wp.array] | None = None) -> None:
         """
@@ -88,7 +91,7 @@ class HostCopy:
         self.done = wp.Event(self.device) if self.device.is_cuda else None
 
     def start(self, stream: wp.Stream | None) -> None:
-        """Begin to copy on `stream` (None: the current one), after the work queued on the current one. A CPU copies at once, if at all."""
+        """Begin to copy on `stream` (None: the current one), after the work queued on the current one. On a CPU copies are synchronous."""
         if self.target is self.source:
             return
         if self.done is None:
@@ -116,7 +119,7 @@ class HostCopy:
 
 
 def wait_event(event: wp.Event) -> None:
-    """Wait for an event with pauses: `wp.synchronize_event` alone keeps a core busy, since CUDA asks the device without a pause."""
+    """Wait for an event with pauses: `wp.synchronize_event` alone keeps a core busy, since CUDA spins."""
     started = time.monotonic()
     while not event.is_complete and (waited := time.monotonic() - started) < MAX_PAUSED_SECONDS:
         time.sleep(max(PAUSE_SECONDS, PAUSE_FRACTION * waited))

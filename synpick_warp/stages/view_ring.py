@@ -17,7 +17,7 @@ from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
-from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
+from synpick_warp.stages.host_copies import DeviceImages, HostCopy, TransferSettings
 from synpick_warp.stages.mask_pool import SHARE, MaskBounds, share_words, widen
 from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
@@ -154,7 +154,7 @@ Scratch = tuple[BoundaryScratch, JpegScratch | None, tuple[DepthScratch, Any, An
 
 
 def allocate_ring(
-    sizes: dict[str, int], layers: Collection[str], host: HostImages, device: wp.Device
+    sizes: dict[str, int], layers: Collection[str], host: TransferSettings, device: wp.Device
 ) -> tuple[list[BatchBuffers], Scratch]:
     """Allocate a ring of batches, on a CPU a single one, and the scratch of encoding; arguments as of `FrameStream`."""
     frame, boundaries = (sizes["view"], sizes["column"], sizes["row"]), boundary_sizes(sizes)
@@ -176,7 +176,7 @@ def allocate_ring(
 class ViewRing:
     """Batches of a group's views: on a GPU up to two are in flight while one is consumed."""
 
-    def __init__(self, group: CameraGroup, layers: Collection[str], device: wp.Device, host: HostImages | None = None) -> None:
+    def __init__(self, group: CameraGroup, layers: Collection[str], device: wp.Device, host: TransferSettings | None = None) -> None:
         """Allocate the ring of batches.
 
         Args:
@@ -187,7 +187,7 @@ class ViewRing:
         """
         sizes = group.sizes
         self.group, self.cameras, self.renderer = group, group.cameras, group.renderer
-        self.host = host or HostImages()
+        self.host = host or TransferSettings()
         self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
