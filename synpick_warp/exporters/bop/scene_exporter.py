@@ -1,4 +1,4 @@
-"""Base class of BOP exporters: one staged scene per camera and episode, one task per view, staged and committed as a whole."""
+"""Base class of BOP exporters: each camera of an episode is a scene, each view a task; scenes of an episode are committed together."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def constant_files(layout: DataLayout) -> tuple[Path, ...]:
 SceneImages = tuple[Sequence[int], ...]
 """Images (im_id) of each scene, ascending."""
 _Staged = StagedEpisode[tuple[Path, ...]]
-"""Its content: the staging folder of each camera's scene, in that of the episode, named by scene_id."""
+"""Staged episode; its content is a folder per camera's scene, named by scene_id, inside the episode's staging folder."""
 
 
 class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
@@ -55,7 +55,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
     writes_depth = True
     write_view: ClassVar[WriteView]
     write_layer: ClassVar[WriteLayer | None] = None
-    """None: the format has no layers."""
+    """None: the format has no layers (further images of a view, as normals or flow)."""
     has_graph: ClassVar[bool] = False
     """Whether the format has scene graphs."""
 
@@ -69,7 +69,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._suffix = f".{bop.color_format}"
         layers = settings.render.layers if self.write_layer else ()
         self._supports: dict[int, list[FrameSupport]] = {}
-        """Support edges of the frames of each episode that runs."""
+        """Which object rests on which (edges of the support graph), for each frame of each running episode."""
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
@@ -98,7 +98,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """Whether this format writes COCO annotations, which need keypoints, with these settings."""
+        """Whether this format, with these settings, writes COCO annotations, for which keypoints are sampled."""
         return False
 
     @staticmethod
@@ -120,7 +120,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """Bytes of a view's images in shared memory. See `Exporter`."""
+        """Size of a task's images in shared memory: those of one view at the largest resolution [B]. See `Exporter`."""
         return view_bytes(settings.rig.largest, settings.objects, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
@@ -149,7 +149,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         return {body.obj_id: self._context.settings.physics.gravity * body.mass for body in self._context.catalog.bodies}
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Keep the support edges of a tick's frames, if the format writes them. See `Exporter`."""
+        """Collect which object rests on which, for each frame of a tick, if the format writes scene graphs. See `Exporter`."""
         if not (self._bop.graph and self.has_graph and "support" in batch.tick):
             return
         for episode, frame, support in zip(batch.episode.tolist(), batch.frame.tolist(), find_supports(batch, self._weights), strict=True):
@@ -176,7 +176,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Submit one task for each stored scene of an episode. See `Exporter`."""
+        """Submit a task for each scene of an episode that is read from an existing data set (conversion). See `Exporter`."""
         staged = self._staged(episode, partial(self._create_scenes, episode))
         for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
             arguments = (stored, type(self).write_view, type(self).write_layer, settings.layers, scene, settings)

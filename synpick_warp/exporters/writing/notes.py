@@ -1,4 +1,4 @@
-"""camera.json, and dataset_info.md of data sets that have neither the format bop nor shards, whose notes are those of BOP."""
+"""Camera files (camera.json), and the card dataset_info.md of data sets without the formats bop and shards, which write their own."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.scenes.types import Camera
 
 _INTRINSICS = ("`camera.json` has the intrinsics of all cameras", "`camera_NAME.json` has the intrinsics of each camera")
-"""Where intrinsics are: of alike cameras, and of others."""
+"""Where intrinsics are: of cameras with the same ones, and of cameras listed one by one."""
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 
 
 def note_files(layout: DataLayout) -> tuple[Path, ...]:
-    """Files that `write_notes` writes, relative to the data set; none where bop or shards write theirs."""
+    """Files that `write_notes` writes, relative to the data set; none if the format bop or shards writes its own."""
     return () if {"bop", "shards"} & set(layout.formats) else tuple(map(Path, (CAMERA_FILE, *camera_files(layout), NOTES_FILE)))
 
 
 def camera_files(layout: DataLayout) -> tuple[str, ...]:
-    """Files like camera.json of single cameras, for those of [[camera]] tables."""
+    """Names of one file per camera, like camera.json, if the settings list cameras one by one ([[camera]] tables); else none."""
     return tuple(f"camera_{name}.json" for name in layout.names) if layout.is_listed else ()
 
 
 def write_cameras(out: Path, layout: DataLayout, cameras: tuple[Camera, ...], depth_scale: float) -> None:
-    """Write camera.json, of the first camera, and `camera_files`: size, intrinsics [px] and millimetres per count of depth."""
+    """Write camera.json (the first camera) and `camera_files`: size, intrinsics [px], mm per depth unit, and lens distortion if any."""
     for name, camera in ((CAMERA_FILE, cameras[0]), *zip(camera_files(layout), cameras, strict=False)):
         (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
         content = {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
@@ -35,14 +35,14 @@ def write_cameras(out: Path, layout: DataLayout, cameras: tuple[Camera, ...], de
 
 
 def describe_sizes(layout: DataLayout, cameras: tuple[Camera, ...]) -> str:
-    """Clause on the sizes of pictures."""
+    """Text fragment on image sizes: one for all cameras, or each with its camera's name."""
     if not layout.is_listed:
         return f"{cameras[0].width} x {cameras[0].height} pixels"
     return ", ".join(f"{camera.width} x {camera.height} ({camera.name})" for camera in cameras) + " pixels"
 
 
 def describe_lenses(settings: ExportSettings) -> str:
-    """First lines of cards and notes: whether pictures are rectified, or which are distorted and by which keys; empty: there is no lens."""
+    """Warning at the top of data set cards: images are rectified (`bop.rectified`), or those of some cameras distorted; else empty."""
     if settings.bop.rectified:
         return """
 **Pictures are rectified** (`bop.rectified`): those of pinhole cameras with the same `cam_K`, without the distortion of the
@@ -94,5 +94,5 @@ Made by synpick-warp (mode {", ".join(settings.modes)}, seed {bake.seed}, {len(c
 
 
 def _row(values: object) -> str:
-    """Numbers as text, rounded to 1e-9 and without -0."""
+    """Numbers as comma-separated text, rounded to 1e-9 and to nine digits, without -0."""
     return ", ".join(f"{value:.9g}" for value in (0.0 + round(float(value), 9) for value in values))  # type: ignore[attr-defined]

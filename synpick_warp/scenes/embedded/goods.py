@@ -1,4 +1,7 @@
-"""Embedded objects 1 to 9 and 12, packaged goods: sizes [m], label texts, colours and pictures."""
+"""Packaged goods of the embedded household set (obj_id 1 to 9 and 12): procedural tins, cartons and bottles with printed labels.
+
+Lengths are in metres. The last number of a label, of a plain texture or of a tin's metal is the seed of its random details.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ WHITE = (250, 250, 247)
 
 
 def coffee_tin() -> Shape:
-    """Shape of a large tin with a plastic lid; the same label in front and behind."""
+    """Shape of a large tin with a blue plastic lid; the same label on front and back."""
     label = Label(("COFFEE",), "GROUND DARK ROAST", "NET 410 g", (24, 40, 92), (196, 150, 60), WHITE, _beans, 100)
     ring, height = ellipse(0.1016, 0.1016, packs.SIDES), 0.140
     ends = {
@@ -45,8 +48,8 @@ def soup_tin() -> Shape:
 
 
 def squeeze_bottle() -> Shape:
-    """Shape of a flat mustard bottle with a nozzle."""
-    label = Label(("MUSTARD",), "MILD & YELLOW", "NET 550 g", (244, 200, 32), (170, 30, 26), (150, 24, 22), _leaf, 500)
+    """Shape of a flat mustard bottle with a nozzle. `levels`, `neck` and the band of the label: see `packs.bottle`."""
+    label = Label(("MUSTARD",), "MILD & YELLOW", "NET 550 g", (244, 200, 32), (170, 30, 26), (150, 24, 22), _flowers, 500)
     levels = [
         (0.080, 0.050, 2.6, -0.0955),
         (0.090, 0.058, 2.6, -0.0945),
@@ -80,12 +83,12 @@ def squeeze_bottle() -> Shape:
 
 
 def fish_tin() -> Shape:
-    """Shape of a flat tin, printed on its lid."""
+    """Shape of a flat round tin with the front of the label on its lid, and its side panels around the wall."""
     label = Label(("TUNA", "CHUNKS"), "IN SPRING WATER", "NET 171 g", (20, 96, 128), (240, 168, 40), WHITE, _fish, 600)
     ring, height = ellipse(0.0855, 0.0855, packs.SIDES), 0.0335
-    width, high = packs.tin_label_size(ring, height)
+    width, rows = packs.tin_label_size(ring, height)
     third = width // 3
-    strip = [packs.other_side(third, high, label), packs.side(width - 2 * third, high, label), packs.other_side(third, high, label)]
+    strip = [packs.other_side(third, rows, label), packs.side(width - 2 * third, rows, label), packs.other_side(third, rows, label)]
     ends = {"top": packs.front(380, 380, label), "bottom": packs.stamped_end(256, packs.SILVER, 609, "BEST 2031")}
     return packs.tin(ring, height, np.concatenate(strip, axis=1), ends, packs.SILVER, 608)
 
@@ -103,7 +106,7 @@ def jelly_carton() -> Shape:
 
 
 def meat_tin() -> Shape:
-    """Shape of a tin with flat sides."""
+    """Shape of a tin whose outline is a rounded rectangle."""
     label = Label(("POTTED", "MEAT"), "SLICED & SMOKED", "NET 370 g", (28, 52, 122), (250, 202, 40), (252, 224, 90), _slices, 900)
     ring, height = packs.label_ring(0.1005, 0.0580, 0.021), 0.0832
     ends = {"top": packs.stamped_end(256, packs.SILVER, 909, "PULL TO OPEN"), "bottom": packs.stamped_end(256, packs.SILVER, 910, "")}
@@ -111,7 +114,7 @@ def meat_tin() -> Shape:
 
 
 def cleaner_bottle() -> Shape:
-    """Shape of a large flat bottle with a blue screw cap."""
+    """Shape of a large flat bottle with a blue screw cap. `levels`, `neck` and the band of the label: see `packs.bottle`."""
     label = Label(("SURFACE", "CLEANER"), "FRESH SCENT", "1 litre", (30, 104, 188), (250, 236, 70), WHITE, _bubbles, 1200, food=False)
     levels = [
         (0.086, 0.054, 2.6, -0.1252),
@@ -138,7 +141,7 @@ def cleaner_bottle() -> Shape:
 
 
 def _beans(image: np.ndarray) -> None:
-    """Draw beans into a label."""
+    """Draw beans onto a label."""
     for x, y in ((0.3, 0.62), (0.42, 0.72), (0.56, 0.6), (0.68, 0.72), (0.5, 0.82), (0.78, 0.6), (0.24, 0.76)):
         paint.dot(image, x, y, 0.062, (112, 66, 32))
         paint.dot(image, x - 0.008, y - 0.01, 0.045, (136, 84, 44))
@@ -146,7 +149,7 @@ def _beans(image: np.ndarray) -> None:
 
 
 def _crackers(image: np.ndarray) -> None:
-    """Draw crackers into a label."""
+    """Draw crackers onto a label."""
     for x, y in ((0.34, 0.6), (0.68, 0.58), (0.5, 0.72), (0.76, 0.78), (0.24, 0.78)):
         paint.dot(image, x, y, 0.155, (170, 110, 44))
         paint.dot(image, x, y, 0.143, (238, 196, 116))
@@ -155,14 +158,14 @@ def _crackers(image: np.ndarray) -> None:
 
 
 def _cubes(image: np.ndarray) -> None:
-    """Draw sugar cubes into a label."""
+    """Draw sugar cubes onto a label."""
     for x, y in ((0.2, 0.66), (0.38, 0.7), (0.56, 0.64), (0.3, 0.58), (0.66, 0.74)):
         paint.fill(image, (x, y, x + 0.15, y + 0.085), (208, 208, 214))
         paint.fill(image, (x + 0.012, y + 0.006, x + 0.138, y + 0.07), WHITE)
 
 
 def _tomato(image: np.ndarray) -> None:
-    """Draw tomatoes into a label."""
+    """Draw tomatoes onto a label."""
     paint.fill(image, (0.0, 0.48, 1.0, 0.84), (248, 240, 222))
     for x in (0.28, 0.5, 0.72):
         paint.dot(image, x, 0.66, 0.14, (206, 40, 30))
@@ -170,8 +173,8 @@ def _tomato(image: np.ndarray) -> None:
         paint.dot(image, x, 0.535, 0.04, (60, 128, 50))
 
 
-def _leaf(image: np.ndarray) -> None:
-    """Draw mustard flowers into a label."""
+def _flowers(image: np.ndarray) -> None:
+    """Draw mustard flowers onto a label."""
     paint.fill(image, (0.0, 0.48, 1.0, 0.84), (176, 32, 28))
     for x in (0.3, 0.5, 0.7):
         for angle in np.arange(6) * np.pi / 3:
@@ -180,7 +183,7 @@ def _leaf(image: np.ndarray) -> None:
 
 
 def _fish(image: np.ndarray) -> None:
-    """Draw a fish into a label."""
+    """Draw a fish onto a label."""
     paint.fill(image, (0.0, 0.5, 1.0, 0.84), (120, 186, 206))
     for x in np.linspace(-0.18, 0.18, 19):
         paint.dot(image, 0.48 + x, 0.67, 0.11 * float(np.sqrt(1 - (x / 0.2) ** 2)), (44, 66, 96))
@@ -190,7 +193,7 @@ def _fish(image: np.ndarray) -> None:
 
 
 def _swirl(image: np.ndarray) -> None:
-    """Draw a bowl of pudding into a label."""
+    """Draw a bowl of pudding onto a label."""
     paint.dot(image, 0.5, 0.68, 0.19, (240, 232, 216))
     for radius in (0.16, 0.11, 0.06):
         paint.dot(image, 0.5, 0.68, radius, (116, 66, 40))
@@ -198,7 +201,7 @@ def _swirl(image: np.ndarray) -> None:
 
 
 def _cherries(image: np.ndarray) -> None:
-    """Draw cherries into a label."""
+    """Draw cherries onto a label."""
     for x, y in ((0.36, 0.7), (0.6, 0.74), (0.48, 0.64)):
         paint.dot(image, x, y, 0.13, (140, 10, 40))
         paint.dot(image, x - 0.035, y - 0.045, 0.03, (250, 170, 190))
@@ -206,7 +209,7 @@ def _cherries(image: np.ndarray) -> None:
 
 
 def _slices(image: np.ndarray) -> None:
-    """Draw slices of meat into a label."""
+    """Draw slices of meat onto a label."""
     paint.fill(image, (0.0, 0.5, 1.0, 0.84), (250, 202, 40))
     for x in (0.26, 0.42, 0.58, 0.74):
         paint.dot(image, x, 0.67, 0.15, (150, 60, 56))
@@ -215,7 +218,7 @@ def _slices(image: np.ndarray) -> None:
 
 
 def _bubbles(image: np.ndarray) -> None:
-    """Draw bubbles into a label."""
+    """Draw bubbles onto a label."""
     for x, y, radius in ((0.3, 0.6, 0.08), (0.5, 0.72, 0.13), (0.72, 0.6, 0.1), (0.66, 0.8, 0.05), (0.28, 0.78, 0.06)):
         paint.dot(image, x, y, radius, (170, 214, 246))
         paint.dot(image, x, y, radius * 0.86, (70, 146, 220))

@@ -34,7 +34,7 @@ SILVER: Color = (204, 205, 208)
 Shape = tuple[Patch, np.ndarray]
 """Surface of an object and its texture (H, W, 3) uint8."""
 Motif = Callable[[np.ndarray], None]
-"""Function that draws a picture into a label."""
+"""Function that draws a picture onto a label."""
 
 
 @dataclass(frozen=True)

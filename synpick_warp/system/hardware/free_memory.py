@@ -1,6 +1,6 @@
-"""Free memory of devices and of the host, which counts the limits of control groups (cgroups) of containers.
+"""Free memory of GPUs and of the host, within the limits of control groups (cgroups), as containers have them.
 
-Every number is an upper bound: memory that the system can take back from caches, and swap, count as free.
+Every number is an upper bound: caches that the system can reclaim, and swap, count as free.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ _FILES = {
 
 
 def free_device_memory(device: wp.Device) -> int:
-    """Free memory of a GPU [bytes], with what this process's memory pool holds but does not use."""
-    with contextlib.suppress(RuntimeError):  # If memory is too short for a context, the queries below raise.
+    """Free memory of a GPU [bytes], plus the part of Warp's memory pool in this process that is not in use.
+
+    The pool keeps what it once had: its size is taken as its peak use. If memory is too short for a CUDA context, the queries raise.
+    """
+    with contextlib.suppress(RuntimeError):  # Left to the queries below.
         _ = device.context  # Warp keeps it; without it each query would create a CUDA context and destroy it, which takes 0.9 s.
     free = device.free_memory
     if device.is_mempool_supported:
@@ -34,20 +37,21 @@ def free_device_memory(device: wp.Device) -> int:
 
 
 def free_host_memory(root: Path = Path("/")) -> int:
-    """Free memory of the host [bytes]: what the kernel can make available, at most what the control groups leave, and free swap.
+    """Free memory of the host [bytes]: what the kernel can make available (without /proc/meminfo: all), at most what each control group
+    leaves; plus free swap, which no group's limit is applied to.
 
     Args:
         root: Folder in which /proc and /sys lie; tests pass another one.
     """
     table = _read_table(root / "proc/meminfo")
-    # meminfo has kibibytes; machines without it have no swap that is known.
+    # meminfo is in kibibytes. Without it, swap is unknown and counts as none.
     available, swap = table.get("MemAvailable:", 0) << 10, table.get("SwapFree:", 0) << 10
     if not available:
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min([available, *_group_limits(root)]) + swap
+    return min([available, *_group_remainders(root)]) + swap
 
 
-def _group_limits(root: Path) -> Iterator[int]:
+def _group_remainders(root: Path) -> Iterator[int]:
     """Memory that each control group of this process leaves [bytes]; groups without a limit are left out."""
     for version, group in list_control_groups("memory", root):
         limit_name, used_name, cached = _FILES[version]
@@ -58,6 +62,6 @@ def _group_limits(root: Path) -> Iterator[int]:
 
 
 def _read_table(path: Path) -> dict[str, int]:
-    """Numbers by name, of lines that begin with a name and a number."""
+    """Parse a table of lines that begin with a name and a number: name -> number."""
     words = (line.split() for line in read_text(path).splitlines())
     return {parts[0]: int(parts[1]) for parts in words if len(parts) > 1 and parts[1].isdecimal()}
