@@ -1,7 +1,8 @@
-"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, and the cell of configs/CELL.md.
+"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, and the robot cell of
+configs/CELL.md.
 
-Makes three small bakes of embedded objects under embedded light maps, and runs the first steps of that page, in a temporary folder; takes
-more than ten minutes on two CPU cores.
+Bakes (simulates and renders) three small data sets of embedded objects under embedded environment maps, and runs the first code blocks of
+that page, in a temporary folder; takes more than ten minutes on two CPU cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0
@@ -61,9 +62,9 @@ PANEL = (480, 270)
 """Width and height of an image in the strip [px]."""
 CAPTION_SCALE = 0.5
 CELL_WIDTH, STEPS = 1000, 3
-"""Width of the picture of the cell [px], and blocks of the page that lead to it: files, a mesh, and the cell."""
-GIF_WIDTH, GIF_COLORS, GIF_STRIDE = 400, 96, 2
-"""Width [px], palette size, and frames per drawn frame: 7.5 Hz of simulated time."""
+"""Width of the picture of the cell [px], and number of code blocks of the page that make it: its files, a mesh, the rendered cell."""
+GIF_WIDTH, GIF_COLORS, GIF_STRIDE, FRAME_RATE = 400, 96, 2, 15
+"""Width [px], palette size, episode frames per GIF frame, and frame rate of episodes [Hz]: the GIF has 7.5 Hz, in real time."""
 LEAD_OUT = 6
 """Frames after the end of the attempt."""
 
@@ -84,7 +85,7 @@ def main(arguments: list[str] | None = None) -> int:
             baked = {name: list(synpick_warp.open(Path(folder) / name).values()) for name, _, _ in BAKES}
             print(write_picture(options.out / STRIP, draw_strip(*baked["strip"])))
             print(write_animation(options.out / PICK, draw_pick(*baked["pick"])))
-            print(write_picture(options.out / TABLES, draw_tables(baked["tables"])))
+            print(write_picture(options.out / TABLES, draw_training_views(baked["tables"])))
             print(write_picture(options.out / CELL, draw_cell(Path(folder))))
     except SynpickError as error:
         return fail("draw_pictures", error)
@@ -92,7 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def draw_strip(episode: Episode) -> Image:
-    """Colour, depth, visible masks, amodal masks, normals and flow of the view with the most motion."""
+    """Two rows of panels: colour, depth, visible masks, amodal masks, normals and flow of the view with the most motion."""
     view = max(episode.views(camera=0), key=lambda view: float(np.nansum(np.abs(view.layer("flow")))))
     panels = {
         "RGB": view.rgb[..., ::-1],
@@ -107,7 +108,7 @@ def draw_strip(episode: Episode) -> Image:
 
 
 def draw_masks(view: View, masks: np.ndarray, outline: bool = False) -> Image:
-    """Masks in their instances' colours over the darkened image; as outlines where masks overlap."""
+    """Masks in their instances' colours over the darkened grey image; with `outline` half transparent with contours, for overlaps."""
     gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
     picture = np.repeat((gray // 3)[..., None], 3, axis=2)
     for instance, mask in zip(view.instance_ids.tolist(), masks, strict=True):
@@ -130,8 +131,8 @@ def captioned(image: Image, text: str) -> Image:
     return picture
 
 
-def draw_tables(episodes: list[Episode]) -> Image:
-    """Grid of training views: of each episode the first frame, seen by the camera with the episode's number."""
+def draw_training_views(episodes: list[Episode]) -> Image:
+    """Grid of views: the first frame of each episode, seen by the camera with the episode's index."""
     views = [episode.view(0, camera=camera).rgb[..., ::-1] for camera, episode in enumerate(episodes)]
     rows = [np.concatenate(views[first : first + TABLE_COLUMNS], axis=1) for first in range(0, len(views), TABLE_COLUMNS)]
     return np.concatenate(rows)
@@ -153,7 +154,7 @@ def draw_pick(episode: Episode) -> list[Image]:
 
 
 def draw_cell(folder: Path) -> Image:
-    """Picture of the cell that the first blocks of the page make, in an empty folder.
+    """Picture of the robot cell that the first STEPS code blocks of the page make in a folder without a CELL: CELL/cell.png.
 
     Raises:
         SynpickError: A block failed.
@@ -170,12 +171,12 @@ def draw_cell(folder: Path) -> Image:
 
 
 def write_animation(path: Path, frames: list[Image]) -> Path:
-    """Write frames as an endless GIF with one palette."""
+    """Write frames as an endlessly looping GIF with one palette, that of the middle frame."""
     pictures = [PillowImage.fromarray(np.ascontiguousarray(frame[..., ::-1])) for frame in frames]
     palette = pictures[len(pictures) // 2].quantize(GIF_COLORS)
     first, *rest = (picture.quantize(palette=palette, dither=PillowImage.Dither.NONE) for picture in pictures)
     path.parent.mkdir(parents=True, exist_ok=True)
-    first.save(path, save_all=True, append_images=rest, duration=round(1000 * GIF_STRIDE / 15), loop=0, optimize=True)
+    first.save(path, save_all=True, append_images=rest, duration=round(1000 * GIF_STRIDE / FRAME_RATE), loop=0, optimize=True)
     return path
 
 

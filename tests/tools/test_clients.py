@@ -19,7 +19,7 @@ from tools.clients import __main__ as tool
 from tools.clients import base, environments
 from tools.clients.process import NOT_INSTALLED
 from tools.clients.reader import CLIENTS
-from tools.clients.trajectories import develop
+from tools.clients.trajectories import tone_map
 
 CAMERAS = cameras(160, 120)
 FRAMES = 2
@@ -94,7 +94,7 @@ def test_values_are_compared_by_difference_and_pictures_by_psnr():
 
 def test_blenders_light_goes_through_our_tone_curve():
     """Linear to sRGB up to 0.6; continuous there; below 1 for any light."""
-    developed = develop(np.array([0.0, 0.18, 0.6, 0.6001, 100.0]))
+    developed = tone_map(np.array([0.0, 0.18, 0.6, 0.6001, 100.0]))
     np.testing.assert_allclose(developed[:4], [0.0, 0.4614, 0.7977, 0.7978], atol=1e-4)
     assert 0.99 < developed[4] <= 1.0
 

@@ -1,6 +1,7 @@
-"""Parts that vary one thing: growth by worlds, objects, pictures, like parts; heaps of many instances; replacements of Newton's parts.
+"""Benchmarks that vary one setting: scaling with the number of worlds, objects, pixels or equal workpieces; perception of heaps of many
+instances; physics with and without our replacements of Newton's components.
 
-Physics of growth is that of piles DROP_TICKS ticks after the drop, without gripper; the pictures show these piles.
+For scaling, physics is timed from DROP_TICKS ticks after the objects are dropped, without gripper; rendering is timed on these piles.
 """
 
 from __future__ import annotations
@@ -50,24 +51,25 @@ FACTORS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (
 """Values of each factor: paths per coarse pixel, and multiples of the settings' own worlds, volume of the objects, image width and height,
 cameras."""
 DROP_TICKS, REST_TICKS = 24, 36
-"""Ticks from the drop to the measurement, 1.6 s, in which nearly all objects land; and from there to one at rest, 4 s after the drop."""
+"""Ticks from the drop to the first measurement (1.6 s: nearly all objects have landed), and from its end to the second (2.4 s: objects
+should be at rest, which is not checked)."""
 PART = "bracket"
-"""Part whose piles are measured if the settings have no counts."""
+"""Workpiece whose piles are measured if the settings have no counts."""
 INSTANCES = (10, 32, 64, 128, 251)
 """Numbers of instances of a heap; the last is the largest that segmentation ids have room for."""
 HEAP_WORLDS = 64
 """Most worlds of a heap."""
 SMALL, DENSITY, MAX_HEIGHT = 4, 0.5, 0.4
-"""Heap: ratio of the catalog's objects to those in it, the smallest, so that many are visible; volume of the objects relative to it, unless
-it would be higher than this [m]."""
+"""Heap: it takes the smallest 1 / SMALL of the catalog's objects, so that many are visible. DENSITY is their volume over that of the box in
+which they are placed; the box is at most MAX_HEIGHT high [m], and then denser."""
 WARM_UP_TICKS, TICKS = 8, 80
-"""Ticks before a measurement of replacements, in which kernels are loaded and graphs captured, and ticks measured: 5 s of an episode."""
+"""Ticks before a measurement of replacements, in which kernels are loaded and graphs captured; and ticks measured, 5 s of an episode."""
 NEWTONS_OWN = {
     "the fused solver": ("choose_solver", lambda device: newton.solvers.SolverSteel),
     "the separating broad phase": ("replace_broad_phase", lambda pipeline: None),
     "the launch sizes of the narrow phase": ("resize_blocks", lambda pipeline: None),
 }
-"""Functions of `stages.sim.physics` that install a replacement, and functions in their place that leave Newton's own."""
+"""Replacement -> function of `stages.sim.physics` that installs it, and one to put in its place, which keeps Newton's own component."""
 
 
 # ---- growth ----
@@ -75,7 +77,7 @@ NEWTONS_OWN = {
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """Measurements of worlds with the settings of a run of the benchmark."""
+    """One configuration to measure: settings of a run of the benchmark, catalog and lights."""
 
     bench: Bench
     catalog: Catalog
@@ -88,7 +90,7 @@ class Variant:
 
     @property
     def steps(self) -> int:
-        """Steps of all worlds in a tick."""
+        """Physics steps in a tick, over all worlds."""
         return self.config.physics.steps_per_tick * self.config.bake.worlds
 
     def build_scene(self) -> RenderScene:
@@ -97,8 +99,8 @@ class Variant:
         fixtures, cameras = make_fixtures(make_bins(config.cell.bins), config.gripper), make_cameras(config.rig)
         return build_render_scene(config.render, -config.tote.wall, self.catalog, fixtures, cameras, self.lights, self.bench.device)
 
-    def simulate(self, scene: RenderScene | None) -> Simulation:
-        """New worlds, in which piles never count as settled."""
+    def make_simulation(self, scene: RenderScene | None) -> Simulation:
+        """Simulation whose piles never count as settled, so that episodes do not go on to their next phase."""
         lights, worlds = max(1, len(self.lights)), range(self.config.bake.worlds)
         simulation = Simulation(self.config, self.catalog, lights, self.bench.device, scene, worlds)
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
@@ -122,9 +124,9 @@ class Variant:
 
 
 def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
-    """The settings with one factor changed, and its new value in words; `value` is a multiple of the old one, or the number of paths.
+    """Settings with one factor changed, and its new value in words; `value` is a multiple of the old one, or the number of paths.
 
-    More cameras than there are are these again, turned by 180° about the vertical.
+    If there are to be more cameras, those of the settings are repeated, every other round turned by 180° about the vertical.
     """
     if factor == "worlds":
         worlds = max(1, round(value * config.bake.worlds))
@@ -144,13 +146,14 @@ def vary(config: Config, factor: str, value: float) -> tuple[str, Config]:
 
 
 def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
+    """The cameras' vectors `name`, repeated up to `count`, every other round turned by 180° about z."""
     vectors = getattr(cameras, name)
     repeats = math.ceil(count / len(vectors))
     return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
 
 
 def measure_growth(bench: Bench) -> Iterator[MeasuredRow]:
-    """Measure the settings themselves, then each factor's values; or physics alone of `bench.instances` like parts."""
+    """Measure the settings themselves, then each factor's values; or, with `bench.instances`, physics alone of equal workpieces."""
     started = time.perf_counter()
     yield from _measure_instances(bench) if bench.instances else _measure_factors(bench)
     yield MeasuredRow("all measurements", time.perf_counter() - started, "s")
@@ -171,9 +174,9 @@ def _measure_factors(bench: Bench) -> Iterator[MeasuredRow]:
 def _measure_point(
     name: str, variant: Variant, scene: RenderScene, piles: Snapshot | None = None
 ) -> Generator[MeasuredRow, None, Snapshot]:
-    """Rows of a view of some piles, which it returns; None: of piles that are dropped for it, with rows of their physics."""
+    """Rows of one measured setting: time of a view of `piles`, which it returns; None: drop them first, with rows of physics."""
     if piles is None:
-        simulation = variant.simulate(scene)
+        simulation = variant.make_simulation(scene)
         seconds, piles = variant.time_ticks(simulation, DROP_TICKS), simulation.record.snapshot
         yield MeasuredRow(f"{name}: objects a tote", float((piles.catalog_index.numpy() >= 0).sum(axis=1).mean()))
         yield MeasuredRow(f"{name}: physics of a tick", 1e3 * seconds, "ms")
@@ -186,15 +189,14 @@ def _measure_point(
 
 
 def number_settings(counts: Counts, number: int) -> dict[str, Any]:
-    """Settings of `number` of the part of `counts` that there are most of, alone, dropped in layers."""
+    """Settings by which `number` copies of one workpiece are dropped, in layers: of the one with the largest number in `counts`."""
     part = max(counts or ((PART, 1, 1),), key=lambda row: row[2])[0]
     fill = {"arrangement.counts": ((part, number, number),), "arrangement.max_objects": number, "arrangement.drop": LAYERED}
     return {"bake.mode": "move"} | fill | ({} if counts else {"objects.embedded": ("industrial",)})
 
 
 def _measure_instances(bench: Bench) -> Iterator[MeasuredRow]:
-    """Time of a tick, contacts and memory of piles of like parts in the same bin, DROP_TICKS after the drop, while nearly all lie, and as
-    soon as all rest.
+    """Time of a tick, contacts and memory of piles of equal workpieces in one bin, DROP_TICKS after the drop and REST_TICKS later.
 
     Raises:
         ConfigError: A number does not fit into the bin, or into the device's memory.
@@ -203,31 +205,32 @@ def _measure_instances(bench: Bench) -> Iterator[MeasuredRow]:
     varied = [config.with_values(number_settings(config.arrangement.counts, number)) for number in bench.instances]
     catalog, bins = load_catalog(max(varied, key=lambda each: each.arrangement.max_objects)), make_bins(config.cell.bins)
     for fitted in [fit_to_catalog(each, catalog, bins, device, SilentProgress()) for each in varied]:
-        yield from _measure_like_parts(Variant(replace(bench, config=fitted), catalog))
+        yield from _measure_equal_parts(Variant(replace(bench, config=fitted), catalog))
 
 
-def _measure_like_parts(pile: Variant) -> Iterator[MeasuredRow]:
-    """Rows of landing and resting parts, of contacts and of memory."""
-    config, device = pile.config, pile.bench.device
+def _measure_equal_parts(variant: Variant) -> Iterator[MeasuredRow]:
+    """Rows of landing and of resting workpieces, of contacts, of overlapping bounding boxes (broad phase) and of memory."""
+    config, device = variant.config, variant.bench.device
     worlds, before = config.bake.worlds, _memory_in_use(device)
-    simulation, name = pile.simulate(None), f"{pile.config.arrangement.max_objects} instances"
+    simulation, name = variant.make_simulation(None), f"{config.arrangement.max_objects} instances"
     for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
-        seconds = pile.time_ticks(simulation, ticks)
+        seconds = variant.time_ticks(simulation, ticks)
         yield MeasuredRow(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
-        yield MeasuredRow(f"{name}, {state}: world-steps", pile.steps / seconds, "1/s")
-        yield MeasuredRow(f"{name}, {state}: part-steps", pile.steps * config.arrangement.max_objects / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: world-steps", variant.steps / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: part-steps", variant.steps * config.arrangement.max_objects / seconds, "1/s")
     own = simulation.physics
     for what, array in (("contacts", own.contacts.rigid_contact_count), ("overlaps", own.overlap_count)):
         yield MeasuredRow(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
-    yield MeasuredRow(f"{name}: worlds without overflow", 100.0 * float(np.mean(~own.solver.constraint_overflow.numpy()[:-1])), "%")
+    overflow = own.solver.constraint_overflow.numpy()[:-1]  # The last entry is that of bodies outside of all worlds.
+    yield MeasuredRow(f"{name}: worlds without overflow", 100.0 * float(np.mean(~overflow)), "%")
     yield MeasuredRow(f"{name}: memory of the physics", (_memory_in_use(device) - before) / GIB, "GiB")
-    pieces = max(len(pile.catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, pile.catalog))
+    pieces = max(len(variant.catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, variant.catalog))
     terms = [term for term in plan_memory(config, device, 0, pieces) if term.name.startswith(("Newton", "the state", "separating"))]
     yield MeasuredRow(f"{name}: memory planned for it, at least", sum(term.size for term in terms) / GIB, "GiB")
 
 
 def _memory_in_use(device: wp.Device) -> int:
-    """Memory in use: of Warp's pool on a GPU, or the peak resident set of the process [bytes]."""
+    """Memory in use of Warp's pool on a GPU; on the CPU the peak resident set of the process [bytes]."""
     if device.is_cuda:
         wp.synchronize_device(device)
         return int(wp.get_mempool_used_mem_current(device))
@@ -238,8 +241,8 @@ def _memory_in_use(device: wp.Device) -> int:
 
 
 def measure_heaps(bench: Bench) -> Iterator[MeasuredRow]:
-    """Measure perception of heaps of INSTANCES: objects in random poses, which may overlap. Nothing is simulated, so that any number is
-    quick."""
+    """Measure perception of heaps of INSTANCES: objects in random poses, which may overlap. Edges of the clutter graph: one object above
+    another. Nothing is simulated, so that any number is quick."""
     worlds = min(bench.config.bake.worlds, HEAP_WORLDS)
     config = replace(bench.config, bake=replace(bench.config.bake, worlds=1, mode="pick"))
     own, device = Variant(replace(bench, config=config), load_catalog(config), load_lights(config.bake.lights)), bench.device
@@ -264,7 +267,7 @@ def measure_heaps(bench: Bench) -> Iterator[MeasuredRow]:
 
 
 def heap(catalog: Catalog, floor: tuple[float, ...], seed: int, worlds: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Small objects, repeated (world, instance) int32, and their random poses above a floor [m] (world, instance, 7) float32."""
+    """Catalog indices of small objects, repeated (world, instance) int32, and their random poses above a floor [m] (world, instance, 7)."""
     numbers = np.random.default_rng(seed)
     volume = np.array([entry.volume for entry in catalog.entries])
     room = np.array(floor)
@@ -279,11 +282,12 @@ def heap(catalog: Catalog, floor: tuple[float, ...], seed: int, worlds: int, cou
     return entry, pose
 
 
-# ---- replacements of Newton's parts ----
+# ---- replacements of Newton's components ----
 
 
 def measure_patches(bench: Bench) -> Iterator[MeasuredRow]:
-    """Rates of physics in mode move with all replacements (`newton_patches`), without each, without any, and with all once more.
+    """Ablation study: rates of physics in mode move with all replacements (`newton_patches`), without each, without any, and with all again
+    to show the noise.
 
     The same piles fall, come to rest and are stirred in every run, since all variants find the same contacts.
     """
@@ -299,7 +303,7 @@ def measure_patches(bench: Bench) -> Iterator[MeasuredRow]:
 
 
 def _time_stirring(simulation: Simulation) -> float:
-    """Time of TICKS ticks [s]."""
+    """Time of TICKS ticks in which the gripper stirs [s], after the warm-up."""
     for _ in range(WARM_UP_TICKS):
         simulation.tick()
     wp.synchronize_device(simulation.device)

@@ -53,7 +53,7 @@ def compare(client: Client, read: Values, expected: Values) -> tuple[str, bool]:
     wrong, ratios, largest = [], [], 0.0
     for name in common:
         if name.startswith(PICTURE):
-            ratios.append(psnr(client.develop(read[name]), expected[name]))
+            ratios.append(psnr(client.tone_map(read[name]), expected[name]))
             wrong += [name] if ratios[-1] < PSNR else []
             continue
         error = difference(read[name], expected[name])

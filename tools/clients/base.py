@@ -1,4 +1,5 @@
-"""Contract of a client, and what clients share. Imports NumPy only, as clients also run in interpreters that have nothing of ours."""
+"""Interface of a client, a third-party library that reads our formats, and shared helpers. Imports only NumPy: clients also run in
+interpreters without our packages."""
 
 from __future__ import annotations
 
@@ -15,10 +16,11 @@ SAMPLES = 3
 PICTURE = "picture"
 """Prefix of values that are pictures from 0 to 1; they are compared by PSNR."""
 PSNR = 28.0
-"""Lowest PSNR of a picture [dB]: lossy video, and a path tracer's noise against our denoiser, stay above; a wrong light does not."""
+"""Lowest PSNR of a picture [dB]: lossy video stays above, and so does another path tracer's noise; a wrong light falls below."""
 MILLIMETERS = 1000.0
+"""Millimetres per metre."""
 Values = dict[str, np.ndarray]
-"""What was read, or is in memory, by name; the first word of a name tells its kind, a last number the frame."""
+"""Arrays by name, read by a client or expected; the first word of a name is the kind of value, a last number the frame."""
 
 
 @dataclass
@@ -26,7 +28,7 @@ class ClientReading:
     """Values that a client has read, with remarks and versions for the table."""
 
     what: str
-    """For the table."""
+    """Summary for the printed table, as "3 scenes, 5 classes"."""
     values: Values
     remarks: list[str] = field(default_factory=list)
     versions: dict[str, str] = field(default_factory=dict)
@@ -34,9 +36,9 @@ class ClientReading:
 
 
 def expect_views(data_set: Any) -> Values:
-    """What clients of images may read of the sampled views, as `synpick_warp.open` has it in memory; all are compared that were read.
+    """Expected values of the sampled views, from `synpick_warp.open`. A client need not read all: those that it read are compared.
 
-    Names with `visible_` are of the instances with visible pixels alone. Depth is in metres, `depth_count` in counts, which are integers.
+    `visible_...`: only of the instances with visible pixels. `depth` is in metres, `depth_count` in integer counts of `depth_scale`.
     """
     values: Values = {}
     for frame, view in sampled_views(data_set).items():
@@ -62,21 +64,21 @@ def expect_views(data_set: Any) -> Values:
 
 @dataclass(frozen=True)
 class Client:
-    """Other people's reader of one of our formats."""
+    """A third-party reader of one of our formats, and how its values are compared with ours."""
 
     packages: tuple[str, ...]
     """Distributions that it needs; the first one's version is printed."""
     find: Callable[[Path], Path | None]
     """File or folder of a data set that it opens; None: the data set has not that format."""
     read: Callable[[Path, Path, str], ClientReading]
-    """What the client makes of it, given that, the data set's folder, and that of a copy of the BOP toolkit (empty: none). Runs in the
+    """Reads, from the path that `find` returned, the data set's folder, and that of a copy of the BOP toolkit (empty: none). Runs in the
     client's interpreter."""
     expect: Callable[[Any], Values] = expect_views
-    """The same values as `synpick_warp.open` has them in memory, by the same names. Runs in ours."""
+    """Expected values, by the same names, of a data set opened by `synpick_warp.open`. Runs in our interpreter."""
     bounds: Mapping[str, float] = field(default_factory=dict)
-    """Largest absolute difference by kind of value (0 if it is not named)."""
-    develop: Callable[[np.ndarray], np.ndarray] = np.asarray
-    """What makes a picture of the client comparable with ours. Runs in ours."""
+    """Largest absolute difference allowed, by kind of value (0 if not listed)."""
+    tone_map: Callable[[np.ndarray], np.ndarray] = np.asarray
+    """Maps a picture of the client to one like ours, as by tone mapping. Runs in our interpreter."""
 
 
 def sample_frames(count: int) -> list[int]:

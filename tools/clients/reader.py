@@ -1,4 +1,5 @@
-"""Table of all clients, and the process of one of them: it reads, and leaves values in an .npz file and a report in JSON."""
+"""Table of clients, third-party libraries that read our data sets in a test, and the script that runs one of them: it saves what it read
+(.npz) and a report (.json)."""
 
 from __future__ import annotations
 
@@ -15,49 +16,53 @@ from tools.clients.base import Client, find_in, find_usd, first_scene, first_sha
 
 CLIENTS = {
     "bop_toolkit": Client(
-        ("bop_toolkit_lib", "numpy"),
-        first_scene,
-        images.read_bop_toolkit,
-        images.expect_bop_toolkit,
-        {"depth": 1e-5, "world_to_camera": 1e-12, "object_to_camera": 1e-12, "model": 1e-4},  # [m]; models in float32 [mm].
+        packages=("bop_toolkit_lib", "numpy"),
+        find=first_scene,
+        read=images.read_bop_toolkit,
+        expect=images.expect_bop_toolkit,
+        bounds={"depth": 1e-5, "world_to_camera": 1e-12, "object_to_camera": 1e-12, "model": 1e-4},  # [m]; models [mm], stored in float32.
     ),
     "shards": Client(("webdataset", "torch", "synpick-warp"), first_shard, images.read_shards, bounds={"depth": 1e-6}),
     "pytorch": Client(("torch", "synpick-warp"), images.find_views, images.read_pytorch, bounds={"visible_pose": 1e-6}),
     "hugging_face": Client(("datasets", "pillow"), images.find_shards, images.read_hugging_face),
     "coco": Client(("pycocotools",), images.find_coco, images.read_coco, images.expect_coco),
     "yolo": Client(
-        ("ultralytics", "supervision"),
-        find_in("yolo/data.yaml"),
-        images.read_yolo,
-        images.expect_yolo,
-        {
-            "box": 1e-3,
-            "box_of_segment": 0.61,
-            "oriented_area": 0.02,
-        },  # Boxes, those that Ultralytics takes from segments [px]; areas, relative.
+        packages=("ultralytics", "supervision"),
+        find=find_in("yolo/data.yaml"),
+        read=images.read_yolo,
+        expect=images.expect_yolo,
+        bounds={
+            "box": 1e-3,  # [px]
+            "box_of_segment": 0.61,  # [px]; computed by Ultralytics from segments.
+            "oriented_area": 0.02,  # Relative.
+        },
     ),
     "xarray_store": Client(("xarray", "zarr"), find_in("trajectory.zarr"), trajectories.read_xarray, trajectories.expect_ticks),
     "newton_usd": Client(
-        ("newton", "newton-usd-schemas", "usd-core"),
-        find_usd,
-        trajectories.read_newton,
-        trajectories.expect_first_frame,
-        {"object_to_world": 1e-6},  # Newton keeps poses in float32, BOP files have translations in millimetres.
+        packages=("newton", "newton-usd-schemas", "usd-core"),
+        find=find_usd,
+        read=trajectories.read_newton,
+        expect=trajectories.expect_first_frame,
+        bounds={"object_to_world": 1e-6},  # Newton keeps poses in float32, BOP files have translations in millimetres.
     ),
     "blender": Client(
-        ("bpy",),
-        find_usd,
-        trajectories.read_blender,
-        trajectories.expect_blender,
-        {"object_to_world": 2e-6, "camera_to_world": 2e-6, "focal": 1e-3},  # 32-bit matrices [m]; focal length, relative to the width.
-        trajectories.develop,
+        packages=("bpy",),
+        find=find_usd,
+        read=trajectories.read_blender,
+        expect=trajectories.expect_blender,
+        bounds={
+            "object_to_world": 2e-6,  # [m]; matrices in float32.
+            "camera_to_world": 2e-6,
+            "focal": 1e-3,  # Relative to the width.
+        },
+        tone_map=trajectories.tone_map,
     ),
     "lerobot": Client(
-        ("av", "pyarrow", "lerobot", "torch"),
-        trajectories.find_lerobot,
-        trajectories.read_lerobot,
-        trajectories.expect_lerobot,
-        {"position": 1e-6, "dataset": 1e-6},
+        packages=("av", "pyarrow", "lerobot", "torch"),
+        find=trajectories.find_lerobot,
+        read=trajectories.read_lerobot,
+        expect=trajectories.expect_lerobot,
+        bounds={"position": 1e-6, "dataset": 1e-6},
     ),
 }
 """Clients by name, in the order of the table's rows."""
@@ -72,7 +77,8 @@ def version_of(package: str) -> str:
 
 
 def main() -> None:
-    """Run one client in this process; arguments: NAME PLACE DATA OUT TOOLKIT."""
+    """Run one client in this process; arguments: its name, the file or folder it opens, the data set's folder, the folder for results, and
+    that of a copy of the BOP toolkit (empty: none)."""
     name, place, data, out, toolkit = sys.argv[1:]
     client = CLIENTS[name]
     reading = client.read(Path(place), Path(data), toolkit)

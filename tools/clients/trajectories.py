@@ -164,8 +164,8 @@ def expect_blender(data_set: Any) -> Values:
     return values | {f"{PICTURE} {frame}": cv2.resize(view.rgb, size, interpolation=cv2.INTER_AREA) / 255.0}
 
 
-def develop(radiance: np.ndarray) -> np.ndarray:
-    """Cycles' linear radiance as an sRGB picture like ours: our tone curve ("shoulder"), then sRGB's transfer curve."""
+def tone_map(radiance: np.ndarray) -> np.ndarray:
+    """Tone-map Cycles' linear radiance to an sRGB picture like ours: our tone curve ("shoulder"), then sRGB's transfer curve."""
     linear = np.maximum(radiance.astype(np.float64), 0.0)
     rest = 1.0 - SHOULDER_START
     bent = SHOULDER_START + rest * (1.0 - np.exp(np.minimum(SHOULDER_START - linear, 0.0) / rest))
