@@ -1,7 +1,7 @@
-"""Conversion of a BOP data set from another source to formats of images. Scene and image ids are kept; images are copied without decoding
-where the format has the same file type; annotations are written as they were read.
+"""Conversion of a BOP data set from another source to data set formats of single images. Scene and image ids are kept; image files are
+copied without decoding where the format has the same file type; annotations are written as they were read.
 
-The result has no settings and no manifest either. It is written to a temporary folder and renamed when it is complete.
+Like the source, the result has no settings and no manifest. It is written to a temporary folder and renamed when it is complete.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ _NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib), nor model
 _NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
 """What formats need of a scene, by the names of `SceneFiles.has`."""
 _BAKED = (CAMERA_FILE, "README.md")
-"""Files of exporters that describe a bake, its camera or its licence."""
+"""Files that exporters write about the camera and licence of a bake: removed, since they are not true of the source's images."""
 _CAMERA = re.compile(r"camera(_\w+)?\.json")
 """Cameras of a split or a sensor."""
 _JPEG_QUALITY = 95
@@ -67,7 +67,7 @@ _JPEG_QUALITY = 95
 
 
 class ForeignViewFiles(StoredViewFiles):
-    """`StoredView` of any BOP scene: images of other formats and sizes are encoded or refused, missing masks are rendered."""
+    """`StoredView` of any BOP scene: other file formats are encoded again, other image sizes refused, missing masks rendered."""
 
     def __init__(self, files: SceneFiles, scene: int, frame: int, suffix: str, size: tuple[int, int], root: Path) -> None:
         """`suffix`: of all colour images; `size`: width and height of all images [px]; `root`: folder of the data set; others as of
@@ -89,6 +89,7 @@ class ForeignViewFiles(StoredViewFiles):
 
     @property
     def color(self) -> tuple[str, Buffer]:
+        """Suffix and content of the colour image's file, copied or encoded again; DatasetError if its size is not that of the first."""
         size = self.files.image_size(self.frame)
         if size != self.size:
             shown, first = (f"{width} x {height}" for width, height in (size, self.size))
@@ -100,11 +101,13 @@ class ForeignViewFiles(StoredViewFiles):
         return self.suffix, encode_png(image) if self.suffix == ".png" else encode_jpeg(image, _JPEG_QUALITY)
 
     def layer(self, name: str) -> Buffer:
+        """PNG file of a layer, as depth: copied, or encoded again with 16 bits."""
         suffix, data = self.files.image_file(name, self.frame)
         return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:
-        """Run lengths of masks; where there are no amodal ones, COCO's formats need none; without masks, they are rendered."""
+        """Run lengths of amodal and visible masks, rendered if the source has no visible ones. Missing amodal ones are
+        given as the visible ones: the formats allowed then (coco, yolo) do not write them."""
         if not self.files.has("mask_visib"):
             return [Masks(find_runs(amodal), find_runs(visible)) for amodal, visible in self._rendered]
         visible = self._runs("mask_visib")
@@ -123,9 +126,13 @@ def _renderer(root: Path) -> ObjectRenderer:
 def render_masks(
     root: Path, files: SceneFiles, frame: int, camera: dict[str, Any], gt: list[dict[str, Any]]
 ) -> list[tuple[np.ndarray, ...]]:
-    """Render the amodal and visible mask (H, W) bool of each instance of a view, by `camera` and `gt`, its entries in scene_camera.json and
-    scene_gt.json, with the models of the data set `root`; raises DatasetError if an object has no model, or the image no intrinsics, and
-    CatalogError if a model cannot be read."""
+    """Render the amodal and visible mask (H, W) bool of each instance of a view, with the models of the data set `root`. `camera`, `gt`:
+    the view's entries in scene_camera.json and scene_gt.json.
+
+    Raises:
+        DatasetError: An object has no model, or the image no intrinsics.
+        CatalogError: A model cannot be read.
+    """
     if "cam_K" not in camera:
         raise DatasetError(f"{files.place}: the camera of image {frame} has no cam_K, by which masks are rendered")
     size = files.image_size(frame)
@@ -144,7 +151,8 @@ def render_masks(
 
 
 def _make_masks(depth: np.ndarray, window: Any, nearest: np.ndarray, measured: np.ndarray | None) -> tuple[np.ndarray, ...]:
-    """Amodal and visible mask (H, W) bool of an object by its depth in a window, the nearest of all, and that of the image (None: none)."""
+    """Amodal and visible mask (H, W) bool of an object. `depth`: rendered, in `window`; `nearest`: least of all objects; `measured`: the
+    depth image (None: there is none), in which 0 hides nothing. All in mm."""
     amodal, visible = np.zeros((2, *nearest.shape), bool)
     amodal[window] = np.isfinite(depth)
     visible[window] = amodal[window] & (depth <= nearest[window])
@@ -154,7 +162,8 @@ def _make_masks(depth: np.ndarray, window: Any, nearest: np.ndarray, measured: n
 
 
 class _Context(ExportContext):
-    """Context of the exporters: objects of models and ground truth, by the models' names or else by numbers; models are copied."""
+    """Context of the exporters. Objects are those that have a model or occur in the ground truth, named as in the models folder or else by
+    number; model files are copied."""
 
     def __init__(self, data: DataSet, out: Path, settings: ExportSettings, pool: WriterPool) -> None:
         super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
@@ -173,7 +182,7 @@ class _Context(ExportContext):
         return {index: named.get(index, f"obj_{index:06d}") for index in sorted(found)}
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """Copy what there is of models."""
+        """Copy the files of models that exist, whichever `names` are given; True: exporters write no others. See `ExportContext`."""
         layout = _found(self._data).layout
         for name in MODEL_FOLDERS:
             source = layout.models.get(name if name in layout.models else models_folder(layout.root))
@@ -185,13 +194,14 @@ class _Context(ExportContext):
 
 
 def _found(data: DataSet) -> ForeignScenes:
+    """Scenes and layout of a data set from another source."""
     assert data.found is not None
     return data.found
 
 
 def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
-    """Convert all scenes of a data set from another source; returns their number, and what was made that the source does not have.
-    Arguments and errors are those of `run.convert`, but `out` is new or empty."""
+    """Convert all scenes of a data set from another source; returns their number, and a remark if masks were rendered (else empty).
+    Arguments and errors: `run.convert`, but `out` must be new or empty."""
     index = next((index for index, episode in data.items() if len(episode)), None)
     if index is None:
         raise DatasetError(f"{data.folder} has no images")
@@ -219,7 +229,8 @@ def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes:
 
 
 def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
-    """Check that the formats can be made of what the first scene has."""
+    """Refuse several splits, and formats that are unknown, need trajectories, exist already, or need what `first`, the first scene of a
+    sensor, lacks. Raises ConfigError."""
     found = _found(data)
     if len(found.splits) > 1:
         raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
@@ -243,12 +254,13 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
 
 
 def _has_masks(scene: SceneFiles) -> bool:
+    """Whether a scene has both amodal and visible masks."""
     return scene.has("mask") and scene.has("mask_visib")
 
 
 def _make_settings(data: DataSet, firsts: Sequence[SceneFiles], formats: Sequence[str]) -> ExportSettings:
-    """Settings by which exporters name and lay out files, with a camera for each sensor (`firsts`: their first scenes); they are written
-    nowhere."""
+    """Settings by which exporters name and lay out files, with a camera for each sensor (`firsts`: their first scenes). The result does not
+    contain them. Mode move has no picks; SPLIT_web is BOP's name of a split in shards."""
     base, masks = load_config(), all(map(_has_masks, firsts))
     suffixes = {first.image_file("rgb", first.frames()[0])[0] for first in firsts}
     config = dataclasses.replace(

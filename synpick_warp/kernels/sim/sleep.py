@@ -86,7 +86,8 @@ def wake_touched_kernel(
 ):
     """Mark the sleeping islands in contact with an awake body: `woken` becomes 1 at the slot that names the island (`island`).
 
-    Contacts begin at twice the contact margin, before surfaces meet. Grid-stride loop over the contacts: launched over `threads`.
+    Contacts begin at a distance of twice the contact margin, so that islands wake before surfaces meet. Grid-stride loop over the contacts:
+    launched over `threads`.
     """
     thread = wp.tid()
     for contact in range(thread, wp.min(contacts.count[0], contacts.shape0.shape[0]), threads):
@@ -207,8 +208,8 @@ def judge_sleep_kernel(
     woken_inout: wp.array2d[int],  # (world, slot)
     motion_out: Motion,
 ):
-    """Put islands to sleep in which every object was quiet for QUIET_TICKS ticks and none is attached to a cup or touches the gripper; wake
-    sleeping islands of which an object was attached or removed. Outside of phase ACT all are awake.
+    """Put an island to sleep if each of its objects was quiet for QUIET_TICKS ticks and none is attached to a cup or touches the gripper;
+    wake it if one of its objects was attached or removed (catalog index -1). Outside of phase ACT all are awake.
 
     Quiet: moved by at most `threshold` [m] in a tick. `island` becomes the slot of the island's root, `woken` zero. Launched over world.
     """
@@ -226,12 +227,12 @@ def judge_sleep_kernel(
         slot = state.body_slot[world, instance]
         is_gone = attempts.removed[world, instance] != 0
         if is_gone or state.catalog_index[world, instance] >= 0:
-            is_held = is_gone or seals.attached[world, instance] != 0
-            quiet = wp.where(not is_held and state.displacement[world, instance] <= threshold, sleepers_inout.quiet[world, slot] + 1, 0)
+            is_taken = is_gone or seals.attached[world, instance] != 0
+            quiet = wp.where(not is_taken and state.displacement[world, instance] <= threshold, sleepers_inout.quiet[world, slot] + 1, 0)
             sleepers_inout.quiet[world, slot] = quiet
             if sleepers_inout.asleep[world, slot] == 0 and quiet < QUIET_TICKS:
                 restless_inout[find_root(parent, first + slot)] = 1
-            if sleepers_inout.asleep[world, slot] != 0 and is_held:
+            if sleepers_inout.asleep[world, slot] != 0 and is_taken:
                 woken_inout[world, sleepers_inout.island[world, slot]] = 1
     for instance in range(layout.instances):
         slot = state.body_slot[world, instance]

@@ -1,4 +1,8 @@
-"""Grasp planning: occlusion votes, clutter graph, choice of the target, grasp pose."""
+"""Grasp planning: who lies on whom, choice of the target, grasp pose.
+
+An occlusion vote that instance j lies above i is a point on the contour of i outside of which a nearer j is visible. The clutter graph, a
+directed acyclic graph, has edges from upper to lower instances by their votes. See the kernels for the rules.
+"""
 
 from __future__ import annotations
 
@@ -32,14 +36,14 @@ from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 @dataclass(frozen=True, eq=False)
 class VoteArrays:
-    """Vote counts, bounding boxes of contours and reaches of instances: scratch of the occlusion votes."""
+    """Scratch of the occlusion votes: vote counts, bounding boxes of contours and reaches of instances."""
 
     count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
-    """Number of votes by kind: full, deep."""
+    """Votes that the second instance lies above the first, by kind: full, or deep (it is seen below the first one's grasp point)."""
     extent: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
     """Bounding box of each contour as maxima: -column, -row, column, row."""
     reach: wp.array = device_array("view", "instance", dtype=wp.float32, unit="px")
-    """Largest distance allowed between a pixel where the instance gets a vote and any point of its contour."""
+    """Bound of an object's size in the image: votes from pixels with a farther point of its contour do not count."""
 
 
 CYCLES = struct_arrays(
@@ -53,7 +57,8 @@ CYCLES = struct_arrays(
 
 
 def allocate_votes(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> tuple[VoteArrays, Any]:
-    """Allocate the scratch of a batch: `VoteArrays`, and the struct `Cycles`."""
+    """Allocate the scratch of a batch: `VoteArrays`, and `Cycles`, with a table of the subsets of `exact_cycle` instances, up to which
+    cycles of the clutter graph are broken at the least loss of votes."""
     sizes = {"view": views, "instance": instances, "word": count_words(instances), "kind": 2}
     sizes["subset"] = 1 << min(settings.exact_cycle, instances)
     return allocate(VoteArrays, sizes, device), allocate_struct(CYCLES, sizes, device)
@@ -84,9 +89,9 @@ class GraspPlanner:
         Args:
             scene: Constants.
             state: State of the worlds.
-            attempts: State of the attempts; `outcome` belongs to the attempt that ended in this tick.
+            attempts: State of the attempts; failed attempts, and the `outcome` of the one that ended in this tick, change the choice.
             observation: Visibility, grasp points and depths are read; point and depth of targets may change.
-            plan: Written; a world without a visible instance gets target -1 and keeps the rest.
+            plan: Written; in a world without a visible instance only the target, to -1.
             seed: Seed of the random choice of targets and grasp points.
         """
         self.bound_contours(scene, state, observation)
@@ -105,16 +110,16 @@ class GraspPlanner:
         launch(bound_contours_kernel, self._contours, scene, state, observation, *self._sources)
 
     def count_votes(self, scene: SceneData, observation: Observation) -> None:
-        """Count the occlusion votes along every contour, by kind."""
+        """Count, along every contour, the votes that another instance lies above the enclosed one, by kind."""
         self.voting.count.zero_()
         launch(count_votes_kernel, self._contours, scene, observation, *self._sources)
 
     def weigh_votes(self, scene: SceneData, observation: Observation) -> None:
-        """Sum the votes by weight."""
+        """Sum full and deep votes, deep ones times their weight."""
         launch(weigh_votes_kernel, (self.views, self.instances, self.instances), scene, observation, *self._sources)
 
     def order_clutter(self, scene: SceneData, observation: Observation) -> None:
-        """Build the acyclic clutter graph and its transitive closure."""
+        """Build the clutter graph from the votes, make it acyclic (minimum feedback arc set), and compute its transitive closure."""
         sources = (scene, observation, self.images)
         launch(link_clutter_kernel, (self.views, *observation.above.shape[1:]), *sources)
         self._close_clutter(observation)
@@ -130,14 +135,14 @@ class GraspPlanner:
     def choose_target(
         self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
     ) -> None:
-        """Choose the instance to pick."""
+        """Choose the visible instance with the fewest others above it; in mode target the one with the most."""
         sources = (scene, state, attempts, observation, plan, self.images)
         launch(choose_target_kernel, self.views, *sources, seed=wp.uint64(seed), block_dim=VIEW_BLOCK)
 
     def choose_flat_points(
         self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
     ) -> None:
-        """Move the targets' grasp points to where they are flat, those of all or of such as have failed."""
+        """Move grasp points to where the surface is flat: of all targets, or only of those at which an attempt has failed."""
         sources = (scene, state, attempts, observation, plan, *self._sources)
         least = 0 if self.flat else 1
         launch(choose_flat_points_kernel, self.views, *sources, seed=wp.uint64(seed), least_failures=least, block_dim=VIEW_BLOCK)
@@ -148,10 +153,10 @@ class GraspPlanner:
         launch(smooth_normal_kernel, self.views, observation, plan, *self._sources, window=window, block_dim=VIEW_BLOCK)
 
     def frame_grasp(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
-        """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
+        """Compute the grasp's frame: point in the world, unit normal, and the gripper's angles."""
         launch(frame_grasp_kernel, self.views, scene, observation, plan, *self._sources, block_dim=VIEW_BLOCK)
 
     def align_cups(self, scene: SceneData, plan: Plan) -> None:
-        """Turn the gripper about the grasp point, so that as many cups as possible lie on the target."""
+        """Turn the gripper about the grasp point so that as many cups as possible lie on the target. For suction arrays only."""
         if scene.cups.count > 1:
             launch(align_cups_kernel, self.views, scene, plan, *self._sources, block_dim=VIEW_BLOCK)
