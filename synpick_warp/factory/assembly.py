@@ -67,6 +67,7 @@ class Stages:
     object_ids: np.ndarray
     """obj_id of each body of the catalog (body) int32."""
     light_table: LightTable
+    """Names of the environment maps, and directions to their first lamps."""
 
     @property
     def tick_time(self) -> float:

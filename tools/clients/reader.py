@@ -31,11 +31,7 @@ CLIENTS = {
         find=find_in("yolo/data.yaml"),
         read=images.read_yolo,
         expect=images.expect_yolo,
-        bounds={
-            "box": 1e-3,  # [px]
-            "box_of_segment": 0.61,  # [px]; computed by Ultralytics from segments.
-            "oriented_area": 0.02,  # Relative.
-        },
+        bounds={"box": 1e-3, "box_of_segment": 0.61, "oriented_area": 0.02},  # Boxes [px], also of segments; areas, relative.
     ),
     "xarray_store": Client(("xarray", "zarr"), find_in("trajectory.zarr"), trajectories.read_xarray, trajectories.expect_ticks),
     "newton_usd": Client(
@@ -50,11 +46,7 @@ CLIENTS = {
         find=find_usd,
         read=trajectories.read_blender,
         expect=trajectories.expect_blender,
-        bounds={
-            "object_to_world": 2e-6,  # [m]; matrices in float32.
-            "camera_to_world": 2e-6,
-            "focal": 1e-3,  # Relative to the width.
-        },
+        bounds={"object_to_world": 2e-6, "camera_to_world": 2e-6, "focal": 1e-3},  # Matrices [m], in float32; relative to the width.
         tone_map=trajectories.tone_map,
     ),
     "lerobot": Client(

@@ -127,12 +127,8 @@ def render_masks(
     root: Path, files: SceneFiles, frame: int, camera: dict[str, Any], gt: list[dict[str, Any]]
 ) -> list[tuple[np.ndarray, ...]]:
     """Render the amodal and visible mask (H, W) bool of each instance of a view, with the models of the data set `root`. `camera`, `gt`:
-    the view's entries in scene_camera.json and scene_gt.json.
-
-    Raises:
-        DatasetError: An object has no model, or the image no intrinsics.
-        CatalogError: A model cannot be read.
-    """
+    the view's entries in scene_camera.json and scene_gt.json. Raises DatasetError if an object has no model or the image no intrinsics, and
+    CatalogError if a model cannot be read."""
     if "cam_K" not in camera:
         raise DatasetError(f"{files.place}: the camera of image {frame} has no cam_K, by which masks are rendered")
     size = files.image_size(frame)
@@ -229,12 +225,12 @@ def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes:
 
 
 def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> None:
-    """Refuse several splits, and formats that are unknown, need trajectories, exist already, or need what `first`, the first scene of a
-    sensor, lacks. Raises ConfigError."""
+    """Refuse several splits, and formats that are unknown, stored already, or need what `first`, a sensor's first scene, lacks."""
     found = _found(data)
     if len(found.splits) > 1:
         raise ConfigError(f"{data.folder} has the splits {', '.join(found.splits)}; choose one by --split")
     bop = dataclasses.replace(load_config().bop, coco=False)
+    # Of formats of other packages, only those asked for are loaded.
     contents = {name: set(contents_of(name, bop)) for name in convertible() if name in FORMAT_TABLE or name in formats}
     for name in formats:
         if name not in contents:

@@ -13,7 +13,7 @@ from synpick_warp.kernels.structs import PerceptionData
 
 wp.set_module_options({"enable_backward": False})
 
-WARP = 32
+LANES = 32
 """Lanes of a view on a GPU."""
 CERTAIN = wp.constant(1.0e30)
 """Gain of placing a source or a sink of the graph, which removes no edge."""

@@ -13,7 +13,7 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.episodes.manipulation import FLAT
-from synpick_warp.kernels.perception.clutter_graph import WARP, Cycles, break_cycles_kernel, close_clutter_kernel, link_clutter_kernel
+from synpick_warp.kernels.perception.clutter_graph import LANES, Cycles, break_cycles_kernel, close_clutter_kernel, link_clutter_kernel
 from synpick_warp.kernels.perception.cup_alignment import align_cups_kernel
 from synpick_warp.kernels.perception.flat_points import choose_flat_points_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
@@ -123,8 +123,8 @@ class GraspPlanner:
         sources = (scene, observation, self.images)
         launch(link_clutter_kernel, (self.views, *observation.above.shape[1:]), *sources)
         self._close_clutter(observation)
-        lanes = WARP if self.device.is_cuda else 1
-        launch(break_cycles_kernel, (self.views, lanes), *sources, lanes=lanes, cycles=self.cycles, block_dim=WARP)
+        lanes = LANES if self.device.is_cuda else 1
+        launch(break_cycles_kernel, (self.views, lanes), *sources, lanes=lanes, cycles=self.cycles, block_dim=LANES)
         self._close_clutter(observation)
 
     def _close_clutter(self, observation: Observation) -> None:

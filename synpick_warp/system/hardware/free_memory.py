@@ -24,11 +24,8 @@ _FILES = {
 
 
 def free_device_memory(device: wp.Device) -> int:
-    """Free memory of a GPU [bytes], plus the part of Warp's memory pool in this process that is not in use.
-
-    The pool keeps what it once had: its size is taken as its peak use. If memory is too short for a CUDA context, the queries raise.
-    """
-    with contextlib.suppress(RuntimeError):  # Left to the queries below.
+    """Free memory of a GPU [bytes], including what Warp's memory pool keeps without using it: the pool has the size of its peak use."""
+    with contextlib.suppress(RuntimeError):  # Memory may be too short for a context: left to the queries below, which raise then.
         _ = device.context  # Warp keeps it; without it each query would create a CUDA context and destroy it, which takes 0.9 s.
     free = device.free_memory
     if device.is_mempool_supported:
