@@ -1,8 +1,7 @@
-"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, and the robot cell of
-configs/CELL.md.
+"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, a robot cell (CELL.md).
 
 Bakes (simulates and renders) three small data sets of embedded objects under embedded environment maps, and runs the first code blocks of
-that page, in a temporary folder; takes more than ten minutes on two CPU cores.
+configs/CELL.md, in a temporary folder; takes more than ten minutes on two CPU cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0

@@ -86,8 +86,7 @@ def wake_touched_kernel(
 ):
     """Mark the sleeping islands in contact with an awake body: `woken` becomes 1 at the slot that names the island (`island`).
 
-    Contacts begin at a distance of twice the contact margin, so that islands wake before surfaces meet. Grid-stride loop over the contacts:
-    launched over `threads`.
+    Contacts begin at twice the contact margin, so that islands wake before surfaces meet. Grid-stride loop, launched over `threads`.
     """
     thread = wp.tid()
     for contact in range(thread, wp.min(contacts.count[0], contacts.shape0.shape[0]), threads):

@@ -34,8 +34,7 @@ def free_device_memory(device: wp.Device) -> int:
 
 
 def free_host_memory(root: Path = Path("/")) -> int:
-    """Free memory of the host [bytes]: what the kernel can make available (without /proc/meminfo: all), at most what each control group
-    leaves; plus free swap, which no group's limit is applied to.
+    """Free memory of the host [bytes]: MemAvailable (without it: all memory), at most what each control group leaves; plus all free swap.
 
     Args:
         root: Folder in which /proc and /sys lie; tests pass another one.
