@@ -32,7 +32,6 @@ SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_s
 def pile(**changes):
     """A pile of two objects at rest, well within all bounds."""
     values = {
-        "episode": 0,
         "ticks": 30,
         "redrops": 0,
         "volume": 6.5,

@@ -177,8 +177,10 @@ def _measure_point(
     """Rows of one measured setting: time of a view of `piles`, which it returns; None: drop them first, with rows of physics."""
     if piles is None:
         simulation = variant.make_simulation(scene)
-        seconds, piles = variant.time_ticks(simulation, DROP_TICKS), simulation.record.snapshot
-        yield MeasuredRow(f"{name}: objects a tote", float((piles.catalog_index.numpy() >= 0).sum(axis=1).mean()))
+        seconds = variant.time_ticks(simulation, DROP_TICKS)
+        dropped: Snapshot = simulation.record.snapshot
+        piles = dropped
+        yield MeasuredRow(f"{name}: objects a tote", float((dropped.catalog_index.numpy() >= 0).sum(axis=1).mean()))
         yield MeasuredRow(f"{name}: physics of a tick", 1e3 * seconds, "ms")
         yield MeasuredRow(f"{name}: world-steps", variant.steps / seconds, "1/s")
     yield MeasuredRow(f"{name}: a view", 1e3 * variant.time_view(scene, piles), "ms")

@@ -130,13 +130,15 @@ def explain(first: Path, second: Path) -> Difference | None:
     if folder is not None:
         import zarr
 
-        arrays = (zarr.open_array(each, mode="r") for each in (folder, second.parents[first.parents.index(folder)]))
-        found = compare_values(*(np.asarray(array[...]) for array in arrays))
+        folders = (folder, second.parents[first.parents.index(folder)])
+        one, other = (np.asarray(zarr.open_array(each, mode="r")[...]) for each in folders)
+        found = compare_values(one, other)
     elif first.suffix.startswith(".usd"):
         from pxr import Sdf
 
         layers = (Sdf.Layer.OpenAsAnonymous(str(path)) for path in (first, second))  # type: ignore[attr-defined]
-        found = compare_values(*(_lines(layer.ExportToString().encode()) for layer in layers))
+        one, other = (_lines(layer.ExportToString().encode()) for layer in layers)
+        found = compare_values(one, other)
     else:
         found = compare_bytes(first.name, first.read_bytes(), second.read_bytes())
     kept = [each for each in found if not any(fnmatchcase(each.where, key) for key in IGNORED.get(first.name, ()))]
@@ -191,7 +193,8 @@ def compare_bytes(name: str, first: bytes, second: bytes, path: str = "") -> Ite
             elif one[member] != other[member]:
                 yield from compare_bytes(member, one[member], other[member], member)
     elif suffix in DECODERS:
-        yield from compare_values(*map(DECODERS[suffix], (first, second)), path)
+        one, other = map(DECODERS[suffix], (first, second))
+        yield from compare_values(one, other, path)
     else:
         length = min(len(first), len(second))
         differs = np.flatnonzero(np.frombuffer(first[:length], np.uint8) != np.frombuffer(second[:length], np.uint8))
@@ -217,8 +220,8 @@ def compare_values(first: Any, second: Any, path: str = "") -> Iterator[Differen
     elif isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
         yield from compare_arrays(first, second, path)
     elif isinstance(first, np.ndarray) or isinstance(second, np.ndarray) or first != second:
-        numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in (first, second))
-        yield Difference(path, f"{first} and {second}", abs(first - second) if numeric else math.nan)
+        numbers = [value for value in (first, second) if isinstance(value, int | float) and not isinstance(value, bool)]
+        yield Difference(path, f"{first} and {second}", abs(numbers[0] - numbers[1]) if len(numbers) == 2 else math.nan)
 
 
 def compare_arrays(first: np.ndarray, second: np.ndarray, path: str = "") -> Iterable[Difference]:

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -30,7 +31,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.stream import TickReport, read_tick
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress
 from tools.figures import finish_report
@@ -57,11 +58,9 @@ OWN = {
 """Options of this report; see `tools.options.OPTIONS`."""
 
 
-@dataclass(frozen=True, eq=False)
-class RestingPile:
+class RestingPile(NamedTuple):
     """Measures of one arrangement at rest; arrays are by object."""
 
-    episode: int
     ticks: int
     """Ticks from the drop to rest."""
     redrops: int
@@ -128,19 +127,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 def settle(simulation: Simulation, catalog: Catalog, results: RestResults, report_progress: Callable[[str], None]) -> None:
     """Simulate until every arrangement is at rest or has failed, and add the measured values to `results`."""
-    config = simulation.config
-    reported = time.perf_counter()
-    record = simulation.record
-    reader = TickReader(record)
+    config, physics, reported = simulation.config, simulation.physics, time.perf_counter()
     before: TickReport | None = None
-    physics = simulation.physics
-    counts = physics.contacts.rigid_contact_count, physics.overlap_count
     while True:
         simulation.tick()
-        reader.start()
-        report = reader.wait()
-        results.contacts = max(results.contacts, int(counts[0].numpy()[0]) / config.bake.worlds)
-        results.pairs = max(results.pairs, int(counts[1].numpy()[0]) / config.bake.worlds)
+        report = read_tick(simulation.record)
+        results.contacts = max(results.contacts, int(physics.contacts.rigid_contact_count.numpy()[0]) / config.bake.worlds)
+        results.pairs = max(results.pairs, int(physics.overlap_count.numpy()[0]) / config.bake.worlds)
         phase = report.column("phase")
         for world in np.flatnonzero(phase == Phase.OVER):
             results.resampled[Ending(int(report.column("ending")[world])).name.lower()] += 1
@@ -190,7 +183,6 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
         energy = (mass * (linear**2).sum(axis=1)).sum() + np.einsum("ni,nij,nj->", body_angular, inertia, body_angular)
         piles.append(
             RestingPile(
-                episode=int(now.column("episode")[world]),
                 ticks=int(progress[world][0]),
                 redrops=int(progress[world][2]),
                 volume=1e3 * sum(entry.volume for entry in entries),
