@@ -125,6 +125,8 @@ def test_quantization_and_header_are_those_of_libjpeg(quality):
     header = jpeg.make_header(30, 20, quality)
     assert file.startswith(header)
     assert len(header) == len(jpeg.make_header(1920, 1080, 95))
+    # Tables K.1 and K.2 are those of quality 50.
+    assert jpeg.quantization(50)[:, :6].tolist() == [[16, 11, 12, 14, 12, 10], [17, 18, 18, 24, 21, 24]]
 
 
 # ---- passes of the coder ----

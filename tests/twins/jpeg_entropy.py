@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.system.codecs.jpeg import AC_COUNTS, AC_SYMBOLS, DC_COUNTS, DC_SYMBOLS, huffman_codes
+from synpick_warp.system.codecs.jpeg import huffman_codes
 
-_DC = [huffman_codes(*table) for table in zip(DC_COUNTS, DC_SYMBOLS, strict=True)]
-_AC = [huffman_codes(*table) for table in zip(AC_COUNTS, AC_SYMBOLS, strict=True)]
+_DC, _AC = (list(zip(*tables, strict=True)) for tables in huffman_codes().values())
 _COMPONENTS = (0, 0, 0, 0, 1, 2)
 
 

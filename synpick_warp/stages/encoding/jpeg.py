@@ -32,10 +32,6 @@ from synpick_warp.kernels.tuning import JPEG_THREADS
 from synpick_warp.stages.arrays import allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.system.codecs.jpeg import (
-    AC_COUNTS,
-    AC_SYMBOLS,
-    DC_COUNTS,
-    DC_SYMBOLS,
     DIVISOR_SCALE,
     QUALITIES,
     RESTART_INTERVAL,
@@ -189,8 +185,6 @@ class Compressor:
 def upload_huffman(device: wp.Device) -> Any:
     """Upload the standard Huffman tables (T.81, annex K) as the struct `HuffmanTables`."""
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
-    for kind, counts, symbols in (("dc", DC_COUNTS, DC_SYMBOLS), ("ac", AC_COUNTS, AC_SYMBOLS)):
-        codes = [huffman_codes(*table) for table in zip(counts, symbols, strict=True)]
-        packed = [code | length.astype(np.uint32) << np.uint32(CODE_BITS) for code, length in codes]
-        getattr(tables, kind).assign(np.stack(packed))
+    for kind, (codes, lengths) in huffman_codes().items():
+        getattr(tables, kind).assign(codes | lengths.astype(np.uint32) << np.uint32(CODE_BITS))
     return tables
