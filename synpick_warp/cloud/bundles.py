@@ -33,17 +33,8 @@ _ADVICE = "delete it and its episode's done mark, manifest/NUMBER.json, and resu
 
 
 def make_bundle(folder: Path, episode: int, settings: ExportSettings, kinds: Sequence[type[Exporter]]) -> bytes:
-    """Pack an episode's index file; deterministic on one machine (another zlib may compress otherwise).
-
-    Args:
-        folder: Data set with the committed episode.
-        episode: Its index.
-        settings: Settings of the data set.
-        kinds: Exporters of its formats.
-
-    Raises:
-        OutputError: The episode was removed.
-    """
+    """Pack the index file of an episode that is committed in a data set with exporters of these kinds; deterministic on one machine
+    (another zlib may compress otherwise). Raises OutputError: the episode was removed."""
     entry = read_entry(folder, episode_entry(episode))
     if entry is None:
         raise OutputError(f"{folder / episode_entry(episode)}.json was removed while it was uploaded; resume the bake")
@@ -70,7 +61,6 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
 
     Args:
         data: The index file.
-        folder: The folder.
         indexed: Pattern of the names of files that indices are made of.
         source: Its object, for messages.
 

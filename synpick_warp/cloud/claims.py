@@ -117,12 +117,7 @@ class Claims:
     """Lease manager of one worker: takes leases in a store under the worker's unique name."""
 
     def __init__(self, store: Store, offset: float, lease: float = LEASE) -> None:
-        """
-        Args:
-            store: With conditional writes.
-            offset: The store's clock less this machine's [s].
-            lease: Time to live of a lease without heartbeat [s].
-        """
+        """Store with conditional writes, its clock less this machine's [s], and time to live of a lease without heartbeat [s]."""
         self.store, self.offset, self.lease = store, offset, lease
         self.seen: dict[str, float] = {}
         """When leases of other workers will expire, as of their last look, by key [s since 1970, by the store's clock]."""
@@ -199,13 +194,8 @@ class Chunks:
     """Work queue in the store: iterates over the chunks that this worker claims, one at a time, until all of the plan are done."""
 
     def __init__(self, ledger: Ledger, claims: Claims, ranges: Sequence[range], chunk: int) -> None:
-        """
-        Args:
-            ledger: Ledger of the data set.
-            claims: Lease manager of this worker.
-            ranges: Episodes that the bake must deliver.
-            chunk: Proposed number of episodes of a whole chunk; that of the worker that starts first counts for all.
-        """
+        """`ranges`: episodes that the bake must deliver; `chunk`: proposed number of episodes of a whole chunk, of which that of the worker
+        that starts first counts for all."""
         self._ledger, self.claims, self._ranges = ledger, claims, ranges
         self.on_wait: Callable[[], object] = lambda: None
         """Callback, invoked when this worker begins to wait for chunks that other workers hold."""

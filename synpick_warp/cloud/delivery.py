@@ -11,7 +11,7 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -40,12 +40,8 @@ _INTERVAL = 0.1
 
 
 def send_file(store: Store, path: Path, name: str, digest: str) -> None:
-    """Upload a file with end-to-end checks: its SHA-256 before, its size in the store after.
-
-    Raises:
-        OutputError: The local file has another checksum.
-        StoreError: It could not be uploaded.
-    """
+    """Upload a file with end-to-end checks: its SHA-256 before, its size in the store after. Raises OutputError: the local file has another
+    checksum; StoreError: it could not be uploaded."""
     size = path.stat().st_size
     data = path.read_bytes() if size <= WHOLE_BYTES else None
     if data is not None:
@@ -165,16 +161,9 @@ class Delivery:
         store.put(f"{CONSTANTS}.json", (folder / f"{CONSTANTS}.json").read_bytes())
 
     def _send_files(self, names: dict[str, str]) -> None:
-        """Upload files in parallel, given their SHA-256 by name; raises the first error."""
-        sent: list[Future[Any]] = [
-            self._files.submit(send_file, self._ledger.store, self._folder / name, name, digest) for name, digest in names.items()
-        ]
-        try:
-            for each in sent:
-                each.result()
-        finally:
-            for each in sent:
-                each.cancel()
+        """Upload files in parallel, given their SHA-256 by name; raises the first error, after which no other is begun."""
+        store, folder = self._ledger.store, self._folder
+        list(self._files.map(lambda name: send_file(store, folder / name, name, names[name]), names))
 
     def _deliver(self, episode: int) -> None:
         """Task: upload and commit an episode, unless its lease is lost, and delete its local copy."""

@@ -13,14 +13,7 @@ from synpick_warp.cloud.delivery import FILES_AT_ONCE, send_file
 from synpick_warp.cloud.ledger import FINISHED, FINISHING, INDEX, Ledger
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
-from synpick_warp.dataset.commit.manifest import (
-    CONFIG_FILE,
-    CONSTANTS,
-    ENTRIES,
-    INDICES,
-    MANIFEST_FILE,
-    read_checksums,
-)
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, INDICES, MANIFEST_FILE, read_checksums
 from synpick_warp.dataset.commit.writing import finalize_data_set
 from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.formats import indexed_files
@@ -51,14 +44,8 @@ def _clear_errors(ledger: Ledger, folder: Path) -> Iterator[None]:
 
 
 def finalize_store(ledger: Ledger, folder: Path) -> int:
-    """Finalize a data set: writes the indices over all episodes, if all are done and the indices do not cover them yet.
-
-    Args:
-        ledger: Ledger of the data set.
-        folder: An empty folder, for temporary files.
-
-    Returns:
-        Number of episodes that are not done; 0: the data set is finished.
+    """Finalize a data set: writes the indices over all episodes, if all are done and the indices do not cover them yet. Returns the number
+    of episodes that are not done; 0: the data set is finished. `folder`: an empty one, for temporary files.
 
     Raises:
         DatasetError: An index file is damaged.
@@ -81,10 +68,7 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
 
 def _put_indices(ledger: Ledger, work: Path) -> None:
     """Upload the indices. The announcement of the plan is the first write and the last read: who finds another's may have mixed with it.
-
-    Raises:
-        StoreError: Another plan was finalized at once.
-    """
+    Raises StoreError: another plan was finalized at once."""
     store, plan = ledger.store, ledger.plan
     store.put(FINISHING, plan)
     for name, digest in read_checksums(work, INDICES).items():

@@ -43,17 +43,8 @@ class Ledger:
     """Commit log of a data set in a store: reads and writes its marks, for the episodes that the settings plan."""
 
     def __init__(self, store: Store, config: Config, probe: Probe) -> None:
-        """Validate the prefix against the settings.
-
-        Args:
-            store: Opened at the prefix.
-            config: All settings.
-            probe: What the store can do.
-
-        Raises:
-            ConfigError: The prefix was started with other settings.
-            OutputError: It holds something else, or lies in another data set.
-        """
+        """Validate the prefix of the store against the settings. Raises ConfigError: the prefix was started with other settings;
+        OutputError: it holds something else, or lies in another data set."""
         self.store, self.config, self.probe = store, config, probe
         self.layout = DataLayout.of(config)
         self.manifest = self._read_manifest()
@@ -114,11 +105,8 @@ class Ledger:
 
     def put_manifest(self, data: bytes) -> None:
         """Create the manifest if absent, and compare it with the one that is there. Without conditional writes, two workers that create it
-        within the same second may both pass.
-
-        Raises:
-            ConfigError: Another worker has started the data set with other settings, objects or lights.
-        """
+        within the same second may both pass. Raises ConfigError: another worker has started the data set with other settings, objects or
+        lights."""
         if self.manifest is None:
             if self.probe.conditional:
                 self.store.create(MANIFEST_FILE, data)

@@ -19,19 +19,16 @@ from typing import Any
 
 from synpick_warp._version import __version__
 from synpick_warp.cloud.claims import open_claims, plan_chunks
-from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store
+from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store, open_ledger
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DeviceError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.factory.pipeline import with_measures
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.urls import RAY, check_engine
 from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress, SilentProgress
-from synpick_warp.system.stores.opening import open_store, probe
 
 LEAST_VERSION = (2, 52)
 """Version of Ray from which on it has token authentication."""
@@ -54,26 +51,20 @@ _LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
 
 
 def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew: Crew) -> BakeSummary:
-    """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part.
+    """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part. Other arguments as
+    of `workers.start_bake`.
 
     Args:
-        job: What to bake.
         engine: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
         workers: Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu.
-        progress: Observer.
-        crew: Receives the number of workers and their time.
 
     Returns:
         Summary of the workers that ended.
-
-    Raises:
-        SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
     """
     job = replace(job, config=with_measures(job.config, ()))
     address = find_address(engine)
     ray = import_ray(address)
-    store = open_store(job.url)
-    ledger = Ledger(store, job.config, probe(store))
+    ledger = open_ledger(job)
     chunks = plan_chunks(ledger, open_claims(ledger, job.lease), DataLayout.of(job.config).plan(job.splits))
     if ledger.finished():
         progress.note("all episodes are done")
@@ -85,9 +76,10 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew:
         try:
             ray.init(address=address or "local", log_to_driver=False, logging_level="ERROR", **own)
             device, each, count = _resources(ray, job.config.bake.device, workers)
+            cores = each["num_cpus"]
+            data = pickle.dumps(replace(job, own={"bake.device": device, "bake.writers": job.config.bake.writers or cores}))
             start = ray.remote(max_retries=RETRIES, **each)(run_worker).remote
-            calls = [start(__version__, pickle.dumps(job), device, each["num_cpus"]) for _ in range(count)]
-            return _await(ray, calls, PlanProgress(progress, chunks, crew))
+            return _await(ray, [start(__version__, data, cores) for _ in range(count)], PlanProgress(progress, chunks, crew))
         except ray.exceptions.RayTaskError:  # A fault of ours, with its traceback.
             raise
         except (ray.exceptions.RayError, OSError, RuntimeError, ValueError) as error:  # It is not there, refuses, is lost, or workers died.
@@ -97,26 +89,19 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew:
             ray.shutdown()
 
 
-def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummary | str:
+def run_worker(version: str, data: bytes, cores: int) -> BakeSummary | str:
     """Ray task: claim and bake chunks until all episodes of a job are done; returns the summary, or an error that the user can correct.
 
     Args:
         version: Version of the driver's synpick_warp.
         data: Pickled `Job`.
-        device: Device of the bakes.
         cores: CPU cores of this worker.
     """
     if version != __version__:
         return f"a Ray worker has synpick-warp {__version__}, and this command {version}; install one version everywhere"
-    job: Job = pickle.loads(data)
     limit_threads(cores)
-    real, own = job.bake or bake_episodes, {"bake.device": device, "bake.writers": job.config.bake.writers or cores}
-
-    def bake(config: Config, *given: Any) -> BakeSummary:
-        return real(config.with_values(own), *given)
-
     try:
-        return bake_into_store(job.config, job.url, SilentProgress(), splits=job.splits, bake=bake, claim=True, lease=job.lease)
+        return bake_into_store(pickle.loads(data), SilentProgress(), claim=True)
     except SynpickError as error:
         return str(error) or type(error).__name__
 
@@ -124,7 +109,7 @@ def run_worker(version: str, data: bytes, device: str, cores: int) -> BakeSummar
 def _await(ray: Any, calls: list[Any], progress: PlanProgress) -> BakeSummary:
     """Show how many episodes are done until the calls of `run_worker` have ended; a signal stops them. Returns the sum of their summaries.
 
-    Raises DeviceError: A worker reports an error that the user can correct.
+    Raises DeviceError: a worker reports an error that the user can correct.
     """
     summary, deadline, started = BakeSummary(), float("inf"), time.monotonic()
     with StopRequest() as stop:
@@ -170,11 +155,8 @@ def import_ray(address: str | None) -> Any:
 
 
 def find_address(engine: str) -> str | None:
-    """Address of the cluster that an engine names, for `ray.init`; None: one on this machine is to be started.
-
-    Raises:
-        DeviceError: There is no such engine, or nobody answers there.
-    """
+    """Address of the cluster that an engine names, for `ray.init`; None: one on this machine is to be started. Raises DeviceError: there is
+    no such engine, or nobody answers there."""
     check_engine(engine)
     address = engine if engine != RAY else os.environ.get("RAY_ADDRESS") or None
     if address is not None and (match := _PLACE.search(address)) is not None:
@@ -187,10 +169,7 @@ def find_address(engine: str) -> str | None:
 
 def _resources(ray: Any, device: str, workers: int) -> tuple[str, dict[str, int], int]:
     """Device of a worker, the resources that it asks for, a GPU with its part of its node's cores, or a core, and the number of workers.
-
-    Raises:
-        DeviceError: The cluster has no GPU, and no worker is asked for that could wait for one.
-    """
+    Raises DeviceError: the cluster has no GPU, and no worker is asked for that could wait for one."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     shares = [int(node.get("CPU", 0) // node["GPU"]) for node in nodes if node.get("GPU", 0) >= 1]
     if device == "cpu" or (device == "auto" and not shares and not workers):

@@ -76,7 +76,6 @@ class Copier:
         """Download an object atomically, unless it is in the folder; returns whether it is there then.
 
         Args:
-            name: Its key.
             digest: Expected SHA-256; None: unchecked.
             limit: Largest size [B].
 
@@ -122,12 +121,7 @@ class Copier:
         return names
 
     def fetch_records(self) -> None:
-        """Download manifest and settings.
-
-        Raises:
-            DatasetError: There is no manifest.
-            StoreError: There is no bucket.
-        """
+        """Download manifest and settings. Raises DatasetError: there is no manifest; StoreError: there is no bucket."""
         if not self.fetch(MANIFEST_FILE):
             with contextlib.suppress(FileNotFoundError):
                 self.store.get(MANIFEST_FILE, MAX_JSON)  # Raises StoreError if there is no bucket, which HEAD does not tell.
@@ -147,17 +141,8 @@ class Copier:
 
 
 def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name: True, report: Report = ignore_progress) -> None:
-    """Download a whole data set into a new folder.
-
-    Args:
-        url: Its prefix.
-        folder: The folder, which is made.
-        wanted: Predicate: whether a file is copied, by its name.
-        report: Progress callback.
-
-    Raises:
-        DatasetError: It is no data set, or larger than FREE_PART of the free space there.
-    """
+    """Download a whole data set into a new folder, which is made. `wanted`: whether a file is copied, by its name. Raises DatasetError: it
+    is no data set, or larger than FREE_PART of the free space there."""
     copier = Copier(url, folder)  # Refuses URLs whose last part would lead elsewhere.
     folder.mkdir()
     copier.fetch_records()
@@ -178,13 +163,9 @@ def copy_set(url: str, folder: Path, wanted: Callable[[str], bool] = lambda name
 
 
 def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
-    """Verify the checksum of every file of a data set in a store, as `commit.verify.verify`: downloads one entry at a time.
-
-    Raises:
-        DatasetError: The prefix has no data set, or its manifest is damaged.
-        OutputError: The temporary folder cannot be written.
-        StoreError: The store cannot be read.
-    """
+    """Verify the checksum of every file of a data set in a store, as `commit.verify.verify`: downloads one entry at a time. Raises
+    DatasetError: the prefix has no data set, or its manifest is damaged; OutputError: the temporary folder cannot be written; StoreError:
+    the store cannot be read."""
     with tempfile.TemporaryDirectory(prefix="synpick-verify-") as name:
         folder = Path(name)
         copier = Copier(url, folder)
@@ -207,11 +188,8 @@ def verify_store(url: str, report: Report = ignore_progress) -> Verdict:
 
 
 def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
-    """Download and verify the files of an entry, and delete them; returns their number, and the episodes that the indices list.
-
-    Raises:
-        DatasetError: A file is missing or damaged.
-    """
+    """Download and verify the files of an entry, and delete them; returns their number, and the episodes that the indices list. Raises
+    DatasetError: A file is missing or damaged."""
     if not copier.fetch_entry(entry):
         if entry == INDICES:
             return 0, []
@@ -253,11 +231,8 @@ class StoreCache:
         return episode in self._held or self.copier.store.stat(f"{episode_entry(episode)}.json") is not None
 
     def fetch(self, episode: int) -> None:
-        """Download an episode, checked by its checksums, and evict the least recently used ones beyond the limit.
-
-        Raises:
-            DatasetError: It is damaged, or a file is missing.
-        """
+        """Download an episode, checked by its checksums, and evict the least recently used ones beyond the limit. Raises DatasetError: it
+        is damaged, or a file is missing."""
         if episode in self._held:
             self._held.move_to_end(episode)
             return
@@ -330,7 +305,6 @@ def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = 
     """Open a data set in a store: downloads its records, constants and indices.
 
     Args:
-        url: Its prefix.
         limit: Size of the cache of episodes [B]; the last one is kept whatever its size.
         episodes: Indices of the episodes to show; None: all.
 

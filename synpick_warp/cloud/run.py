@@ -8,9 +8,9 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -42,13 +42,20 @@ Baker = Callable[..., BakeSummary]
 
 @dataclass(frozen=True)
 class Job:
-    """Parameters of a bake that all of its claiming workers share; as the arguments of `bake_into_store`."""
+    """Bake of a data set into an object store: what all of its workers share, and what a worker has for itself."""
 
     config: Config
+    """All settings."""
     url: str
+    """Prefix of the data set: new, or of an earlier bake with the same settings."""
     splits: tuple[str, ...] = ()
+    """Only episodes of these splits; empty: all."""
     bake: Baker | None = None
+    """Bakes episodes into a folder; None: `pipeline.bake_episodes`."""
     lease: float = LEASE
+    """Time to live of a claim without heartbeat [s]."""
+    own: Mapping[str, object] = field(default_factory=dict)
+    """Full key -> value of settings of a worker alone: device, writers."""
 
 
 @dataclass
@@ -94,32 +101,30 @@ class PlanProgress(ForwardingProgress):
         self.update(episodes_done=done, episodes=0, worlds_active=0, views=0, views_per_s=0.0, seconds_left=None)
 
 
+def open_ledger(job: Job) -> Ledger:
+    """Commit log of a job's data set; its store is opened and probed. Raises SynpickError as these do."""
+    store = open_store(job.url)
+    return Ledger(store, job.config, probe(store))
+
+
 def bake_into_store(
-    config: Config,
-    url: str,
+    job: Job,
     progress: Progress,
     shard: tuple[int, int] = (0, 1),
-    splits: Sequence[str] = (),
     devices: Sequence[str] = (),
-    bake: Baker | None = None,
     *,
     claim: bool = False,
-    lease: float = LEASE,
     workers: int = 0,
     summary: BakeSummary | None = None,
 ) -> BakeSummary:
     """Bake a data set into an object store: simulates, renders and uploads it, or the remaining episodes of one.
 
     Args:
-        config: All settings.
-        url: Prefix of the data set: new, or of an earlier bake with the same settings.
+        job: What to bake.
         progress: Observer.
         shard: (i, n): only episodes with index % n == i.
-        splits: Only episodes of these splits; empty: all.
         devices: As in `pipeline.run_bake`.
-        bake: Bakes episodes into a folder; None: `pipeline.bake_episodes`.
         claim: Whether this is one of several equal workers, which share the episodes out among them by claims.
-        lease: Time to live of a claim without heartbeat [s].
         workers: Number of claiming workers, which begin at about the same time; 0: unknown.
         summary: Receives the episodes bake by bake, for a caller that ends this by an exception; None: a new one.
 
@@ -129,18 +134,17 @@ def bake_into_store(
     Raises:
         SynpickError: An error that the user can correct; done episodes stay, and the same bake resumes.
     """
-    config = with_measures(config, devices)
-    ranges = DataLayout.of(config).plan_shard(splits, shard)
-    store = open_store(url)
-    ledger = Ledger(store, config, probe(store))
-    claims = open_claims(ledger, lease) if claim else None
+    job = replace(job, config=with_measures(job.config, devices))
+    ranges = DataLayout.of(job.config).plan_shard(job.splits, shard)
+    ledger = open_ledger(job)
+    claims = open_claims(ledger, job.lease) if claim else None
     summary = BakeSummary() if summary is None else summary
     with tempfile.TemporaryDirectory(prefix="synpick-store-") as name:
         place = Path(name)
         if claims is None or not ledger.finished():
             for work in _works(ledger, place, claims, ranges, workers, progress):
                 with work:
-                    part = _bake(ledger, place, work, progress, devices, bake or bake_episodes, summary)
+                    part = _bake(job, ledger, place, work, progress, devices, summary)
                 if _take(summary, part):
                     return summary
                 gc.collect()  # Frees the worlds of this bake before memory for those of the next is planned.
@@ -161,14 +165,8 @@ class _Work(EpisodeSource):
     """
 
     def __init__(self, ledger: Ledger, place: Path, first: Chunk, chunks: Chunks | None = None, limit: int = 0) -> None:
-        """
-        Args:
-            ledger: Ledger of the data set.
-            place: Folder for temporary files.
-            first: The chunk to begin with.
-            chunks: Work queue of further chunks; None: there are none.
-            limit: Prefetch limit: number of episodes without done mark from which on no other chunk is claimed.
-        """
+        """Begin with the chunk `first`; others are of the work queue `chunks`, unless there is none, of which none is claimed from `limit`
+        episodes without done mark on."""
         super().__init__(first.episodes, limit)
         self.lost: set[int] = set()
         """Episodes of the chunks whose leases are lost."""
@@ -325,9 +323,10 @@ def _chunks(ledger: Ledger, ranges: Sequence[range]) -> Iterator[list[int]]:
 
 
 def _bake(
-    ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], bake: Baker, ended: BakeSummary
+    job: Job, ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], ended: BakeSummary
 ) -> BakeSummary:
     """Bake and upload episodes in a new temporary folder, after those of `ended`; messages of errors name the store in its place."""
+    bake = job.bake or bake_episodes
     folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)
@@ -342,7 +341,7 @@ def _bake(
 
     try:
         with Delivery(ledger, folder, work.permit, work.delivered) as delivery:
-            summary = bake(ledger.config, folder, WatchedProgress(progress, check, ended), work, devices, deliver)
+            summary = bake(job.config.with_values(job.own), folder, WatchedProgress(progress, check, ended), work, devices, deliver)
         work.report(progress)
         summary.total -= len(work.lost)
         summary.episodes = [row for row in summary.episodes if row.episode not in work.lost]

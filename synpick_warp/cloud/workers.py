@@ -8,18 +8,16 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from types import FrameType
 from typing import Any
 
 from synpick_warp.cloud.claims import open_claims, plan_chunks
-from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.ray_engine import bake_with_ray
-from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store
+from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store, open_ledger
 from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.devices import DeviceProcesses
@@ -31,7 +29,6 @@ from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.progress import Progress
-from synpick_warp.system.stores.opening import open_store, probe
 
 _PROGRAM = "from synpick_warp.cloud.workers import run_worker; from synpick_warp.factory.worker import main; main(run_worker)"
 
@@ -48,10 +45,11 @@ def start_bake(
     workers: int = 0,
     crew: Crew | None = None,
 ) -> BakeSummary:
-    """Bake a data set into an object store; arguments as of `run.bake_into_store`.
+    """Bake a data set into an object store; other arguments as of `run.bake_into_store`.
 
     Args:
-        job: What to bake; `splits` take the place of its own.
+        job: What to bake.
+        splits: Those of the job.
         engine: Cluster of claiming workers, as of `ray_engine.bake_with_ray`; empty: none.
         workers: Number of the engine's workers.
         crew: Receives number and time of the workers of an engine, or of claiming ones on these devices, for a display.
@@ -69,38 +67,24 @@ def start_bake(
         return bake_with_ray(job, engine, workers, progress, crew)
     if claim and devices:
         return bake_with_devices(job, devices, progress, crew)
-    return bake_into_store(job.config, job.url, progress, shard, splits, devices, claim=claim)
+    return bake_into_store(job, progress, shard, devices, claim=claim)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Share(Job):
-    """Job of one device's worker, with what is its own."""
+    """Job of one device's worker."""
 
     folder: str
     """Folder for temporary files."""
     processes: int
     """Workers on this host, which share its memory."""
-    own: Mapping[str, object]
-    """Full key -> value of settings of the worker alone: device, writers."""
 
 
 def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew: Crew) -> BakeSummary:
-    """Bake a data set into an object store by a claiming worker on each device; other claiming workers may take part.
-
-    Args:
-        job: What to bake.
-        devices: As in `pipeline.run_bake`.
-        progress: Observer.
-        crew: Receives the number of workers and their time.
-
-    Returns:
-        Summary of the chunks of these workers.
-
-    Raises:
-        SynpickError: An error that the user can correct; done episodes stay, and the same command resumes.
-    """
-    config = with_measures(job.config, devices)
-    ranges = DataLayout.of(config).plan(job.splits)
+    """Bake a data set into an object store by a claiming worker on each device; other claiming workers may take part. Arguments as of
+    `start_bake`; returns the summary of the chunks of these workers."""
+    job = replace(job, config=with_measures(job.config, devices))
+    config, ranges = job.config, DataLayout.of(job.config).plan(job.splits)
     planned = sum(map(len, ranges))
     names = pick_processes(config, devices, planned)
     needs, summary = Needs.of(config), BakeSummary(planned)
@@ -109,17 +93,15 @@ def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
             with DeviceProcesses(names, _PROGRAM, handle) as processes:  # They load their libraries meanwhile.
-                store = open_store(job.url)
-                ledger = Ledger(store, config, probe(store))
+                ledger = open_ledger(job)
                 claims = open_claims(ledger, job.lease)
                 if ledger.finished():
                     progress.note("all episodes are done")
                     return BakeSummary()
-                common = {**vars(job), "config": config, "folder": folder, "processes": len(names)}
                 own = [{"bake.device": name, "bake.writers": count} for name, count in zip(names, writers, strict=True)]
+                shares = [_Share(**vars(replace(job, own=each)), folder=folder, processes=len(names)) for each in own]
                 crew.alive = len(names)
-                shown = PlanProgress(progress, plan_chunks(ledger, claims, ranges), crew)
-                lost = processes.run([_Share(**common, own=each) for each in own], summary, shown)
+                lost = processes.run(shares, summary, PlanProgress(progress, plan_chunks(ledger, claims, ranges), crew))
         finally:
             os.close(handle)
     if lost and not summary.stopped and not ledger.finished():
@@ -141,11 +123,11 @@ def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
     real = job.bake or partial(bake_episodes, processes=job.processes, stop=link)
     summary, is_busy = BakeSummary(), False
 
-    def bake(config: Config, *given: Any) -> BakeSummary:
+    def bake(*given: Any) -> BakeSummary:
         nonlocal is_busy
         is_busy = True
         try:
-            return real(config.with_values(job.own), *given)
+            return real(*given)
         finally:
             is_busy = False
 
@@ -159,8 +141,7 @@ def run_worker(job: _Share, _: Sequence[int], link: BakeLink) -> BakeSummary:
     try:
         if link.number:
             raise _Stopped
-        given = {"splits": job.splits, "lease": job.lease, "workers": job.processes, "summary": summary}
-        bake_into_store(job.config, job.url, link, bake=bake, claim=True, **given)
+        bake_into_store(replace(job, bake=bake), link, claim=True, workers=job.processes, summary=summary)
     except _Stopped:
         summary.stopped = link.number
     return summary

@@ -10,12 +10,13 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.processes.threads import LINK
 from synpick_warp.system.processes.worker import send
+from synpick_warp.system.progress import SilentProgress
 
 if TYPE_CHECKING:
     from synpick_warp.factory.episodes import BakeSummary
@@ -24,7 +25,7 @@ _MAX_FAULT = 200
 """Longest description of an unexpected error [characters]; the standard error stream has its traceback."""
 
 
-class BakeLink:
+class BakeLink(SilentProgress):
     """Link to the bake's main process: observer (`Progress`) that forwards all reports, and stop request (as `StopRequest`).
 
     A thread listens: a number is the signal for which to stop after the current tick; when the link closes, writers and process end.
@@ -44,22 +45,13 @@ class BakeLink:
         signal.signal(signal.SIGTERM, self._stop)
         threading.Thread(target=self._listen, name=LINK, daemon=True).start()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        return None
-
     def stage(self, text: str) -> None:
-        """Send the stage's name to the main process."""
         self.report("stage", text)
 
     def update(self, **counts: Any) -> None:
-        """Send the counts of progress to the main process."""
         self.report("update", counts)
 
     def note(self, text: str) -> None:
-        """Send a note to the main process."""
         self.report("note", text)
 
     def report(self, kind: str, content: object) -> None:
@@ -88,7 +80,8 @@ def main(generate: Callable[[Any, Sequence[int], BakeLink], BakeSummary]) -> Non
     """Serve one share from the socket with handle argv[1]; the other handles are for the writers to keep open.
 
     Args:
-        generate: Generates the episodes of a share (`devices.Share`, `ray_worker.Job`); its other arguments are these handles and the link.
+        generate: Generates the episodes of a share (`devices.DeviceShare`, or what `cloud.workers` sends); its other arguments are these
+            handles and the link.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection, *handles = map(int, sys.argv[1:])

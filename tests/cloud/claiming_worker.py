@@ -11,6 +11,6 @@ from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
 
 if __name__ == "__main__":
-    given = {"bake": partial(scripted_bake.bake_episodes, grows=True), "claim": True, "lease": float(sys.argv[3])}
+    job = run.Job(tiny(int(sys.argv[2])), sys.argv[1], bake=partial(scripted_bake.bake_episodes, grows=True), lease=float(sys.argv[3]))
     print("claiming", flush=True)
-    run.bake_into_store(tiny(int(sys.argv[2])), sys.argv[1], SilentProgress(), **given)
+    run.bake_into_store(job, SilentProgress(), claim=True)

@@ -29,7 +29,7 @@ from tests.harness import scripted_bake
 
 
 def work(url: str, **given):
-    return run.bake_into_store(tiny(), url, SilentProgress(), bake=given.pop("bake", scripted_bake.bake_episodes), claim=True, **given)
+    return run.bake_into_store(Job(tiny(), url, **{"bake": scripted_bake.bake_episodes} | given), SilentProgress(), claim=True)
 
 
 @pytest.mark.parametrize(("episodes", "chunk"), [(1, 1), (4, 1), (7, 3), (1_000_000, 512), (1_000, 600)])
@@ -201,7 +201,7 @@ def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
 
     progress = SilentProgress()
     progress.note = notes.append
-    summary = run.bake_into_store(tiny(), memory, progress, bake=bake, claim=True, lease=0.5)
+    summary = run.bake_into_store(Job(tiny(), memory, bake=bake, lease=0.5), progress, claim=True)
     assert stored(memory) == local
     assert (len(baked) > 1) == lost
     assert summary.total == EPISODES
@@ -240,7 +240,7 @@ def test_a_dead_workers_chunk_is_done_by_another(memory, local, monkeypatch):
 def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(run, "finalize_store", lambda *_: 0)
-        run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+        run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
     assert "manifest/joined.json" not in stored(memory)
     ledger = Ledger(open_store(memory), tiny(), Probe(0.0, True))
     gate, real, places = threading.Barrier(2), finish.finalize_data_set, [tmp_path / "one", tmp_path / "two"]
@@ -264,7 +264,7 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
     large, small = (Ledger(store, tiny(count), Probe(0.0, False)) for count in (EPISODES, 2))
     with monkeypatch.context() as patch:
         patch.setattr(run, "finalize_store", lambda *_: 0)
-        run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+        run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
     real = finish.send_file
     for each in places:
         each.mkdir()
@@ -278,7 +278,7 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
     with pytest.raises(StoreError, match=r"another bake finalized s3://memory-.* for other episodes"):
         finish.finalize_store(large, places[0])
     assert store.get(finish.FINISHING, 1 << 30) == b""  # So the other would fail, too, if it still ran.
-    run.bake_into_store(tiny(), memory, SilentProgress(), bake=scripted_bake.bake_episodes)
+    run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
     assert stored(memory) == local
 
 

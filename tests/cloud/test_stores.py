@@ -83,7 +83,7 @@ def test_a_second_server_without_compare_and_swap_is_told_and_takes_shares(tmp_p
     said = mistake("bake", "--config", "smoke", "--out", url, "--claim", "--device", "cpu")
     assert "has no conditional writes, which --claim needs" in said
     for share in range(2):
-        run.bake_into_store(tiny(), url, SilentProgress(), shard=(share, 2), bake=scripted_bake.bake_episodes)
+        run.bake_into_store(run.Job(tiny(), url, bake=scripted_bake.bake_episodes), SilentProgress(), shard=(share, 2))
     assert stored(url) == local
     server.shutdown()
     server.server_close()

@@ -25,7 +25,7 @@ QUIET = SilentProgress()
 
 
 def bake(url: str, config=None, **given):
-    return run.bake_into_store(config or tiny(), url, QUIET, bake=scripted_bake.bake_episodes, **given)
+    return run.bake_into_store(run.Job(config or tiny(), url, bake=scripted_bake.bake_episodes), QUIET, **given)
 
 
 def bake_mortal(url: str, lives: int, monkeypatch) -> bool:
