@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.calibration.sensor_presets import SENSORS
+from synpick_warp.configs.calibration.tables import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import Setting, settings_of
@@ -36,7 +36,7 @@ _SETTINGS_HEAD = """# Reference of the settings
 What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out. Paths in
 a file are relative to it. Choices stand in the meaning.
 """
-_SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensor_presets.py`."
+_SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensors.toml`."
 _MEASURED = "measured"
 """Table of a bin that users do not set."""
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)

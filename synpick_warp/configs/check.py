@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import operator
+import re
+import sys
 import typing
 from collections.abc import Iterator
 from typing import Any
@@ -19,6 +20,8 @@ _NAMES = {
     bool: ("true or false", "true or false"),
     str: ("a string", "strings"),
 }
+_SURROGATE = re.compile("[\ud800-\udfff]")
+"""What UTF-8 lacks: bytes of the command line that are not UTF-8."""
 _BOUNDS = (("above", "above"), ("low", "at least"), ("high", "at most"))
 
 
@@ -97,17 +100,21 @@ def describe_type(annotation: Any, *, plural: bool = False) -> str:
 def _convert(value: object, annotation: Any) -> Any:
     """Value as the annotated type (int becomes float, lists tuples); raises _MismatchError if it does not fit."""
     if typing.get_origin(annotation) is tuple:
-        return _convert_tuple(value, typing.get_args(annotation))
+        parts = typing.get_args(annotation)
+        if not isinstance(value, list | tuple) or (parts[-1] is not Ellipsis and len(value) != len(parts)):
+            raise _MismatchError
+        return tuple(map(_convert, value, parts if parts[-1] is not Ellipsis else parts[:1] * len(value)))
     if _is_distribution(annotation):
         try:
             return annotation.parse(value)
         except ValueError as error:
             raise _MismatchError(str(error)) from None
     if annotation is float:
-        if not isinstance(value, int | float) or isinstance(value, bool):
+        # Whole numbers may exceed a float's range, and TOML has inf and nan.
+        if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= sys.float_info.max:
             raise _MismatchError
-        return _finite(value)
-    if type(value) is not annotation or (isinstance(value, str) and not _encodable(value)):
+        return float(value)
+    if type(value) is not annotation or (isinstance(value, str) and _SURROGATE.search(value)):
         raise _MismatchError
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise _MismatchError("a whole number of at most 64 bits, as TOML has")
@@ -122,37 +129,6 @@ def is_table(annotation: Any) -> bool:
 def _is_distribution(annotation: Any) -> bool:
     """Whether a type is that of a distribution."""
     return isinstance(annotation, type) and issubclass(annotation, Distribution)
-
-
-def _convert_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
-    """List as a tuple of converted values; raises _MismatchError for a wrong length or kind."""
-    if not isinstance(value, list | tuple):
-        raise _MismatchError
-    if parts[-1] is Ellipsis:
-        return tuple(_convert(one, parts[0]) for one in value)
-    if len(value) != len(parts):
-        raise _MismatchError
-    return tuple(_convert(one, part) for one, part in zip(value, parts, strict=True))
-
-
-def _finite(value: float) -> float:
-    """Convert to a finite float: whole numbers may exceed a float's range, and TOML has inf and nan."""
-    try:
-        result = float(value)
-    except OverflowError:
-        raise _MismatchError from None
-    if not math.isfinite(result):
-        raise _MismatchError
-    return result
-
-
-def _encodable(text: str) -> bool:
-    """Whether the text can be written as UTF-8: command line arguments with other bytes cannot."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _leaves(value: Any) -> Iterator[Any]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
+import re
 import types
 import typing
 from collections.abc import Callable
@@ -19,23 +21,28 @@ INT32_MAX = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class Within:
-    """Bounds, inclusive, and unit of a setting's numbers, of each one in a tuple: `Annotated[float, Within(0.0, 1.0, "m")]`."""
+class Bounds:
+    """Bounds and unit of a setting's numbers, of each one in a tuple."""
 
     low: float | None = None
-    high: float | None = None
-    unit: str = ""
+    """Inclusive lower bound."""
     above: float | None = None
     """Exclusive lower bound, in place of `low`."""
+    high: float | None = None
+    """Inclusive upper bound."""
+    unit: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Bounds:
+        """Bounds of an interval, as in `Annotated[float, "(0, 10] m"]`: both, one or none of interval and unit; "inf" is no bound."""
+        bracket, low, high, unit = _INTERVAL.fullmatch(text).groups()  # type: ignore[union-attr]
+        least, most = (None if bound in (None, "inf") else ast.literal_eval(bound) for bound in (low, high))
+        return cls(least if bracket == "[" else None, least if bracket == "(" else None, most, unit)
 
 
-def above(least: float, high: float | None = None, unit: str = "") -> Within:
-    """Bounds of which the lower one is exclusive."""
-    return Within(None, high, unit, least)
-
-
-Fraction = Annotated[float, Within(0.0, 1.0)]
-Color = Annotated[tuple[float, float, float], Within(0.0, 1.0, "sRGB")]
+_INTERVAL = re.compile(r"(?:([\[(])(\S+), (\S+)[\])])? ?(.*)")
+Fraction = Annotated[float, "[0, 1]"]
+Color = Annotated[tuple[float, float, float], "[0, 1] sRGB"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,7 @@ class Setting:
 
     kind: Any
     default: Any
-    bounds: Within
+    bounds: Bounds
     doc: str
     choices: tuple[str, ...]
     parse: Callable[[Any], Any] | None
@@ -87,9 +94,9 @@ def settings_of(kind: type[Any]) -> dict[str, Setting]:
 
 def _read(annotation: Any, item: dataclasses.Field[Any]) -> Setting:
     """Setting of a field."""
-    bounds = Within()
+    bounds = Bounds()
     if typing.get_origin(annotation) is Annotated:
-        annotation, bounds = typing.get_args(annotation)
+        annotation, bounds = annotation.__origin__, Bounds.parse(annotation.__metadata__[0])
     if typing.get_origin(annotation) in (types.UnionType, typing.Union):
         annotation = next(part for part in typing.get_args(annotation) if part is not type(None))
     return Setting(annotation, item.default, bounds, **item.metadata)

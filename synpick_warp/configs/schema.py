@@ -21,7 +21,7 @@ from synpick_warp.configs.cell.sensors import DepthSensor, Effects
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize
-from synpick_warp.configs.fields import INT32_MAX, Color, Fraction, Within, above, setting
+from synpick_warp.configs.fields import INT32_MAX, Color, Fraction, setting
 from synpick_warp.system.plugins import plugin_names
 from synpick_warp.views.layers import LAYER_TABLE
 
@@ -63,21 +63,17 @@ class Bake:
         "cycle (pick, target, move in turn).",
         choices=(*MODES, MIXED, CYCLE),
     )
-    mix: Annotated[tuple[float, float, float], Within(0.0, 1000)] = setting(
-        (1.0, 1.0, 1.0), "Weights of pick, target and move in mode mixed."
-    )
-    worlds: Annotated[int, Within(0, 65536)] = setting(
+    mix: Annotated[tuple[float, float, float], "[0, 1000]"] = setting((1.0, 1.0, 1.0), "Weights of pick, target and move in mode mixed.")
+    worlds: Annotated[int, "[0, 65536]"] = setting(
         0, "Worlds simulated in parallel on each device; 0: chosen by episodes, device and memory. A GPU simulates at least 8."
     )
-    episodes: Annotated[int, Within(1, INT32_MAX)] = setting(
+    episodes: Annotated[int, f"[1, {INT32_MAX}]"] = setting(
         4, "Episodes to generate; each becomes one BOP scene per camera. As many as bake.worlds, where only those are set."
     )
-    seed: Annotated[int, Within(0, 2**63 - 1)] = setting(0, "Seed of all random numbers.")
+    seed: Annotated[int, f"[0, {2**63 - 1}]"] = setting(0, "Seed of all random numbers.")
     device: str = setting("auto", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting(
-        "",
-        "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: embedded objects.",
-        path=True,
+        "", "Folder of BOP models, of PLY, OBJ, glTF, STL and STEP files, or of a folder per object; empty: embedded objects.", path=True
     )
     lights: str = setting("", "Folder of HDR environment maps (.hdr) and sIBL sets; empty: embedded maps.", path=True)
     formats: tuple[str, ...] = setting(
@@ -86,7 +82,7 @@ class Bake:
         "lerobot, coco, yolo.",
         choices=FORMATS,
     )
-    writers: Annotated[int, Within(0, 1024)] = setting(
+    writers: Annotated[int, "[0, 1024]"] = setting(
         0, "Processes that write files, for all devices; 0: one per CPU core, if memory suffices."
     )
 
@@ -95,13 +91,13 @@ class Bake:
 class Arrangement:
     """Which objects an episode contains, and how they are dropped into the tote."""
 
-    counts: Annotated[Counts, Within(0, INT32_MAX)] = setting(
+    counts: Annotated[Counts, f"[0, {INT32_MAX}]"] = setting(
         (),
         "Parts, by name or obj_id, with the number, or range of numbers, of each in an episode; empty: objects are drawn up to volume.",
         parse=parse_counts,
         allowed=COUNTS,
     )
-    volume: Annotated[float, above(0.0, 1.0, "m³")] = setting(
+    volume: Annotated[float, "(0, 1] m³"] = setting(
         7e-3, "Budget for the total volume of collision shapes of an episode's objects (paper)."
     )
     fill: str = setting(
@@ -110,11 +106,11 @@ class Arrangement:
         "An object that alone is larger is never drawn.",
         choices=FILLS,
     )
-    max_objects: Annotated[int, Within(1, MAX_INSTANCES)] = setting(24, "Maximum objects of an episode.")
+    max_objects: Annotated[int, f"[1, {MAX_INSTANCES}]"] = setting(24, "Maximum objects of an episode.")
     repeat_to_fill: bool = setting(
         True, "Let objects repeat in an episode, as pick.repeats does, where the whole catalog stays below the budget."
     )
-    slot_shortfall: Annotated[float, above(0.0, 0.5)] = setting(
+    slot_shortfall: Annotated[float, "(0, 0.5]"] = setting(
         1e-3, "Accepted fraction of draws that need more body slots than a world has; they are repeated."
     )
     drop: str = setting(
@@ -123,7 +119,7 @@ class Arrangement:
         "the lowest of random places).",
         choices=(COLUMN, LAYERED, SCATTERED),
     )
-    clearance: Annotated[float, Within(0.0, 1.0, "m")] = setting(
+    clearance: Annotated[float, "[0, 1] m"] = setting(
         0.01, "Gap between bounding spheres of objects as they begin to fall; scattered: of cylinders."
     )
     upright: Fraction = setting(0.0, "Fraction of the objects that begin to fall with their z axis upwards, so that most stand.")
@@ -136,59 +132,54 @@ class Arrangement:
 class Settle:
     """When a dropped pile counts as at rest, and which objects are dropped again."""
 
-    min_time: Annotated[float, Within(0.0, 3600.0, "s")] = setting(1.0, "Minimum simulated time from the drop to the first frame.")
-    max_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(10.0, "Time after which a pile that is not at rest is resampled.")
-    rest_displacement: Annotated[float, above(0.0, 0.1, "m")] = setting(
-        1e-4, "Largest displacement in a tick of any point of an object at rest."
-    )
-    relax_time: Annotated[float, Within(0.0, 3600.0, "s")] = setting(
+    min_time: Annotated[float, "[0, 3600] s"] = setting(1.0, "Minimum simulated time from the drop to the first frame.")
+    max_time: Annotated[float, "(0, 3600] s"] = setting(10.0, "Time after which a pile that is not at rest is resampled.")
+    rest_displacement: Annotated[float, "(0, 0.1] m"] = setting(1e-4, "Largest displacement in a tick of any point of an object at rest.")
+    relax_time: Annotated[float, "[0, 3600] s"] = setting(
         4.0, "Time after which relaxed_displacement replaces rest_displacement: some piles keep jittering."
     )
-    relaxed_displacement: Annotated[float, above(0.0, 0.1, "m")] = setting(2e-3, "Rest threshold after relax_time: displacement in a tick.")
-    rest_ticks: Annotated[int, Within(1, INT32_MAX)] = setting(8, "Consecutive ticks for which all objects must be at rest.")
-    restless: Annotated[float, Within(0.0, 0.5)] = setting(
-        0.0,
-        "Fraction of the objects that may move by more than rest_displacement, but not relaxed_displacement, in a pile at rest.",
+    relaxed_displacement: Annotated[float, "(0, 0.1] m"] = setting(2e-3, "Rest threshold after relax_time: displacement in a tick.")
+    rest_ticks: Annotated[int, f"[1, {INT32_MAX}]"] = setting(8, "Consecutive ticks for which all objects must be at rest.")
+    restless: Annotated[float, "[0, 0.5]"] = setting(
+        0.0, "Fraction of the objects that may move by more than rest_displacement, but not relaxed_displacement, in a pile at rest."
     )
-    stuck_depth: Annotated[float, above(0.0, 1.0, "m")] = setting(0.01, "Penetration above which an object is stuck (released).")
-    stuck_time: Annotated[float, above(0.0, 3600.0, "s")] = setting(0.4, "Time after which a stuck object is dropped again (released).")
-    max_redrops: Annotated[int, Within(0, INT32_MAX)] = setting(8, "Maximum objects dropped again before an arrangement is resampled.")
-    tries: Annotated[int, Within(1, INT32_MAX)] = setting(20, "Arrangements tried before an episode is given up.")
+    stuck_depth: Annotated[float, "(0, 1] m"] = setting(0.01, "Penetration above which an object is stuck (released).")
+    stuck_time: Annotated[float, "(0, 3600] s"] = setting(0.4, "Time after which a stuck object is dropped again (released).")
+    max_redrops: Annotated[int, f"[0, {INT32_MAX}]"] = setting(8, "Maximum objects dropped again before an arrangement is resampled.")
+    tries: Annotated[int, f"[1, {INT32_MAX}]"] = setting(20, "Arrangements tried before an episode is given up.")
 
 
 @dataclass(frozen=True)
 class Physics:
     """Rigid-body solver and contacts. Values without a source were measured with Newton 1.8."""
 
-    step: Annotated[float, Within(1e-5, 0.02, "s")] = setting(2e-3, "Time step (paper).")
-    steps_per_tick: Annotated[int, Within(1, 1000)] = setting(33, "Steps per tick, one output frame: 33 steps of 2 ms are 15 Hz (paper).")
-    gravity: Annotated[float, Within(0.0, 100.0, "m/s²")] = setting(9.81, "Gravitational acceleration.")
-    substeps: Annotated[int, Within(1, 100)] = setting(
-        1, "Solver substeps per step, with collision detection in each; two take twice as long."
-    )
-    iterations: Annotated[int, Within(1, 1000)] = setting(16, "Projected Gauss-Seidel iterations per solver substep.")
+    step: Annotated[float, "[1e-5, 0.02] s"] = setting(2e-3, "Time step (paper).")
+    steps_per_tick: Annotated[int, "[1, 1000]"] = setting(33, "Steps per tick, one output frame: 33 steps of 2 ms are 15 Hz (paper).")
+    gravity: Annotated[float, "[0, 100] m/s²"] = setting(9.81, "Gravitational acceleration.")
+    substeps: Annotated[int, "[1, 100]"] = setting(1, "Solver substeps per step, with collision detection in each; two take twice as long.")
+    iterations: Annotated[int, "[1, 1000]"] = setting(16, "Projected Gauss-Seidel iterations per solver substep.")
     match_all: bool = setting(
         False,
         "Warm start every contact. Newton leaves one of two coincident contacts out, as edges on a face have: boxes that lie ten deep "
         "then move five times as fast.",
     )
-    sleep: Annotated[float, Within(0.0, 0.01, "m")] = setting(
+    sleep: Annotated[float, "[0, 0.01] m"] = setting(
         0.0,
         "Island sleeping: displacement in a tick up to which an object is at rest, such as 2e-4; 0: off. Touching objects that all rest "
         "for three ticks are not simulated until one is touched, and lack contact forces in records.",
     )
-    friction: Annotated[float, Within(0.0, 10.0)] = setting(0.5, "Coulomb friction coefficient of every shape.")
-    gap: Annotated[float, Within(0.0, 0.1, "m")] = setting(4e-3, "Contact margin of a shape: contacts exist below twice this distance.")
-    angular_damping: Annotated[float, Within(0.0, 1e3, "1/s")] = setting(0.05, "Angular damping of the objects (PhysX's default).")
-    max_speed: Annotated[float, above(0.0, 100.0, "m/s")] = setting(
+    friction: Annotated[float, "[0, 10]"] = setting(0.5, "Coulomb friction coefficient of every shape.")
+    gap: Annotated[float, "[0, 0.1] m"] = setting(4e-3, "Contact margin of a shape: contacts exist below twice this distance.")
+    angular_damping: Annotated[float, "[0, 1e3] 1/s"] = setting(0.05, "Angular damping of the objects (PhysX's default).")
+    max_speed: Annotated[float, "(0, 100] m/s"] = setting(
         4.0, "Speed limit of the objects; above twice the gap per substep they may tunnel."
     )
-    contacts_per_world: Annotated[int, Within(16, INT32_MAX)] = setting(512, "Contact capacity per world; about 140 contacts are usual.")
-    pairs_per_world: Annotated[int, Within(16, INT32_MAX)] = setting(1024, "Broad-phase pair capacity per world.")
-    rows_per_world: Annotated[int, Within(48, INT32_MAX)] = setting(1536, "Capacity for the objects' contact constraint rows per world.")
-    gripper_rows_per_world: Annotated[int, Within(48, INT32_MAX)] = setting(256, "Capacity for the gripper's constraint rows per world.")
+    contacts_per_world: Annotated[int, f"[16, {INT32_MAX}]"] = setting(512, "Contact capacity per world; about 140 contacts are usual.")
+    pairs_per_world: Annotated[int, f"[16, {INT32_MAX}]"] = setting(1024, "Broad-phase pair capacity per world.")
+    rows_per_world: Annotated[int, f"[48, {INT32_MAX}]"] = setting(1536, "Capacity for the objects' contact constraint rows per world.")
+    gripper_rows_per_world: Annotated[int, f"[48, {INT32_MAX}]"] = setting(256, "Capacity for the gripper's constraint rows per world.")
     deterministic: bool = setting(True, "Sort contact rows on a GPU, so that bakes are equal bit for bit.")
-    guide_height: Annotated[float, above(0.0, 100.0, "m")] = setting(8.0, "Height of temporary walls on the rim that guide the drop.")
+    guide_height: Annotated[float, "(0, 100] m"] = setting(8.0, "Height of temporary walls on the rim that guide the drop.")
 
     @property
     def tick_time(self) -> float:
@@ -206,26 +197,25 @@ class Render:
         "shadows of one lamp: for small images of many worlds).",
         choices=RENDER_MODES,
     )
-    samples: Annotated[int, Within(1, 65536)] = setting(64, "Mode reference: paths per pixel; powers of two are stratified best.")
-    bounces: Annotated[int, Within(1, 64)] = setting(4, "Maximum surfaces along a path; 1: direct light only.")
+    samples: Annotated[int, "[1, 65536]"] = setting(64, "Mode reference: paths per pixel; powers of two are stratified best.")
+    bounces: Annotated[int, "[1, 64]"] = setting(4, "Maximum surfaces along a path; 1: direct light only.")
     random_yaw: bool = setting(True, "Rotate each episode's environment map by a random yaw.")
-    exposure: Annotated[float, Within(0.01, 100.0)] = setting(1.0, "Factor on the automatic exposure.")
-    exposure_spread: Annotated[float, Within(0.0, 5.0, "EV")] = setting(0.3, "Half width of each episode's random exposure offset.")
-    coarse_pixel: Annotated[int, Within(0, 64, "px")] = setting(
+    exposure: Annotated[float, "[0.01, 100]"] = setting(1.0, "Factor on the automatic exposure.")
+    exposure_spread: Annotated[float, "[0, 5] EV"] = setting(0.3, "Half width of each episode's random exposure offset.")
+    coarse_pixel: Annotated[int, "[0, 64] px"] = setting(
         0,
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history` (4 px at "
         "full HD; 5 px take 6 % less time and cost 0.2 to 0.7 dB). Shadow rays are spaced as wide, at most 32 px.",
     )
-    coarse_paths: Annotated[int, Within(0, 1024)] = setting(
+    coarse_paths: Annotated[int, "[0, 1024]"] = setting(
         0,
         "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them; with "
         "it up to 32 in an episode's first frame.",
     )
-    history: Annotated[int, Within(0, 255)] = setting(
-        32,
-        "Mode fast: paths per coarse pixel averaged over frames where nothing moves; 0: each frame by itself.",
+    history: Annotated[int, "[0, 255]"] = setting(
+        32, "Mode fast: paths per coarse pixel averaged over frames where nothing moves; 0: each frame by itself."
     )
-    lamps: Annotated[int, Within(0, 8)] = setting(
+    lamps: Annotated[int, "[0, 8]"] = setting(
         8, "Maximum lamps of a map, small bright lights with shadow rays of their own; mode unoccluded: at most 1."
     )
     antialias: bool = setting(True, "Anti-alias the edges of surfaces; mode reference always does.")
@@ -235,13 +225,12 @@ class Render:
         choices=names(Tone),
     )
     table: bool = setting(True, "Render a table under the tote; without it the environment map is the background.")
-    table_size: Annotated[tuple[float, float], Within(0.0, 20.0, "m")] = setting(
-        (0.0, 0.0),
-        "Length and width of the table that cameras see, about the origin; 0: endless. Light and objects meet an endless one.",
+    table_size: Annotated[tuple[float, float], "[0, 20] m"] = setting(
+        (0.0, 0.0), "Length and width of the table that cameras see, about the origin; 0: endless. Light and objects meet an endless one."
     )
     table_color: Color = setting((0.45, 0.45, 0.44), "Base colour of the table.")
     layers: tuple[str, ...] = setting((), "Additional ground-truth layers (AOVs) of each view.", choices=LAYERS)
-    views_per_batch: Annotated[int, Within(0, INT32_MAX)] = setting(0, "Views rendered in one batch; 0: chosen by device and resolution.")
+    views_per_batch: Annotated[int, f"[0, {INT32_MAX}]"] = setting(0, "Views rendered in one batch; 0: chosen by device and resolution.")
 
 
 @dataclass(frozen=True)
@@ -250,8 +239,8 @@ class Bop:
 
     split: str = setting("train_pbr", "Folder of the split; the BOP toolkit reads JPEG only from *_pbr.")
     color_format: str = setting("jpg", "File format of RGB images.", choices=("jpg", "png"))
-    jpeg_quality: Annotated[int, Within(1, 100)] = setting(95, "JPEG quality.")
-    depth_scale: Annotated[float, above(0.0, 10.0, "mm")] = setting(0.1, "Depth of one count; 0.1 mm reaches 6.5 m.")
+    jpeg_quality: Annotated[int, "[1, 100]"] = setting(95, "JPEG quality.")
+    depth_scale: Annotated[float, "(0, 10] mm"] = setting(0.1, "Depth of one count; 0.1 mm reaches 6.5 m.")
     masks: bool = setting(True, "Write mask/ (amodal) and mask_visib/ (visible).")
     coco: bool = setting(True, "Write COCO annotations (scene_gt_coco.json).")
     polygons: bool = setting(False, "Segmentation of the format coco by exact polygons, for tools that read no run lengths.")
@@ -262,10 +251,9 @@ class Bop:
         choices=LAYOUTS,
     )
     rectified: bool = setting(
-        False,
-        "Render cameras as pinholes of the same matrices, without distortion. Undistort real pictures to the same matrix.",
+        False, "Render cameras as pinholes of the same matrices, without distortion. Undistort real pictures to the same matrix."
     )
-    keypoints: Annotated[int, Within(0, 64)] = setting(
+    keypoints: Annotated[int, "[0, 64]"] = setting(
         0, "Keypoints of each object in COCO annotations: farthest points of its surface (8: as PVNet); 0: none."
     )
     graph: bool = setting(
@@ -281,9 +269,9 @@ class Trajectory:
     """The zarr store of simulated trajectories."""
 
     steps: bool = setting(True, "Store every physics step; without it every tick only.")
-    chunk_ticks: Annotated[int, Within(1, 4096, "ticks")] = setting(16, "Chunk length: the unit of compression and reading.")
-    shard_chunks: Annotated[int, Within(1, 4096, "chunks")] = setting(64, "Chunks per shard, which is one file.")
-    level: Annotated[int, Within(1, 22)] = setting(3, "Compression level of zstd.")
+    chunk_ticks: Annotated[int, "[1, 4096] ticks"] = setting(16, "Chunk length: the unit of compression and reading.")
+    shard_chunks: Annotated[int, "[1, 4096] chunks"] = setting(64, "Chunks per shard, which is one file.")
+    level: Annotated[int, "[1, 22]"] = setting(3, "Compression level of zstd.")
 
 
 @dataclass(frozen=True)
@@ -294,8 +282,8 @@ class Split:
 
     name: str = ""
     """Key of its table; no setting of its own."""
-    episodes: Annotated[int, Within(1, INT32_MAX)] = setting(1, "Episodes of the split; it can grow where indices are free.")
-    first: Annotated[int, Within(-1, INT32_MAX)] = setting(
+    episodes: Annotated[int, f"[1, {INT32_MAX}]"] = setting(1, "Episodes of the split; it can grow where indices are free.")
+    first: Annotated[int, f"[-1, {INT32_MAX}]"] = setting(
         -1, "Index of its first episode; -1: the next after the split before it. A gap leaves room to grow."
     )
     mode: str = setting("", "As bake.mode; empty: that.", choices=("", *MODES, MIXED, CYCLE))

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.configs.calibration.files import FISHEYE, PINHOLE, Calibration, read_calibration
 from synpick_warp.configs.calibration.lens import MAX_ANGLE, TOLERANCE, Lens, LensMap
-from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera
+from synpick_warp.configs.calibration.tables import SENSORS, sensor_camera
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.errors import ConfigError

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.calibration.sensor_presets import ASSUMED, DEFINED, MEASURED, PUBLISHED, SENSORS, sensor_settings
+from synpick_warp.configs.calibration.tables import SENSORS, sensor_settings
 from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import COMMAND_LINE, load_config, override_config, parse_assignment, preset_names, sections
 from synpick_warp.configs.files.write import config_to_toml
@@ -345,7 +345,7 @@ def test_a_sensor_preset_sets_its_figures(name, tmp_path):
     path.write_text(config_to_toml(load_config("smoke", {"depth_sensor.preset": name, "depth_sensor.disparity_noise": 0.5})))
     assert load_config(str(path)).depth_sensor == dataclasses.replace(sensor, disparity_noise=0.5)
     for key, figure in SENSORS[name].items():
-        assert figure.trust in (PUBLISHED, MEASURED, ASSUMED, DEFINED), key
+        assert figure.trust in ("published", "measured", "assumed", "defined"), key
         assert figure.source
 
 

@@ -33,11 +33,8 @@ Tree = dict[str, Any]
 
 
 def read_document(path: Path) -> Tree:
-    """Read a file as a mapping: of its names, or of those that formats without names mean.
-
-    Raises:
-        ConfigError: In one line: it cannot be read, is too large, is of no such format, or has what a calibration never needs.
-    """
+    """Read a file as a mapping: of its names, or of those that formats without names mean. Raises ConfigError: in one line: it cannot be
+    read, is too large, is of no such format, or has what a calibration never needs."""
     data = read_file(path, MAX_FILE, ConfigError)
     if data.startswith((b"PK", b"\x93NUMPY")):
         return _read_arrays(data, path)

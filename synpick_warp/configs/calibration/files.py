@@ -78,13 +78,12 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
     """Read the intrinsics of a camera from a file of any of the formats, which is told from its content.
 
     Args:
-        path: The file.
         model: Distortion model, where the file does not name it: four coefficients in a file of OpenCV may be of both.
         pixel_center: Image coordinates of the first pixel's centre in the file, 0 or 0.5 [px]; None: those of its format.
 
     Raises:
-        ConfigError: In one line: the file cannot be read or is of no such format, a value is missing or impossible, or a distortion model
-            is one that is not rendered.
+        ConfigError: The file cannot be read or is of no such format, a value is missing or impossible, or a distortion model is not
+            rendered.
     """
     tree = read_document(path)
     trees = [tree] if _format(tree) else [part for part in tree.values() if isinstance(part, dict) and _format(part)]
@@ -303,11 +302,8 @@ def _has(tree: Tree, names: Sequence[str]) -> bool:
 
 
 def _coefficients(tree: Tree, any_size: bool = False) -> tuple[float, ...]:
-    """Distortion coefficients under one of their names, or k1, k2, p1, p2 and so on under their own; none if there are none.
-
-    Raises:
-        _FaultError: A name looks like one of coefficients, and is not known.
-    """
+    """Distortion coefficients under one of their names, or k1, k2, p1, p2 and so on under their own; none if there are none. Raises
+    _FaultError: A name looks like one of coefficients, and is not known."""
     if unknown := [name for name in tree if _short(name).startswith("dist") and _short(name) not in (*_DISTORTION, *_MODEL)]:
         raise _FaultError(f"it has {format_value(unknown[0])}, which is no known name; call coefficients distortion_coefficients")
     if _has(tree, _DISTORTION):

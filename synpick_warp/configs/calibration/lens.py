@@ -45,11 +45,8 @@ _BLOCK = 2**18
 
 @dataclass(frozen=True)
 class Lens:
-    """Distortion model and its coefficients, in OpenCV's order.
-
-    Raises:
-        ConfigError: There is no such model, it has another number of coefficients, or one is not finite or absurdly large.
-    """
+    """Distortion model and its coefficients, in OpenCV's order. Raises ConfigError: there is no such model, it has another number of
+    coefficients, or one is not finite or absurdly large."""
 
     model: str = PINHOLE
     coefficients: tuple[float, ...] = (0.0,) * 4
@@ -129,15 +126,8 @@ class Lens:
 
 
 def read_lens(camera: Mapping[str, Any], size: tuple[int, int]) -> LensMap | None:
-    """Projection of an entry of scene_camera.json, by its `cam_K`, `cam_dist` and `cam_dist_model`; None: a pinhole.
-
-    Args:
-        camera: The entry.
-        size: Width and height of the image [px].
-
-    Raises:
-        ConfigError: The values are none of a lens that covers the image.
-    """
+    """Projection of an entry of scene_camera.json, by its `cam_K`, `cam_dist` and `cam_dist_model`, for images of this size [px]; None: a
+    pinhole. Raises ConfigError: the values are none of a lens that covers the image."""
     if not camera.get("cam_dist"):
         return None
     try:
@@ -158,11 +148,8 @@ def make_lens_map(
 
 
 def with_matrix(lens: LensMap | None, matrix: np.ndarray, size: tuple[int, int] | None = None) -> LensMap | None:
-    """The same lens before a sensor with another camera matrix (3, 3) [px], and of another size [px] unless None; None: a pinhole.
-
-    Raises:
-        ConfigError: The lens does not cover the image.
-    """
+    """The same lens before a sensor with another camera matrix (3, 3) [px], and of another size [px] unless None; None: a pinhole. Raises
+    ConfigError: the lens does not cover the image."""
     if lens is None:
         return None
     fx, fy, cx, cy = matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
@@ -185,16 +172,8 @@ class LensMap:
     """Upper bound of the distance of two rays in the normalised plane, by the distance of their pixels [1/px]."""
 
     def __init__(self, lens: Lens, intrinsics: tuple[float, float, float, float], size: tuple[int, int]) -> None:
-        """
-        Args:
-            lens: The distortion.
-            intrinsics: fx, fy, cx, cy [px].
-            size: Width and height of the image [px].
-
-        Raises:
-            ConfigError: The distortion folds over inside the image, a pixel's ray is more than MAX_ANGLE off the axis, or intrinsics are
-                none of an image.
-        """
+        """Distortion, fx, fy, cx, cy [px], and width and height of the image [px]. Raises ConfigError: the distortion folds over inside the
+        image, a pixel's ray is more than MAX_ANGLE off the axis, or intrinsics are none of an image."""
         if not (min(intrinsics[:2]) > 1 / MAX_NUMBER and (np.abs(intrinsics) <= MAX_NUMBER).all()):
             raise ConfigError(
                 f"fx, fy, cx, cy are {format_value(list(intrinsics))}; allowed: focal lengths above 0 and a centre in the image"
@@ -215,11 +194,8 @@ class LensMap:
         return self._continued(np.asarray(points, float))[0] * self._focal + self._center
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
-        """Points (..., 2) of the normalised plane that are projected to `pixels` (..., 2), by Newton's method with damped steps.
-
-        Raises:
-            ConfigError: A pixel's ray was not found.
-        """
+        """Points (..., 2) of the normalised plane that are projected to `pixels` (..., 2), by Newton's method with damped steps. Raises
+        ConfigError: A pixel's ray was not found."""
         pixels = np.asarray(pixels, float)
         goal = ((pixels - self._center) / self._focal).reshape(-1, 2)
         rays = np.concatenate([self._invert(part) for part in np.array_split(goal, -(-len(goal) // _BLOCK) or 1)])

@@ -1,31 +1,71 @@
-"""Resolution of [[camera]] tables that name a calibration file or a sensor: numbers replace the name, and the file is not read again."""
+"""Sensors of [[camera]] tables and of `depth_sensor`: presets (sensors.toml), and tables that name a calibration file or a sensor, whose
+numbers replace the name, so that the file is not read again.
+
+A preset sets `depth_sensor.*`. Its noise is noise of disparity, from which depth noise follows by focal length and baseline:
+sigma_z = z² sigma_d / (f b). Two cameras of one model differ by some pixels: a calibration of the own camera is better.
+"""
 
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from synpick_warp.configs.calibration.files import HALVES, INTEGERS, MAX_NUMBER, MODELS, Calibration, read_calibration
-from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import ConfigError, format_value, suggest
 
 _INTRINSICS = ("matrix", "fov", "distortion")
 """Keys that a file or a sensor stands for, with `model` and `resolution`."""
+NO_OTHER_NOISE: dict[str, Any] = {"noise": 0.0, "noise_growth": 0.0, "noise_angle": 0.0}
+"""Settings of all presets: the only noise is that of disparity and of the pixel's position."""
+_CAMERA = ("resolution", "focal", "center", "height")
+"""Values that are no settings of `depth_sensor`."""
+
+
+class Figure(NamedTuple):
+    """Value of a preset, how it is known (published, measured, assumed or defined), and its source in words."""
+
+    value: Any
+    trust: str
+    source: str
+
+
+def _read_presets() -> dict[str, dict[str, Figure]]:
+    """Values of each preset, with those of its series."""
+    tables = tomllib.loads(Path(__file__).with_name("sensors.toml").read_text(encoding="utf-8"))
+    rows = {name: table | tables["series"].get(table.pop("series", ""), {}) for name, table in tables["sensors"].items()}
+    return {
+        name: {key: Figure(tuple(value) if isinstance(value, list) else value, *rest) for key, (value, *rest) in row.items()}
+        for name, row in rows.items()
+    }
+
+
+SENSORS = _read_presets()
+"""Values of each preset by name."""
+
+
+def sensor_settings(name: str) -> dict[str, Any]:
+    """Settings of the section `depth_sensor` that a preset stands for; none for an empty or unknown name."""
+    figures = SENSORS.get(name, {})
+    known = {key: figure.value for key, figure in figures.items() if key not in _CAMERA}
+    return {**NO_OTHER_NOISE, "max_disparity": 0.0, **known} if figures else {}
+
+
+def sensor_camera(name: str) -> Calibration | None:
+    """Resolution and intrinsics of a preset's depth image; None: it has no camera of its own, as `ideal`, or there is no such preset."""
+    figures = SENSORS.get(name, {})
+    if "focal" not in figures:
+        return None
+    return Calibration(*figures["resolution"].value, *figures["focal"].value, *figures["center"].value)
 
 
 def fill_tables(tables: object, source: str) -> object:
     """Replace `file` or `sensor`, and `pixel_center`, in the content of [[camera]] tables; anything that is no such table is left as it is.
-
-    Args:
-        tables: Value of `camera` as parsed from TOML.
-        source: Where the tables come from, for messages.
-
-    Raises:
-        ConfigError: A file cannot be used, there is no such sensor, or one stands beside keys that it sets.
-    """
+    `source`: where the tables come from, for messages. Raises ConfigError: a file cannot be used, there is no such sensor, or one stands
+    beside keys that it sets."""
     if not isinstance(tables, list):
         return tables
     return [_fill(f"camera[{index}]", table, source) if isinstance(table, dict) else table for index, table in enumerate(tables)]
@@ -70,12 +110,10 @@ def _fill(key: str, table: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 def _sensor(key: str, name: str, source: str) -> Calibration:
     """Intrinsics of a sensor."""
-    known = [name for name in SENSORS if sensor_camera(name) is not None]
-    if name not in known:
-        raise ConfigError(f"{key}.sensor is {format_value(name)} {source}; allowed: {', '.join(known)}{suggest(name, known)}")
-    found = sensor_camera(name)
-    assert found is not None
-    return found
+    if found := sensor_camera(name):
+        return found
+    known = [each for each in SENSORS if sensor_camera(each)]
+    raise ConfigError(f"{key}.sensor is {format_value(name)} {source}; allowed: {', '.join(known)}{suggest(name, known)}")
 
 
 def _shifted(table: dict[str, Any], center: float | None) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 
 from synpick_warp.configs.calibration.files import MAX_NUMBER, MODELS
 from synpick_warp.configs.episodes.randomize import Distribution
-from synpick_warp.configs.fields import Within, above, setting
+from synpick_warp.configs.fields import setting
 from synpick_warp.views.layers import LAYER_TABLE
 
 Vector = tuple[float, float, float]
@@ -26,17 +26,14 @@ MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
 class Cameras:
     """Pinhole cameras above the tote: square pixels, principal point in the middle of the image."""
 
-    resolution: Annotated[tuple[int, int], Within(1, 8192, "px")] = setting((1920, 1080), "Image width and height.")
-    fov: Annotated[float, Within(1.0, 170.0, "°")] = setting(20.0, "Horizontal field of view.")
-    positions: Annotated[tuple[tuple[float, float, float], ...], Within(-100.0, 100.0, "m")] = setting(
+    resolution: Annotated[tuple[int, int], "[1, 8192] px"] = setting((1920, 1080), "Image width and height.")
+    fov: Annotated[float, "[1, 170] °"] = setting(20.0, "Horizontal field of view.")
+    positions: Annotated[tuple[tuple[float, float, float], ...], "[-100, 100] m"] = setting(
         ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)), "Position of each camera in the tote's frame (released)."
     )
-    target: Annotated[tuple[float, float, float], Within(-100.0, 100.0, "m")] = setting(
-        (0.0, 0.0, 0.16), "Look-at point of all cameras (released)."
-    )
-    ups: Annotated[tuple[tuple[float, float, float], ...], Within(-1e3, 1e3)] = setting(
-        ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)),
-        "Up vector of each camera.",
+    target: Annotated[tuple[float, float, float], "[-100, 100] m"] = setting((0.0, 0.0, 0.16), "Look-at point of all cameras (released).")
+    ups: Annotated[tuple[tuple[float, float, float], ...], "[-1e3, 1e3]"] = setting(
+        ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)), "Up vector of each camera."
     )
 
 
@@ -44,17 +41,15 @@ class Cameras:
 class Pose:
     """Pose of a camera in the tote's frame, in one of three forms."""
 
-    matrix: Annotated[tuple[tuple[float, float, float, float], ...] | None, Within(-100.0, 100.0, "m")] = setting(
+    matrix: Annotated[tuple[tuple[float, float, float, float], ...] | None, "[-100, 100] m"] = setting(
         None, "Camera-to-world transform, 4 x 4."
     )
-    position: Annotated[tuple[float, float, float] | None, Within(-100.0, 100.0, "m")] = setting(
+    position: Annotated[tuple[float, float, float] | None, "[-100, 100] m"] = setting(
         None, "Optical centre; with quaternion, or with look_at and up."
     )
-    quaternion: Annotated[tuple[float, float, float, float] | None, Within(-1.1, 1.1)] = setting(
-        None, "Camera-to-world rotation: x, y, z, w."
-    )
-    look_at: Annotated[tuple[float, float, float] | None, Within(-100.0, 100.0, "m")] = setting(None, "Point that the optical axis meets.")
-    up: Annotated[tuple[float, float, float] | None, Within(-1e3, 1e3)] = setting(None, "Direction that is up in the image.")
+    quaternion: Annotated[tuple[float, float, float, float] | None, "[-1.1, 1.1]"] = setting(None, "Camera-to-world rotation: x, y, z, w.")
+    look_at: Annotated[tuple[float, float, float] | None, "[-100, 100] m"] = setting(None, "Point that the optical axis meets.")
+    up: Annotated[tuple[float, float, float] | None, "[-1e3, 1e3]"] = setting(None, "Direction that is up in the image.")
     axes: str | None = setting(
         None,
         "Axes in matrix or quaternion: opencv (x right, y down, z forward; the default) or opengl (x right, y up, z backward; also "
@@ -73,10 +68,10 @@ class Jitter:
     Components are independent. Normal distributions are cut at three standard deviations. Not in the paper.
     """
 
-    position: Annotated[Distribution, Within(-10.0, 10.0, "m")] = setting(_NONE, "Offset of the position along each axis.")
-    rotation: Annotated[Distribution, Within(-90.0, 90.0, "°")] = setting(_NONE, "Components of a rotation vector in the camera's axes.")
-    focal_length: Annotated[Distribution, Within(-0.9, 9.0)] = setting(_NONE, "Relative change of fx and fy, such as 0.01 for 1 % more.")
-    center: Annotated[Distribution, Within(-8192.0, 8192.0, "px")] = setting(_NONE, "Offset of cx and of cy.")
+    position: Annotated[Distribution, "[-10, 10] m"] = setting(_NONE, "Offset of the position along each axis.")
+    rotation: Annotated[Distribution, "[-90, 90] °"] = setting(_NONE, "Components of a rotation vector in the camera's axes.")
+    focal_length: Annotated[Distribution, "[-0.9, 9]"] = setting(_NONE, "Relative change of fx and fy, such as 0.01 for 1 % more.")
+    center: Annotated[Distribution, "[-8192, 8192] px"] = setting(_NONE, "Offset of cx and of cy.")
 
 
 @dataclass(frozen=True)
@@ -85,17 +80,13 @@ class CameraRow:
 
     REQUIRED: ClassVar = ("pose",)
     name: str = setting("", "Name of lower-case letters, digits and underscores; empty: camera_0 and so on.")
-    resolution: Annotated[tuple[int, int] | None, Within(1, 8192, "px")] = setting(
-        None, "Image width and height; not given: cameras.resolution."
-    )
-    fov: Annotated[float | None, Within(1.0, 170.0, "°")] = setting(
-        None, "Horizontal field of view: square pixels, principal point in the middle."
-    )
+    resolution: Annotated[tuple[int, int] | None, "[1, 8192] px"] = setting(None, "Image width and height; not given: cameras.resolution.")
+    fov: Annotated[float | None, "[1, 170] °"] = setting(None, "Horizontal field of view: square pixels, principal point in the middle.")
     matrix: Annotated[
         tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]] | None,
-        Within(-MAX_NUMBER, MAX_NUMBER, "px"),
+        f"[{-MAX_NUMBER}, {MAX_NUMBER}] px",
     ] = setting(None, "Camera matrix with fx, fy, cx and cy, instead of fov.")
-    distortion: Annotated[tuple[float, ...] | None, Within(-MAX_NUMBER, MAX_NUMBER)] = setting(
+    distortion: Annotated[tuple[float, ...] | None, f"[{-MAX_NUMBER}, {MAX_NUMBER}]"] = setting(
         None, "Lens distortion by OpenCV's coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]; of a fisheye k1 k2 k3 k4."
     )
     model: str | None = setting(None, "Distortion model, pinhole unless it is given.", choices=MODELS)
@@ -105,12 +96,11 @@ class CameraRow:
         "distortion, resolution.",
         path=True,
     )
-    scale: Annotated[float | None, above(0.0, 1.0)] = setting(
-        None,
-        "Factor on image size and camera matrix, such as 0.25 for a quarter; not given: 1.",
+    scale: Annotated[float | None, "(0, 1]"] = setting(
+        None, "Factor on image size and camera matrix, such as 0.25 for a quarter; not given: 1."
     )
     sensor: str | None = setting(None, "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
-    pixel_center: Annotated[float | None, Within(unit="px")] = setting(
+    pixel_center: Annotated[float | None, "px"] = setting(
         None, "Centre of the first pixel in the given matrix or file, 0 or 0.5; not given: 0.5, of a file its format's."
     )
     pose: Pose = setting(Pose(), "Pose in the tote's frame: {matrix}, {position, quaternion} or {position, look_at, up}.")
@@ -123,9 +113,7 @@ class CameraRow:
     modalities: tuple[str, ...] | None = setting(
         None, "Images in its files, of layers those in render.layers; not given: all.", choices=MODALITIES
     )
-    every: Annotated[int | None, Within(1, 1000, "frames")] = setting(
-        None, "Frames from one picture to the next, from frame 0; not given: 1."
-    )
+    every: Annotated[int | None, "[1, 1000] frames"] = setting(None, "Frames from one picture to the next, from frame 0; not given: 1.")
     jitter: Jitter | None = setting(
         None, "What each episode draws of the camera anew: {position, rotation, focal_length, center}, each a distribution."
     )

@@ -135,12 +135,8 @@ class BinSizes:
         return self.measured.compartments if self.measured else [(*center, *self.cell, 0.0, 0.0, 0.0) for center in self._centers]
 
     def waypoints(self, corner: float, height: float) -> list[list[Point]]:
-        """Points near the four corners of each compartment.
-
-        Args:
-            corner: Where they are, as a fraction of the way from the centre to the corners of the floor.
-            height: Their height above the floor [m].
-        """
+        """Points near the four corners of each compartment: `corner` is where they are, as a fraction of the way from the centre to the
+        corners of the floor, `height` their height above the floor [m]."""
         return [
             [(x, y, a * x + b * y + c + height) for y in (cy + corner * width / 2, cy - corner * width / 2) for x in (cx + s, cx - s)]
             for cx, cy, length, width, a, b, c in self.floors

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from synpick_warp.codes import MAX_CUPS
 from synpick_warp.configs.episodes.objects import UNITS
-from synpick_warp.configs.fields import INT32_MAX, Color, Conflict, Fraction, Within, above, setting
+from synpick_warp.configs.fields import INT32_MAX, Color, Conflict, Fraction, setting
 from synpick_warp.system.plugins import plugin_names
 
 SUCTION1 = "suction1"
@@ -38,7 +38,7 @@ class Gripper:
     """A conical shaft that translates along x, y and z, and a head with suction on a wrist joint about the y axis."""
 
     kind: str = setting(SUCTION1, "Kind: suction1 (one cup) or suction_array (a plate with gripper.cups).", choices=GRIPPERS)
-    cups: Annotated[tuple[tuple[float, float], ...], Within(-0.5, 0.5, "m")] = setting(
+    cups: Annotated[tuple[tuple[float, float], ...], "[-0.5, 0.5] m"] = setting(
         (),
         "Centres [x, y] of the cups of a suction_array: x across the wrist axis, y along it, from the tool centre point; "
         f"at most {MAX_CUPS}.",
@@ -56,18 +56,18 @@ class Gripper:
     )
     mesh_unit: str = setting("m", "Unit of that mesh.", choices=tuple(UNITS))
     mesh_checksum: str = setting("", "SHA-256 of that mesh; the program writes it.")
-    finger_length: Annotated[float, Within(0.005, 2.0, "m")] = setting(0.35, "Length of the shaft, from its top to the wrist axis.")
-    finger_width: Annotated[float, Within(0.005, 1.0, "m")] = setting(0.075, "Diameter of the shaft at its top.")
-    cup_width: Annotated[float, Within(0.005, 0.5, "m")] = setting(0.042, "Diameter of the suction cup.")
-    cup_length: Annotated[float, Within(0.005, 0.5, "m")] = setting(
+    finger_length: Annotated[float, "[0.005, 2] m"] = setting(0.35, "Length of the shaft, from its top to the wrist axis.")
+    finger_width: Annotated[float, "[0.005, 1] m"] = setting(0.075, "Diameter of the shaft at its top.")
+    cup_width: Annotated[float, "[0.005, 0.5] m"] = setting(0.042, "Diameter of the suction cup.")
+    cup_length: Annotated[float, "[0.005, 0.5] m"] = setting(
         0.055, "Distance from the wrist axis to the tool centre point (TCP), the cup's lip."
     )
-    finger_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(1.5, "Mass of the shaft.")
-    cup_mass: Annotated[float, Within(0.001, 1e3, "kg")] = setting(0.5, "Mass of the cup.")
-    tilt_limit: Annotated[float, above(0.0, 90.0, "°")] = setting(90.0, "Joint limit of the wrist, to both sides.")
-    tilt_stiffness: Annotated[float, above(0.0, 1e6, "N·m/rad")] = setting(2500.0, "Stiffness of the wrist's PD position drive.")
-    tilt_damping: Annotated[float, Within(0.0, 1e5, "N·m·s/rad")] = setting(200.0, "Damping of the wrist's PD position drive.")
-    tilt_torque: Annotated[float, above(0.0, 1e5, "N·m")] = setting(200.0, "Torque limit of the wrist's drive.")
+    finger_mass: Annotated[float, "[0.001, 1e3] kg"] = setting(1.5, "Mass of the shaft.")
+    cup_mass: Annotated[float, "[0.001, 1e3] kg"] = setting(0.5, "Mass of the cup.")
+    tilt_limit: Annotated[float, "(0, 90] °"] = setting(90.0, "Joint limit of the wrist, to both sides.")
+    tilt_stiffness: Annotated[float, "(0, 1e6] N·m/rad"] = setting(2500.0, "Stiffness of the wrist's PD position drive.")
+    tilt_damping: Annotated[float, "[0, 1e5] N·m·s/rad"] = setting(200.0, "Damping of the wrist's PD position drive.")
+    tilt_torque: Annotated[float, "(0, 1e5] N·m"] = setting(200.0, "Torque limit of the wrist's drive.")
     color: Color = setting((0.55, 0.56, 0.58), "Base colour of the shaft.")
     cup_color: Color = setting((0.05, 0.05, 0.055), "Base colour of the cup.")
     metallic: Fraction = setting(0.01, "Metallic factor of shaft and cup (released).")
@@ -78,42 +78,42 @@ class Gripper:
 class Suction:
     """The suction cup: seal test by rays, and a spring-damper that holds attached objects."""
 
-    rays: Annotated[int, Within(3, 64)] = setting(10, "Rays of the seal test, on a circle at the cup's lip (paper).")
-    vacuum: Annotated[float | None, above(0.0, _ATMOSPHERE, "kPa")] = setting(
+    rays: Annotated[int, "[3, 64]"] = setting(10, "Rays of the seal test, on a circle at the cup's lip (paper).")
+    vacuum: Annotated[float | None, f"(0, {_ATMOSPHERE}] kPa"] = setting(
         None,
         "Vacuum below a tight cup, such as 60: a seal then breaks at the vacuum, less leaks, times the covered area of the mouth; it sets "
         "radius, rays, surface and break forces. Not given: good_force and poor_force (paper).",
     )
-    flow: Annotated[float | None, Within(0.1, 1e5, "l/min")] = setting(
+    flow: Annotated[float | None, "[0.1, 1e5] l/min"] = setting(
         None,
         "Suction rate of the ejector with an open cup, 40 unless given; small ejectors have 10 to 80. Linear characteristic, orifices "
         "with a discharge coefficient of 0.62.",
     )
-    compliance: Annotated[float | None, Within(0.0, 1.0)] = setting(
+    compliance: Annotated[float | None, "[0, 1]"] = setting(
         None,
         "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: balls from a radius of 1.3 cups seal; "
         "with 0.05, as of a flat cup, of 2.5.",
     )
-    radius: Annotated[float, above(0.0, 0.25, "m")] = setting(0.01, "Radius of that circle (released).")
-    reach: Annotated[float, above(0.0, 1.0, "m")] = setting(0.03, "Length of the rays (paper).")
+    radius: Annotated[float, "(0, 0.25] m"] = setting(0.01, "Radius of that circle (released).")
+    reach: Annotated[float, "(0, 1] m"] = setting(0.03, "Length of the rays (paper).")
     surface: str = setting(
         "hull",
         "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh).",
         choices=("hull", "mesh"),
     )
-    tolerated_misses: Annotated[int, Within(0, INT32_MAX)] = setting(
+    tolerated_misses: Annotated[int, f"[0, {INT32_MAX}]"] = setting(
         0, "Maximum rays that may miss for a good seal (paper: 0; released: 2)."
     )
-    good_force: Annotated[float, above(0.0, 1e5, "N")] = setting(40.0, "Break force of a good seal (paper).")
-    poor_force: Annotated[float, above(0.0, 1e5, "N")] = setting(2.0, "Break force of any other seal (paper: 2; released: 0.2).")
-    stiffness: Annotated[float, above(0.0, 1e6, "N/m")] = setting(
+    good_force: Annotated[float, "(0, 1e5] N"] = setting(40.0, "Break force of a good seal (paper).")
+    poor_force: Annotated[float, "(0, 1e5] N"] = setting(2.0, "Break force of any other seal (paper: 2; released: 0.2).")
+    stiffness: Annotated[float, "(0, 1e6] N/m"] = setting(
         2e4, "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm."
     )
-    damping: Annotated[float, Within(0.0, 1e5, "N·s/m")] = setting(100.0, "Linear damping of a seal.")
-    twist_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(50.0, "Torsional stiffness about the cup's axis.")
-    twist_damping: Annotated[float, Within(0.0, 1e5, "N·m·s/rad")] = setting(0.1, "Angular damping of twist and swing.")
-    swing_limit: Annotated[float, Within(0.0, 90.0, "°")] = setting(5.0, "Angle by which an attached object may swing freely (released).")
-    swing_stiffness: Annotated[float, Within(0.0, 1e6, "N·m/rad")] = setting(50.0, "Stiffness against swing beyond that angle.")
+    damping: Annotated[float, "[0, 1e5] N·s/m"] = setting(100.0, "Linear damping of a seal.")
+    twist_stiffness: Annotated[float, "[0, 1e6] N·m/rad"] = setting(50.0, "Torsional stiffness about the cup's axis.")
+    twist_damping: Annotated[float, "[0, 1e5] N·m·s/rad"] = setting(0.1, "Angular damping of twist and swing.")
+    swing_limit: Annotated[float, "[0, 90] °"] = setting(5.0, "Angle by which an attached object may swing freely (released).")
+    swing_stiffness: Annotated[float, "[0, 1e6] N·m/rad"] = setting(50.0, "Stiffness against swing beyond that angle.")
 
     @property
     def mouth_rays(self) -> int:
@@ -181,10 +181,7 @@ def find_gripper_conflicts(gripper: Gripper, suction: Suction, mouths: Sequence[
         yield "gripper.cups", f"cups that do not overlap: {apart}, gripper.cup_width is {gripper.cup_width:g}"
     limit = max((min(sides) for sides in mouths), default=math.inf) / 2 - max_radius
     if max(math.hypot(*place) for place in gripper.cups) > limit:
-        yield (
-            "gripper.cups",
-            f"within {max(limit, 0.0):g} m of the middle: the tool must fit into a compartment, however it is turned",
-        )
+        yield "gripper.cups", f"within {max(limit, 0.0):g} m of the middle: the tool must fit into a compartment, however it is turned"
 
 
 def _vacuum(gripper: Gripper, suction: Suction) -> Iterator[Conflict]:

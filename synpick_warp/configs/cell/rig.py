@@ -31,11 +31,8 @@ class Rig:
 
     @classmethod
     def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = (), rectified: bool = False) -> Rig:
-        """Rig of [[camera]] tables, or without any of the section; `rectified`: pinholes of the same matrices, without distortion.
-
-        Raises:
-            ConfigError: The section has no position, or another number of up vectors.
-        """
+        """Rig of [[camera]] tables, or without any of the section; `rectified`: pinholes of the same matrices, without distortion. Raises
+        ConfigError: the section has no position, or another number of up vectors."""
         listed = bool(rows)
         if not listed:
             if not cameras.positions:
@@ -138,11 +135,8 @@ def intrinsics(row: CameraRow) -> tuple[float, float, float, float]:
 
 
 def lens_map(row: CameraRow) -> LensMap | None:
-    """Distortion of a row with a resolution; None: a pinhole.
-
-    Raises:
-        ConfigError: The coefficients are none of a lens that covers the image.
-    """
+    """Distortion of a row with a resolution; None: a pinhole. Raises ConfigError: the coefficients are none of a lens that covers the
+    image."""
     if not row.distortion or row.resolution is None:
         return None
     from synpick_warp.configs.calibration.lens import PINHOLE, make_lens_map

@@ -24,11 +24,8 @@ def episode_range(split: Split) -> range:
 
 
 def choose_splits(splits: tuple[Split, ...], names: Sequence[str]) -> tuple[Split, ...]:
-    """Return the splits with the given names, in the order of the settings, or all splits if `names` is empty.
-
-    Raises:
-        ConfigError: An unknown split.
-    """
+    """Return the splits with the given names, in the order of the settings, or all splits if `names` is empty. Raises ConfigError: an
+    unknown split."""
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ConfigError(f'splits are {format_value(names)}; allowed: a list of names, such as ["train"]')
     if not names:
@@ -43,11 +40,7 @@ def choose_splits(splits: tuple[Split, ...], names: Sequence[str]) -> tuple[Spli
 
 
 def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
-    """Validate a shard (i, n); arguments as in `DataLayout.plan_shard`.
-
-    Raises:
-        ConfigError: Not two whole numbers with 0 <= i < n.
-    """
+    """Validate a shard (i, n); arguments as in `DataLayout.plan_shard`. Raises ConfigError: not two whole numbers with 0 <= i < n."""
     if not isinstance(shard, tuple | list) or len(shard) != 2 or any(to_index(part) is None for part in shard):
         raise ConfigError(f"{name} is {shard!r}; allowed: (i, n) with i from 0 to n - 1, such as (0, 4)")
     index, count = shard
@@ -96,15 +89,7 @@ class DataLayout:
         return self.names == self.sensor_names
 
     def plan(self, names: Sequence[str] = (), shard: tuple[int, int] = (0, 1)) -> list[range]:
-        """Episode indices of a bake, ascending, one range per split.
-
-        Args:
-            names: Splits; empty: all.
-            shard: (i, n): only indices with index % n == i.
-
-        Raises:
-            ConfigError: An unknown split.
-        """
+        """Episode indices of a bake, ascending, one range per split; arguments as of `plan_shard`. Raises ConfigError: an unknown split."""
         index, count = shard
         splits = choose_splits(self.splits, names)
         ranges = [episode_range(split) for split in splits] if splits else [range(self.episodes)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import hypot
 from typing import Annotated, Any, ClassVar
 
-from synpick_warp.configs.fields import INT32_MAX, Fraction, Within, above, setting
+from synpick_warp.configs.fields import INT32_MAX, Fraction, setting
 
 AUTO_UNIT = "auto"
 """Unit of mesh files by their kind: millimetres of BOP models, metres of others."""
@@ -126,16 +126,11 @@ class Objects:
         "Unit of all mesh files; auto: mm for BOP models (obj_NNNNNN.ply), m for others. STEP files name their own.",
         choices=(AUTO_UNIT, *UNITS),
     )
-    hull_vertices: Annotated[int, Within(8, 256)] = setting(
-        64,
-        "Maximum vertices of a convex hull.",
-    )
-    piece_vertices: Annotated[int, Within(8, 256)] = setting(32, "Maximum vertices of each piece of a convex decomposition.")
-    pieces: Annotated[int, Within(1, 64)] = setting(16, "Maximum pieces of a convex decomposition.")
-    concavity: Annotated[float, Within(0.01, 1.0)] = setting(
-        0.05, "CoACD's concavity threshold; smaller values follow the surface more closely."
-    )
-    decomposition_time: Annotated[float, above(0.0, 86400.0, "s")] = setting(
+    hull_vertices: Annotated[int, "[8, 256]"] = setting(64, "Maximum vertices of a convex hull.")
+    piece_vertices: Annotated[int, "[8, 256]"] = setting(32, "Maximum vertices of each piece of a convex decomposition.")
+    pieces: Annotated[int, "[1, 64]"] = setting(16, "Maximum pieces of a convex decomposition.")
+    concavity: Annotated[float, "[0.01, 1]"] = setting(0.05, "CoACD's concavity threshold; smaller values follow the surface more closely.")
+    decomposition_time: Annotated[float, "(0, 86400] s"] = setting(
         1800.0, "Maximum processor time of a convex decomposition; longer is an error."
     )
     concave_ratio: Fraction = setting(
@@ -144,7 +139,7 @@ class Objects:
         "the convex hull from the surface, in halves of the hull's thickness (hollow ball 0, tube 0.8, bowl or bracket above 1).",
     )
     strict: bool = setting(False, "End the bake at the first object or light map that cannot be used, instead of leaving it out.")
-    density: Annotated[float, above(0.0, 1e5, "kg/m³")] = setting(
+    density: Annotated[float, "(0, 1e5] kg/m³"] = setting(
         400.0, "Density of objects without a mass; not set: the mass is a guess, and named as one."
     )
     mass_volume: str = setting(
@@ -155,9 +150,8 @@ class Objects:
     )
     metallic: Fraction = setting(0.1, "Metallic factor of objects whose material names none.")
     roughness: Fraction = setting(0.5, "Roughness of objects whose material names none.")
-    crease_angle: Annotated[float, Within(0.0, 180.0, "°")] = setting(
-        35.0,
-        "Meshes without normals are smooth where triangles meet at up to this angle; 180: all over.",
+    crease_angle: Annotated[float, "[0, 180] °"] = setting(
+        35.0, "Meshes without normals are smooth where triangles meet at up to this angle; 180: all over."
     )
     center: bool = setting(False, "Move the centre of each mesh's bounding box to its origin, except of BOP models.")
     symmetries: str = setting(
@@ -165,13 +159,11 @@ class Objects:
         "Symmetries: declared (of their rows, else of models_info.json), or detect (of objects that declare none, by shape alone).",
         choices=SYMMETRIES,
     )
-    symmetry_tolerance: Annotated[float, Within(1e-3, 0.2)] = setting(
-        0.03,
-        "Largest distance between a surface and its rotated self for a detected symmetry, in diameters (BOP: 0.1, at least 15 mm).",
+    symmetry_tolerance: Annotated[float, "[1e-3, 0.2]"] = setting(
+        0.03, "Largest distance between a surface and its rotated self for a detected symmetry, in diameters (BOP: 0.1, at least 15 mm)."
     )
-    diameter_tolerance: Annotated[float, above(0.0, 1.0)] = setting(
-        0.1,
-        "Largest relative difference between a model's diameter and that of its row; with more, the row is not used.",
+    diameter_tolerance: Annotated[float, "(0, 1]"] = setting(
+        0.1, "Largest relative difference between a model's diameter and that of its row; with more, the row is not used."
     )
 
 
@@ -181,22 +173,22 @@ class ObjectRow:
 
     REQUIRED: ClassVar = ("id", "diameter")
     IDENTITY: ClassVar = ("id", "name", "diameter", "symmetries_discrete", "symmetries_continuous")
-    id: Annotated[int, Within(0, INT32_MAX)] = setting(0, "The model's obj_id in its BOP folder.")
+    id: Annotated[int, f"[0, {INT32_MAX}]"] = setting(0, "The model's obj_id in its BOP folder.")
     name: str = setting("", "Name; of meshes that are not BOP models the file name without suffix.")
-    diameter: Annotated[float, Within(0.0, unit="m")] = setting(0.0, "Diameter of the model, which must agree; 0: any.")
-    mass: Annotated[float | None, above(0.0, unit="kg")] = setting(None, "Mass; not given: by objects.density.")
+    diameter: Annotated[float, "[0, inf) m"] = setting(0.0, "Diameter of the model, which must agree; 0: any.")
+    mass: Annotated[float | None, "(0, inf) kg"] = setting(None, "Mass; not given: by objects.density.")
     concave: bool | None = setting(
         None, "Use a convex decomposition as collision shape instead of the convex hull; not given: by objects.concave_ratio."
     )
     metallic: Fraction = setting(0.1, "Metallic factor, unless the mesh file names one.")
     roughness: Fraction = setting(0.5, "Roughness, unless the mesh file names one.")
-    symmetries_discrete: Annotated[tuple[tuple[float, ...], ...], Within(unit="m")] = setting(
+    symmetries_discrete: Annotated[tuple[tuple[float, ...], ...], "m"] = setting(
         (),
         f"Discrete symmetries in the frame of the mesh file, replacing those of models_info.json; each {_DISCRETE}. Without an offset the "
         "axis passes through the centroid of the surface. Products of those listed are added.",
         parse=_parse_discrete,
     )
-    symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], Within(unit="m")] = setting(
+    symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], "m"] = setting(
         (),
         f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
         parse=_parse_continuous,
@@ -209,11 +201,8 @@ COUNTS = "a table of parts with their numbers, or least and largest numbers: { b
 
 
 def parse_counts(value: Any) -> Any:
-    """Lists [part, least, most] of a table; such lists, which config.toml has, stay as they are.
-
-    Raises:
-        ValueError: It is none, a number is not allowed, or a part comes twice.
-    """
+    """Lists [part, least, most] of a table; such lists, which config.toml has, stay as they are. Raises ValueError: it is none, a number is
+    not allowed, or a part comes twice."""
     rows = [[name, *_limits(number)] for name, number in value.items()] if isinstance(value, Mapping) else value
     if not isinstance(rows, list | tuple) or not all(isinstance(row, list | tuple) and len(row) == 3 for row in rows):
         raise ValueError(COUNTS)

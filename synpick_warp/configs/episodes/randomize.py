@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Self
 
 from synpick_warp.codes import LookKind, names
-from synpick_warp.configs.fields import Within, setting
+from synpick_warp.configs.fields import setting
 
 OFF, FIXED, UNIFORM, LOG_UNIFORM, NORMAL, CHOICE = KINDS = names(LookKind)
 """Kinds of distributions."""
@@ -44,11 +44,7 @@ class Distribution:
 
     @classmethod
     def parse(cls, value: object) -> Self:
-        """Distribution of a TOML value.
-
-        Raises:
-            ValueError: It is none.
-        """
+        """Distribution of a TOML value. Raises ValueError: it is none."""
         if value == OFF:
             return cls()
         if isinstance(value, Distribution):
@@ -160,22 +156,16 @@ class Randomize:
     choice = [...], weights = [...] }`. Not in the paper.
     """
 
-    object_hue: Annotated[Distribution, Within(-180.0, 180.0, "°")] = setting(_NONE, "Rotation of the hue of each object.")
-    object_brightness: Annotated[Distribution, Within(0.05, 20.0)] = setting(
-        _NONE, "Factor on the base colour of each object, in linear light."
-    )
-    object_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of each object.")
-    object_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of each object.")
-    bin_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
-        _NO_COLOR, "Base colour of the bin; with a texture, its factor."
-    )
-    bin_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the bin.")
-    bin_metallic: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Metallic factor of the bin.")
+    object_hue: Annotated[Distribution, "[-180, 180] °"] = setting(_NONE, "Rotation of the hue of each object.")
+    object_brightness: Annotated[Distribution, "[0.05, 20]"] = setting(_NONE, "Factor on the base colour of each object, in linear light.")
+    object_roughness: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Roughness of each object.")
+    object_metallic: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Metallic factor of each object.")
+    bin_color: Annotated[ColorDistribution, "[0, 1] sRGB"] = setting(_NO_COLOR, "Base colour of the bin; with a texture, its factor.")
+    bin_roughness: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Roughness of the bin.")
+    bin_metallic: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Metallic factor of the bin.")
     bin_textures: str = setting("", "Folder of images: each episode draws the bin's texture; empty: none.", path=True)
-    table_color: Annotated[ColorDistribution, Within(0.0, 1.0, "sRGB")] = setting(
-        _NO_COLOR, "Base colour of the table; with a texture, its factor."
-    )
-    table_roughness: Annotated[Distribution, Within(0.0, 1.0)] = setting(_NONE, "Roughness of the table.")
+    table_color: Annotated[ColorDistribution, "[0, 1] sRGB"] = setting(_NO_COLOR, "Base colour of the table; with a texture, its factor.")
+    table_roughness: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Roughness of the table.")
     table_textures: str = setting("", "Folder of images: each episode draws the table's texture; empty: none.", path=True)
     background_textures: str = setting(
         "",
@@ -183,34 +173,32 @@ class Randomize:
         "environment map is seen there.",
         path=True,
     )
-    surfaces: Annotated[int, Within(0, MOST_CHOICES // 2)] = setting(
+    surfaces: Annotated[int, f"[0, {MOST_CHOICES // 2}]"] = setting(
         0,
         "Procedural textures (carpet, boards, checks, print, clutter) of table, floor and geometric distractors, beside those of folders.",
     )
-    texture_width: Annotated[Distribution, Within(0.01, 100.0, "m")] = setting(
+    texture_width: Annotated[Distribution, "[0.01, 100] m"] = setting(
         _HALF_METRE, "Width of one repeat of the textures of bin, table and floor."
     )
-    lamps: Annotated[Distribution, Within(0, 4)] = setting(
+    lamps: Annotated[Distribution, "[0, 4]"] = setting(
         _NONE, "Number of lamps besides an environment map, rounded: distant discs with soft shadows."
     )
-    lamp_variants: Annotated[int, Within(1, 64)] = setting(4, "Variants of each environment map, each with lamps of its own.")
-    lamp_elevation: Annotated[Distribution, Within(10.0, 90.0, "°")] = setting(_ELEVATION, "Height of each lamp above the horizon.")
-    lamp_radius: Annotated[Distribution, Within(0.3, 20.0, "°")] = setting(_RADIUS, "Angular radius of each lamp.")
-    lamp_strength: Annotated[Distribution, Within(0.01, 100.0)] = setting(
+    lamp_variants: Annotated[int, "[1, 64]"] = setting(4, "Variants of each environment map, each with lamps of its own.")
+    lamp_elevation: Annotated[Distribution, "[10, 90] °"] = setting(_ELEVATION, "Height of each lamp above the horizon.")
+    lamp_radius: Annotated[Distribution, "[0.3, 20] °"] = setting(_RADIUS, "Angular radius of each lamp.")
+    lamp_strength: Annotated[Distribution, "[0.01, 100]"] = setting(
         _STRENGTH, "Light of each lamp on a surface that faces up, relative to the map's."
     )
-    lamp_temperature: Annotated[Distribution, Within(1700.0, 25000.0, "K")] = setting(_TEMPERATURE, "Colour temperature of each lamp.")
-    distractors: Annotated[Distribution, Within(0, MOST_DISTRACTORS)] = setting(
+    lamp_temperature: Annotated[Distribution, "[1700, 25000] K"] = setting(_TEMPERATURE, "Colour temperature of each lamp.")
+    distractors: Annotated[Distribution, f"[0, {MOST_DISTRACTORS}]"] = setting(
         _NONE,
         "Number of distractors, rounded: objects in the pile without labels, which are no targets. They count towards "
         "arrangement.max_objects.",
     )
     distractor_models: str = setting(
-        "",
-        "Folder of distractors, as bake.models, without those of a labelled object's name or shape; empty: geometric solids.",
-        path=True,
+        "", "Folder of distractors, as bake.models, without those of a labelled object's name or shape; empty: geometric solids.", path=True
     )
-    exposure: Annotated[Distribution, Within(-5.0, 5.0, "EV")] = setting(_NONE, "Exposure offset, in place of render.exposure_spread.")
+    exposure: Annotated[Distribution, "[-5, 5] EV"] = setting(_NONE, "Exposure offset, in place of render.exposure_spread.")
 
     @property
     def most_distractors(self) -> int:

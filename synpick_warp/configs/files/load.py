@@ -11,8 +11,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.calibration.sensor_presets import sensor_settings
-from synpick_warp.configs.calibration.tables import fill_tables
+from synpick_warp.configs.calibration.tables import fill_tables, sensor_settings
 from synpick_warp.configs.cell.bins import BinRow, check_meshes
 from synpick_warp.configs.cell.cameras import Cameras
 from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
@@ -29,8 +28,6 @@ DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"
 """Source of settings that come as options, in error messages."""
 CAMERA = "camera"
-_OFFERED = "offered splits"
-"""Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
 _PRESET = "in the preset"
 """Begin of the source of settings of a preset."""
@@ -78,9 +75,8 @@ def load_config(
     if not isinstance(preset_or_file, str | os.PathLike | None):
         raise ConfigError(f"the preset passed is {format_value(preset_or_file)}; allowed: a name, or the path of a .toml file")
     values = _read(os.fspath(preset_or_file or DEFAULT_PRESET))
-    offered = values.pop(_OFFERED, None)
-    if splits and offered and SPLITS not in values:
-        values[SPLITS] = offered
+    if not splits and _is_preset(values.get(SPLITS, (None, ""))[1]):
+        del values[SPLITS]
     if not isinstance(settings or {}, Mapping):
         raise ConfigError(f"the settings passed are {format_value(settings)}; allowed: a dict, of full keys such as bake.episodes")
     for key, value in (settings or {}).items():
@@ -126,7 +122,7 @@ def override_config(config: Config, settings: Mapping[str, object], source: str 
 
 def _follow(config: Config, values: Values) -> Config:
     """Configuration whose suction follows from its vacuum, but for what is set beside it, other than in a preset."""
-    fixed = {key.partition(".")[2] for key, (_, source) in values.items() if key.startswith("suction.") and _PRESET not in source}
+    fixed = {key.partition(".")[2] for key, (_, source) in values.items() if key.startswith("suction.") and not _is_preset(source)}
     return dataclasses.replace(config, suction=follow_vacuum(config.gripper, config.suction, fixed))
 
 
@@ -151,11 +147,8 @@ def describe_presets() -> dict[str, str]:
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Parse "section.key=value" into key and value. The value is TOML; quotes of strings and in lists of strings may be omitted.
-
-    Raises:
-        ConfigError: There is no "=", no such setting, or more than one setting.
-    """
+    """Parse "section.key=value" into key and value. The value is TOML; quotes of strings and in lists of strings may be omitted. Raises
+    ConfigError: there is no "=", no such setting, or more than one setting."""
     key, equals, written = text.partition("=")
     key = key.strip()
     if not equals:
@@ -206,8 +199,8 @@ def _read(preset_or_file: str) -> Values:
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
-        return _override(_offer_splits(_read_preset(base, f" in {preset_or_file}")), document, f"in {preset_or_file}")
-    return _offer_splits(_read_preset(preset_or_file, ""))
+        return _override(_read_preset(base, f" in {preset_or_file}"), document, f"in {preset_or_file}")
+    return dict(_read_preset(preset_or_file, ""))
 
 
 def _locate(document: dict[str, Any], folder: str) -> None:
@@ -221,9 +214,9 @@ def _locate(document: dict[str, Any], folder: str) -> None:
                     table[key] = os.path.abspath(os.path.join(folder, os.path.expanduser(table[key])))
 
 
-def _offer_splits(values: Values) -> Values:
-    """Values of a preset whose splits hold only if they are asked for."""
-    return {_OFFERED if key == SPLITS else key: value for key, value in values.items()}
+def _is_preset(source: str) -> bool:
+    """Whether a value comes from a preset, not from a file or the caller."""
+    return source.startswith(_PRESET) and not source.endswith(".toml")
 
 
 def _read_preset(name: str, source: str) -> Values:
@@ -255,7 +248,7 @@ def _override(base: Values, document: Mapping[str, Any], source: str) -> Values:
     values = dict(base)
     bake = document.get("bake")
     if isinstance(bake, dict) and ("mode" in bake or "episodes" in bake):
-        values = {key: value for key, value in values.items() if key not in (SPLITS, _OFFERED)}
+        values.pop(SPLITS, None)
     for name, content in document.items():
         if (kind := table_lists().get(name)) and isinstance(content, dict):
             values[name] = (change_rows(name, kind, base[name][0] if name in base else (), content, source), source)

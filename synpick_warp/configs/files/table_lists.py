@@ -22,22 +22,14 @@ from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 
 def read_rows(key: str, kind: type[Any], content: Any, source: str) -> tuple[Any, ...]:
-    """Rows of the tables [[key]].
-
-    Raises:
-        ConfigError: It is no list of tables, a key is unknown or missing, or a value is not allowed.
-    """
+    """Rows of the tables [[key]]. Raises ConfigError: it is no list of tables, a key is unknown or missing, or a value is not allowed."""
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise ConfigError(f"{key} is {format_value(content)} {source}; allowed: [[{key}]] tables")
     return tuple(read_table(f"{key}[{index}]", kind, row, source) for index, row in enumerate(content))
 
 
 def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
-    """One row, or a setting that is a table.
-
-    Raises:
-        ConfigError: It is no table, a key is unknown or missing, or a value is not allowed.
-    """
+    """One row, or a setting that is a table. Raises ConfigError: it is no table, a key is unknown or missing, or a value is not allowed."""
     known, required = settings_of(kind), getattr(kind, "REQUIRED", ())
     if not isinstance(content, Mapping):
         raise ConfigError(f"{key} is {format_value(content)} {source}; allowed: a table of {', '.join(known)}")
@@ -56,11 +48,8 @@ def _read_setting(key: str, value: object, item: Setting, source: str) -> Any:
 
 
 def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mapping[str, Any], source: str) -> tuple[Any, ...]:
-    """Rows of a preset with the values of a table [key], which hold for all of them.
-
-    Raises:
-        ConfigError: A key is not one of those that may hold for every row, or a value is not allowed.
-    """
+    """Rows of a preset with the values of a table [key], which hold for all of them. Raises ConfigError: a key is not one of those that may
+    hold for every row, or a value is not allowed."""
     identity = getattr(kind, "IDENTITY", ())
     if not identity:
         raise ConfigError(f"{key} is a table {source}; allowed: [[{key}]] tables, one for each")
@@ -97,11 +86,8 @@ Tables = dict[str, dict[str, Any]]
 
 
 def read_tables(content: Any, source: str) -> Tables:
-    """Validate the content of `splits`, a table of tables; returns the values of each split.
-
-    Raises:
-        ConfigError: It is something else, a name or a key is wrong, or a value is not allowed.
-    """
+    """Validate the content of `splits`, a table of tables; returns the values of each split. Raises ConfigError: it is something else, a
+    name or a key is wrong, or a value is not allowed."""
     if not isinstance(content, Mapping) or not content or not all(isinstance(table, Mapping) for table in content.values()):
         raise ConfigError(f"{SPLITS} is {format_value(content)} {source}; allowed: tables such as [{SPLITS}.train]")
     if len(content) > MAX_SPLITS:
@@ -113,11 +99,7 @@ def read_tables(content: Any, source: str) -> Tables:
 
 
 def check_setting(name: str, key: str, value: Any, source: str) -> Any:
-    """Validate one setting of a split; returns its value.
-
-    Raises:
-        ConfigError: There is no such setting, or the value is not allowed.
-    """
+    """Validate one setting of a split; returns its value. Raises ConfigError: there is no such setting, or the value is not allowed."""
     known = settings_of(Split)
     if key not in known:
         keys = f"keys of {SPLITS}.{name}: {', '.join(known)}"
@@ -126,11 +108,8 @@ def check_setting(name: str, key: str, value: Any, source: str) -> Any:
 
 
 def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:
-    """Tables with one more setting, given as NAME.key.
-
-    Raises:
-        ConfigError: There is no such split or setting, or the value is not allowed.
-    """
+    """Tables with one more setting, given as NAME.key. Raises ConfigError: there is no such split or setting, or the value is not
+    allowed."""
     name, _, key = path.partition(".")
     if name not in tables:
         known = f"splits: {', '.join(tables)}" if tables else "the settings have none"
@@ -139,14 +118,8 @@ def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables
 
 
 def resolve_splits(tables: Tables, mode: str, color_format: str, source: str) -> tuple[Split, ...]:
-    """Splits with all defaults filled in, sorted by first episode.
-
-    Args:
-        tables: Checked tables, in the order of the file.
-
-    Raises:
-        ConfigError: Two splits share an episode or a folder, or indices exceed 32 bits.
-    """
+    """Splits of checked tables, in the order of the file, with all defaults filled in, sorted by first episode. Raises ConfigError: two
+    splits share an episode or a folder, or indices exceed 32 bits."""
     splits: list[Split] = []
     following = 0
     for name, table in tables.items():

@@ -20,11 +20,8 @@ _DELETE = "\x7f"
 
 
 def config_to_toml(config: Config, *, comments: bool = False) -> str:
-    """All settings as TOML text, including defaults; paths are absolute, so that it holds wherever it is written to.
-
-    Args:
-        comments: Precede each setting by its meaning, unit and allowed values.
-    """
+    """All settings as TOML text, including defaults; paths are absolute, so that it holds wherever it is written to. `comments`: each
+    setting is preceded by its meaning, unit and allowed values."""
     # Without rows those of the preset would hold; no preset has rows of another kind.
     lines = [] if config.object_rows else ["object_rows = []", ""]
     for section, kind in sections().items():

@@ -200,12 +200,8 @@ def _mounting(row: CameraRow, keys: Sequence[str], turn: float = 0.0, *, label: 
 def _placement(
     row: CameraRow, keys: Sequence[str], turn: float = 0.0, *, label: str, bins: Sequence[BinSizes], shift: Sides
 ) -> Iterator[Conflict]:
-    """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad].
-
-    Args:
-        keys: Keys of its position, up vector and look-at point.
-        label: Name of the camera for messages.
-    """
+    """Yield a degenerate view, or one that does not show the bins, even if it were turned by an angle [rad]. `keys`: of its position, up
+    vector and look-at point; `label`: name of the camera for messages."""
     (place, _, target), (fx, fy, *_) = keys, intrinsics(row)
     at = position(row.pose)
     if found := list(_view_axes(row, keys, label)):
@@ -262,10 +258,7 @@ def _matrix(key: str, matrix: tuple[tuple[float, float, float], ...], width: int
     elif skew != 0.0:
         yield key, "a matrix without skew: 0 beside fx"
     elif not (low <= fx <= high and max(fx, fy) <= ASPECT * min(fx, fy)):
-        yield (
-            key,
-            f"fx from {low:.4g} to {high:.4g}, which are a fov of 170° and 1° of {width} px, and fy within twice fx [px]",
-        )
+        yield key, f"fx from {low:.4g} to {high:.4g}, which are a fov of 170° and 1° of {width} px, and fy within twice fx [px]"
     elif not (0.0 <= cx <= width and 0.0 <= cy <= height):
         yield key, f"a principal point cx, cy inside its images of {width} x {height} px: are numbers, or width and height, swapped? [px]"
 

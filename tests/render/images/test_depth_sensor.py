@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.calibration.sensor_presets import SENSORS, sensor_camera, sensor_settings
+from synpick_warp.configs.calibration.tables import SENSORS, sensor_camera, sensor_settings
 from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.stages.arrays import allocate
