@@ -33,7 +33,7 @@ from synpick_warp.errors import (
     SynpickError,
 )
 from synpick_warp.system.inputs.urls import parse_place
-from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.interpreter import collection_paused
 
 if TYPE_CHECKING:
     from synpick_warp.apps.conversion.run import Converted

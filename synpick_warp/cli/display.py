@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextCol
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from synpick_warp.system.progress import Progress
+from synpick_warp.system.progress import Progress, SilentProgress
 
 if TYPE_CHECKING:
     from synpick_warp.codes import Ending, Outcome
@@ -80,7 +80,7 @@ class LiveProgress(LiveBar):
         self._bar.console.print(text, markup=False)
 
 
-class PlainProgress:
+class PlainProgress(SilentProgress):
     """Plain progress lines: one per stage and note, and rate-limited ones for counts, also for those of a stage ("name: 3 of 9")."""
 
     def __init__(self, console: Console, remark: object = "") -> None:
@@ -88,12 +88,6 @@ class PlainProgress:
         self._started = time.monotonic()
         self._printed_at = float("-inf")
         self._counted_at: dict[str, float] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
     def stage(self, text: str) -> None:
         """Print the stage's name as a line; of the counts of one stage at most one every `PLAIN_INTERVAL`."""

@@ -35,24 +35,17 @@ from synpick_warp.cli.options import (
     parse_shard,
     parse_splits,
 )
-from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
+from synpick_warp.cli.streams import StreamError, describe_fault, flush_output, safe_streams
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.fields import PATH_RULE, settings_of
-from synpick_warp.configs.files.load import (
-    COMMAND_LINE,
-    DEFAULT_PRESET,
-    describe_presets,
-    parse_assignment,
-    preset_names,
-    sections,
-)
+from synpick_warp.configs.files.load import COMMAND_LINE, DEFAULT_PRESET, describe_presets, parse_assignment, preset_names, sections
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.system.inputs.urls import resolve_word, store_url
-from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.processes.interrupt import KeptInterrupt, raising_sigterm
 
 if TYPE_CHECKING:
@@ -310,14 +303,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: Command line without the program's name; None: `sys.argv`.
     """
-    with SafeStreams() as streams:
+    with safe_streams() as output:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
-        streams.flush()
-        if streams.fault is None:
+        flush_output()
+        if output.fault is None:
             return code
-        if isinstance(streams.fault, BrokenPipeError):
+        if isinstance(output.fault, BrokenPipeError):
             return EXIT_PIPE
-        print(f"{NAME}: error: {describe_fault(streams.fault)}", file=sys.stderr)
+        print(f"{NAME}: error: {describe_fault(output.fault)}", file=sys.stderr)
         return EXIT_MISTAKE
 
 

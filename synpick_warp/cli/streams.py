@@ -10,10 +10,11 @@ import contextlib
 import io
 import sys
 import threading
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.interpreter import open_standard_descriptors
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -30,6 +31,7 @@ class _Descriptor(io.FileIO):
         """`raises`: whether the fault is raised, once, as StreamError in the main thread."""
         super().__init__(handle, "wb", closefd=False)
         self.fault: OSError | None = None
+        """First error of a write."""
         self._raises = raises
 
     def write(self, data: ReadableBuffer, /) -> int:
@@ -44,33 +46,28 @@ class _Descriptor(io.FileIO):
         return memoryview(data).nbytes
 
 
-class SafeStreams:
-    """Context manager that makes the standard streams safe, and restores them. Streams that the caller has replaced are left alone."""
-
-    def __enter__(self) -> Self:
-        open_standard_descriptors()
-        self._before = sys.stdout, sys.stderr
-        self._output = _Descriptor(1, raises=True)
-        if sys.stdout is sys.__stdout__:
-            sys.stdout = _wrap(self._output, sys.stdout)
-        if sys.stderr is sys.__stderr__:
-            sys.stderr = _wrap(_Descriptor(2, raises=False), sys.stderr)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.flush()
+@contextlib.contextmanager
+def safe_streams() -> Iterator[_Descriptor]:
+    """Make the standard streams safe, and restore them; the value has the `fault` of the standard output. Streams that the caller has
+    replaced are left alone."""
+    open_standard_descriptors()
+    before, output = (sys.stdout, sys.stderr), _Descriptor(1, raises=True)
+    if sys.stdout is sys.__stdout__:
+        sys.stdout = _wrap(output, sys.stdout)
+    if sys.stderr is sys.__stderr__:
+        sys.stderr = _wrap(_Descriptor(2, raises=False), sys.stderr)
+    try:
+        yield output
+    finally:
+        flush_output()
         sys.stderr.flush()
-        sys.stdout, sys.stderr = self._before
+        sys.stdout, sys.stderr = before
 
-    def flush(self) -> None:
-        """Flush the standard output; an error is recorded, not raised."""
-        with contextlib.suppress(StreamError):
-            sys.stdout.flush()
 
-    @property
-    def fault(self) -> OSError | None:
-        """First error of a write to the standard output."""
-        return self._output.fault
+def flush_output() -> None:
+    """Flush the standard output; an error is recorded, not raised."""
+    with contextlib.suppress(StreamError):
+        sys.stdout.flush()
 
 
 def describe_fault(fault: OSError) -> str:

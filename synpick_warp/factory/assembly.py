@@ -47,7 +47,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, name_lights
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.views.frames import most_words
 

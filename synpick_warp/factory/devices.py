@@ -43,9 +43,9 @@ from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.suction_surface import with_suctionable_area
-from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
+from synpick_warp.system.interpreter import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, send, start_process
 from synpick_warp.system.progress import Progress

@@ -14,7 +14,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
-from synpick_warp.system.processes.garbage import collection_paused
+from synpick_warp.system.interpreter import collection_paused
 
 MAX_LEAD = 1024
 """Maximum number of ticks by which physics may be ahead of the renderer. With 256, physics limits the last quarter of a bake of

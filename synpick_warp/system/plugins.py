@@ -32,11 +32,8 @@ def plugin_names(group: Group, own: tuple[str, ...]) -> tuple[str, ...]:
 
 @functools.cache
 def load_plugin(group: Group, name: str, *members: str) -> Any:
-    """Import a plug-in, which must have these members.
-
-    Raises:
-        ConfigError: Its package cannot be imported, two packages have one of this name, or it is something else.
-    """
+    """Import a plug-in, which must have these members. Raises ConfigError: its package cannot be imported, two packages have one of this
+    name, or it is something else."""
     known = f'"{name}" of the entry points synpick_warp.{group}'
     entries = metadata.entry_points(group=f"synpick_warp.{group}", name=name)
     if len(entries) != 1:

@@ -46,14 +46,11 @@ class SilentProgress:
     def __exit__(self, *_: object) -> None:
         return None
 
-    def stage(self, text: str) -> None:
-        """Do nothing."""
+    def stage(self, text: str) -> None: ...
 
-    def update(self, **counts: Any) -> None:
-        """Do nothing."""
+    def update(self, **counts: Any) -> None: ...
 
-    def note(self, text: str) -> None:
-        """Do nothing."""
+    def note(self, text: str) -> None: ...
 
 
 class LoggedProgress(SilentProgress):
@@ -73,13 +70,10 @@ class ForwardingProgress(SilentProgress):
         self._progress = progress
 
     def stage(self, text: str) -> None:
-        """Pass it on."""
         self._progress.stage(text)
 
     def update(self, **counts: Any) -> None:
-        """Pass it on."""
         self._progress.update(**counts)
 
     def note(self, text: str) -> None:
-        """Pass it on."""
         self._progress.note(text)

@@ -22,7 +22,7 @@ from synpick_warp.cli import display
 from synpick_warp.cli import main as commands
 from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.cli.main import main
-from synpick_warp.cli.streams import SafeStreams
+from synpick_warp.cli.streams import flush_output, safe_streams
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.factory import episodes
@@ -218,10 +218,10 @@ def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
         monkeypatch.setattr(sys, "stdout", file)
         monkeypatch.setattr(sys, "__stdout__", file)
         try:
-            with SafeStreams() as streams:
+            with safe_streams() as output:
                 Console(width=80).print("worlds 2 · 3 m³ \ud800")
-                streams.flush()
-                assert streams.fault is None
+                flush_output()
+                assert output.fault is None
         finally:
             os.dup2(kept, 1)
             os.close(kept)
@@ -258,7 +258,7 @@ def test_a_bake_on_a_full_device_stops_in_its_first_progress_line(tmp_path):
 
 def test_replaced_streams_are_left_alone(capsys):
     before = sys.stdout, sys.stderr
-    with SafeStreams():
+    with safe_streams():
         assert (sys.stdout, sys.stderr) == before
         print("kept")
     assert capsys.readouterr().out == "kept\n"
@@ -288,8 +288,8 @@ def test_writers_start_when_a_lock_has_the_number_of_the_closed_output(tmp_path)
 def test_closed_descriptors_are_taken_before_any_file(tmp_path):
     """Fault 5: the program itself."""
     code = (
-        "import os, sys; from synpick_warp.cli.streams import SafeStreams\n"
-        f"with SafeStreams(): sys.exit(os.open({str(tmp_path)!r}, os.O_RDONLY) < 3)"
+        "import os, sys; from synpick_warp.cli.streams import flush_output, safe_streams\n"
+        f"with safe_streams(): sys.exit(os.open({str(tmp_path)!r}, os.O_RDONLY) < 3)"
     )
     result = subprocess.run(["sh", "-c", f'exec "{sys.executable}" -c "{code}" <&- >&- 2>&-'], timeout=HANG, check=False)
     assert result.returncode == 0

@@ -16,8 +16,8 @@ import zarr
 
 from synpick_warp.dataset.stored_array import open_array
 from synpick_warp.dataset.trajectory import GroupContext
+from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.processes import threads
-from synpick_warp.system.processes.garbage import collection_paused
 
 
 @pytest.fixture(autouse=True)

@@ -27,8 +27,7 @@ def validate(
     folder: Annotated[
         Path | None,
         Parameter(
-            name="DIR",
-            help="A BOP data set: the folder that contains train_pbr, models, ... (default: synpick-data in the current folder)",
+            name="DIR", help="A BOP data set: the folder that contains train_pbr, models, ... (default: synpick-data in the current folder)"
         ),
     ] = None,
     /,

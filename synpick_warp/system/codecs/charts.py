@@ -58,24 +58,13 @@ class ChartError(SynpickError):
 
 
 def read_bundle() -> str:
-    """Vega, Vega-Lite and Vega-Embed as one script, which sets `vegaEmbed`.
-
-    Raises:
-        ChartError: The library cannot run.
-    """
+    """Vega, Vega-Lite and Vega-Embed as one script, which sets `vegaEmbed`. Raises ChartError: the library cannot run."""
     return _run(_BUNDLE).decode(errors="replace")
 
 
 def render_charts(specs: Sequence[Spec], scale: float = SCALE) -> list[bytes]:
-    """Render charts in one process: a PNG file of each.
-
-    Args:
-        specs: The charts.
-        scale: Pixels of the picture per pixel of the specification.
-
-    Raises:
-        ChartError: The library cannot run.
-    """
+    """Render charts in one process: a PNG file of each, with `scale` pixels per pixel of the specification. Raises ChartError: the library
+    cannot run."""
     if not specs:
         return []
     data = _run(_RENDER, json.dumps([{**spec, "usermeta": {"scale": scale}} for spec in specs], allow_nan=False).encode())
@@ -139,10 +128,7 @@ def limit(encoding: Spec, place: float, text: str, mark: Spec, label: Spec) -> S
     return {
         "data": {"values": [{"limit": place, "what": text}]},
         "encoding": encoding,
-        "layer": [
-            {"mark": {"type": "rule", **mark}},
-            {"mark": {"type": "text", **label}, "encoding": {"text": {"field": "what"}}},
-        ],
+        "layer": [{"mark": {"type": "rule", **mark}}, {"mark": {"type": "text", **label}, "encoding": {"text": {"field": "what"}}}],
     }
 
 

@@ -110,12 +110,8 @@ def _escape_latex(text: str) -> str:
 
 
 def to_text(table: Table, width: int | None = None) -> Iterator[list[str]]:
-    """Blocks of lines of a table in aligned columns, each with its header first.
-
-    Args:
-        table: The table.
-        width: Largest length of a line [characters], where a table of more columns is split into blocks; None: any.
-    """
+    """Blocks of lines of a table in aligned columns, each with its header first. `width`: largest length of a line [characters], where a
+    table of more columns is split into blocks; None: any."""
     rows = [[escape(cell) for cell in row] for row in (table.labels(), *table.cells("-"))]
     widths = [max(map(cell_len, column)) for column in zip(*rows, strict=True)]
     head = ""

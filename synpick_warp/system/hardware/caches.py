@@ -42,11 +42,7 @@ def user_cache() -> Path | None:
 
 
 def kernel_cache(version: str) -> Path | None:
-    """Folder of the kernels that Warp compiles, as Warp chooses it itself.
-
-    Args:
-        version: Version of Warp: each has a folder of its own.
-    """
+    """Folder of the kernels that a version of Warp compiles, as Warp chooses it itself."""
     base = os.environ.get(KERNEL_VARIABLE)
     if base is not None:
         return Path(os.path.realpath(base), version)
@@ -58,12 +54,7 @@ def usable_kernel_cache(version: str) -> Path | None:
     """Check the kernel cache; make a temporary one, with a note on the standard error, if it cannot be written.
 
     Kernels that the unusable cache has are linked into the temporary one, which is removed when the process ends.
-
-    Returns:
-        The temporary folder; None: Warp's own choice can be written.
-
-    Raises:
-        CacheError: There is no room for a temporary folder either.
+    Returns the temporary folder; None: Warp's own choice can be written. Raises CacheError: there is no room for a temporary folder either.
     """
     cache = kernel_cache(version)
     reason = "the user has no home" if cache is None else find_fault(cache)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import warp as wp
 
 from synpick_warp.errors import DeviceError
-from synpick_warp.system.descriptors import STANDARD_ERROR
 from synpick_warp.system.hardware.caches import usable_kernel_cache
+from synpick_warp.system.interpreter import STANDARD_ERROR
 
 _CONNECTIONS = ("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 """Hardware queues that CUDA maps streams to; its default is 8. Captured graphs of physics spread over several streams. Where they share

@@ -54,11 +54,7 @@ class ModuleBuild(NamedTuple):
 @contextlib.contextmanager
 def compilation_lock(wait: Callable[[], None]) -> Iterator[None]:
     """Lock of Warp's kernel cache (flock): of several processes that start with a cold cache one compiles, and the others get its kernels.
-
-    File systems without locks are used unlocked.
-
-    Args:
-        wait: Called before waiting for another process.
+    File systems without locks are used unlocked. `wait`: called before waiting for another process.
     """
     try:
         handle = os.open(Path(wp.config.kernel_cache_dir or "", _LOCK_FILE), os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
@@ -98,9 +94,7 @@ def split_modules(prefixes: tuple[str, ...]) -> None:
     A module is compiled as a whole when one of its kernels is launched, and again when a generic kernel gets a further overload: of the 130
     kernels of Newton's solver, in 50,000 lines of CUDA, a bake launches some twenty, with two block sizes. Modules of one kernel leave out
     what is not launched, and are compiled in parallel. Kernels that the library creates later stay in the modules that it names.
-
-    Args:
-        prefixes: What the names of the modules begin with.
+    `prefixes`: what the names of the modules begin with.
     """
     for name, module in list(context.user_modules.items()):
         if not name.startswith(prefixes):

@@ -14,16 +14,8 @@ _BLOCK = 1 << 20
 
 
 def read_file(path: Path | str, limit: int, error: type[SynpickError]) -> bytes:
-    """Read a regular file, or what a symbolic link to one names.
-
-    Args:
-        path: The file.
-        limit: Largest size [bytes].
-        error: Class of the exception.
-
-    Raises:
-        SynpickError: As `error`, in one line: there is no such file, it is not a regular file, is too large, or cannot be read.
-    """
+    """Read a regular file of at most `limit` bytes, or what a symbolic link to one names. Raises SynpickError: as `error`, in one line:
+    there is no such file, it is not a regular file, is too large, or cannot be read."""
     data = read_file_if_present(path, limit, error)
     if data is None:
         raise error(f"there is no file {path}")

@@ -48,9 +48,7 @@ def decode_image(
     """Decode a PNG or JPEG file's content by OpenCV; unchanged greyscale PNG files as a bake writes them by ISA-L, which is faster.
 
     Args:
-        data: Content of the file.
         source: Where it comes from, for messages.
-        error: Class of the exception.
         flags: OpenCV's `IMREAD_` flags; -1: unchanged.
         size: Width and height that it must have [px]; None: any up to MAX_SIDE.
 

@@ -22,10 +22,8 @@ def decode_json(data: bytes, schema: type[_Content], source: object, error: type
     """Decode JSON and validate it against a schema.
 
     Args:
-        data: UTF-8 text.
         schema: Type of the content as msgspec understands it: a Struct, a TypedDict, `dict[str, int]`, `Any`.
         source: Where it comes from, for messages: a path, or a path with a line number.
-        error: Class of the exception.
         advice: End of the message: what to do.
 
     Raises:

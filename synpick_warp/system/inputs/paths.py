@@ -19,12 +19,7 @@ def path_inside(folder: Path, name: str, source: object, error: type[SynpickErro
 
     Args:
         folder: The folder that must contain the path.
-        name: Relative name with "/" between its parts, as read from `source`.
-        source: File that contains the name, for messages.
-        error: Class of the exception.
-
-    Returns:
-        `folder` / `name`.
+        name: Relative name with "/" between its parts, as read from the file `source`.
 
     Raises:
         SynpickError: As `error`: the name is empty, absolute, has parts "..", control characters, or leads out of the folder by a link.
@@ -50,10 +45,7 @@ def _quote(name: str) -> str:
 
 def make_folder(folder: Path) -> None:
     """Create a folder with its parents, unless it exists: `mkdir -p`. `Path.mkdir` calls itself for each parent, which ends at 1,000.
-
-    Raises:
-        OSError: As `Path.mkdir`; FileExistsError: it is a file.
-    """
+    Raises OSError: as `Path.mkdir`; FileExistsError: it is a file."""
     missing = list(takewhile(lambda each: not os.path.lexists(each), (folder, *folder.parents)))
     for each in reversed(missing or [folder]):
         each.mkdir(exist_ok=True)

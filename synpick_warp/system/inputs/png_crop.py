@@ -29,8 +29,7 @@ def decode_grey_crop(data: bytes, size: tuple[int, int], rows: slice, columns: s
     Args:
         data: Content of the file.
         size: Width and height that it must have [px].
-        rows: Rows of the crop, within the image.
-        columns: Columns of the crop, within the image.
+        rows, columns: Of the crop, within the image.
         bits: Bit depth that it must have: 8 or 16.
 
     Returns:

@@ -22,11 +22,7 @@ _LONG_KEY = re.compile(rf"(?<![\w'-])(?:[\w'-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PART
 
 
 def decode_toml(text: str) -> dict[str, Any]:
-    """Decode TOML.
-
-    Raises:
-        ValueError: The text is not TOML, or exceeds a limit; the message says which.
-    """
+    """Decode TOML. Raises ValueError: the text is not TOML, or exceeds a limit; the message says which."""
     if _LONG_KEY.search(_STRINGS.sub("''", text)):
         raise ValueError(f"a key has more than {MAX_KEY_PARTS} parts")
     try:
@@ -40,11 +36,8 @@ def decode_toml(text: str) -> dict[str, Any]:
 
 
 def read_toml(path: Path, error: type[SynpickError]) -> dict[str, Any]:
-    """Read a TOML file, with a byte order mark or without.
-
-    Raises:
-        SynpickError: As `error`, in one line: it cannot be read, is too large, is not UTF-8, or is not TOML.
-    """
+    """Read a TOML file, with a byte order mark or without. Raises SynpickError: as `error`, in one line: it cannot be read, is too large,
+    is not UTF-8, or is not TOML."""
     data = read_file(path, MAX_TOML, error)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in data[:4]:
         raise error(f"{path} is text in UTF-16 or UTF-32, which TOML does not allow; save it as UTF-8")

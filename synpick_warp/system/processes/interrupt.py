@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Self
 
-from synpick_warp.system.descriptors import STANDARD_ERROR
+from synpick_warp.system.interpreter import STANDARD_ERROR
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping after this tick; committed episodes stay, the same command resumes the bake; once more: stop at once\n"

@@ -87,7 +87,6 @@ class _Server:
         """Ask the server for a process that writes its result into the file with handle `result`.
 
         Args:
-            result: Handle of an open file.
             failed: Server of this call's first attempt, which exited without an answer; None at the first attempt. It is replaced once,
                 by whichever of its calls asks first.
 
@@ -121,7 +120,6 @@ def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
     Args:
         function: Function at the top of a module: it is pickled by name, and the process imports it.
         calls: Arguments of each call; they are pickled.
-        limits: Limits of each call.
 
     Yields:
         For each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
@@ -208,7 +206,6 @@ def _outcome(end: tuple[int, bool] | None, stream: BinaryIO, limits: Limits) -> 
     Args:
         end: Exit status, as of subprocess, and whether the time was over; None: the link was closed.
         stream: The file into which the process wrote its result.
-        limits: Limits of the call.
     """
     if end is None:
         return _STOPPED

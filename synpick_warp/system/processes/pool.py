@@ -19,7 +19,7 @@ from multiprocessing.reduction import recv_handle, send_handle
 from typing import Any, Self
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.interpreter import open_standard_descriptors
 from synpick_warp.system.processes.worker import END_TIMEOUT, ProcessError, WorkerProcess, send, start_process
 
 _PROGRAM = "from synpick_warp.system.processes.pool import main; main()"
@@ -90,14 +90,7 @@ class WorkerPool:
     """Pool of worker processes. As a context manager it kills them."""
 
     def __init__(self, program: WorkerProgram, processes: int) -> None:
-        """
-        Args:
-            program: Program of the processes.
-            processes: Number of processes; 0: tasks run in the calling process, at once.
-
-        Raises:
-            ProcessError: Processes cannot be started.
-        """
+        """Start processes; 0: tasks run in the calling process, at once. Raises ProcessError: they cannot be started."""
         open_standard_descriptors()
         self._program = program
         self._workers: list[WorkerProcess] = []
@@ -166,15 +159,8 @@ class WorkerPool:
         return future
 
     def broadcast(self, task: Callable[..., Any], handle: int | None = None) -> list[TaskFuture]:
-        """Send a task to every process; returns their futures.
-
-        Args:
-            task: The task; see `WorkerProgram`.
-            handle: Open file that the task receives besides the state, as a handle of its own process, which the task closes.
-
-        Raises:
-            DeadProcessError: A process died.
-        """
+        """Send a task to every process; returns their futures. `handle`: open file that the task receives besides the state, as a handle of
+        its own process, which the task closes. Raises DeadProcessError: a process died."""
         if self._runs_here:
             return [self.submit(task)]
         message = pickle.dumps((task, handle is not None))
@@ -186,14 +172,8 @@ class WorkerPool:
         return futures
 
     def receive(self, timeout: float | None) -> list[TaskFuture]:
-        """Receive available results; a timeout of None blocks until there is one, unless no task is unanswered.
-
-        Returns:
-            The futures that it has set.
-
-        Raises:
-            DeadProcessError: A process died.
-        """
+        """Receive available results; a timeout of None blocks until there is one, unless no task is unanswered. Returns the futures that it
+        has set. Raises DeadProcessError: a process died."""
         if timeout is None and not any(worker.tasks for worker in self._workers):
             timeout = 0.0
         received = []
@@ -208,28 +188,15 @@ class WorkerPool:
         return received
 
     def wait(self, future: TaskFuture) -> Any:
-        """Block until a task is done; returns its result.
-
-        Raises:
-            SynpickError: What the task raised; so are OSError and MemoryError.
-            TaskError: The task raised another error.
-            DeadProcessError: A process died.
-        """
+        """Block until a task is done; returns its result. Raises SynpickError: what the task raised; so are OSError and MemoryError;
+        TaskError: the task raised another error; DeadProcessError: A process died."""
         while not future.done():
             self.receive(None)
         return future.result()
 
     def map_ordered(self, tasks: Iterable[Callable[[Any], Any]], *, depth: int = 1, ahead: int = _AHEAD) -> Iterator[Any]:
-        """Results of tasks, in order.
-
-        Args:
-            tasks: The tasks, taken lazily as processes become idle.
-            depth: Unanswered tasks per process.
-            ahead: Unanswered tasks and results that wait for an earlier one, per process.
-
-        Raises:
-            Exception: Those of `wait`; other tasks go on.
-        """
+        """Results of tasks, which are taken lazily as processes become idle, in order. `depth`: unanswered tasks per process; `ahead`:
+        these and results that wait for an earlier one. Raises the errors of `wait`; other tasks go on."""
         limit = ahead * max(1, len(self))
         pending: deque[TaskFuture] = deque()
         for task in tasks:
@@ -243,12 +210,7 @@ class WorkerPool:
             yield self.wait(pending.popleft())
 
     def end(self) -> None:
-        """Let idle processes exit.
-
-        Raises:
-            OSError: One has died.
-            subprocess.TimeoutExpired: One did not exit.
-        """
+        """Let idle processes exit. Raises OSError: one has died; subprocess.TimeoutExpired: one did not exit."""
         for worker in self._workers:
             send(worker.link, None)
         for worker in self._workers:
@@ -273,11 +235,8 @@ class WorkerPool:
 
 
 def map_ordered(program: WorkerProgram, tasks: Iterable[Callable[[Any], Any]], processes: int) -> Iterator[Any]:
-    """Results of tasks, in order, in a pool of their own, or with one process in the calling one; see `WorkerPool.map_ordered`.
-
-    Raises:
-        ProcessError: Processes cannot be started, or one died.
-    """
+    """Results of tasks, in order, in a pool of their own, or with one process in the calling one; see `WorkerPool.map_ordered`. Raises
+    ProcessError: processes cannot be started, or one died."""
     with WorkerPool(program, processes if processes > 1 else 0) as pool:
         yield from pool.map_ordered(tasks)
 

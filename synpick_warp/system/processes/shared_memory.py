@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.interpreter import open_standard_descriptors
 from synpick_warp.system.processes.threads import COPIES
 
 _ALIGNMENT = 64

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.descriptors import duplicate_above_streams
+from synpick_warp.system.interpreter import duplicate_above_streams
 
 END_TIMEOUT = 120.0
 """How long an idle process may take to exit [s], also on a machine that is busy with others."""
@@ -54,11 +54,8 @@ class WorkerProcess:
         self.link.close()
 
     def describe_end(self, setting: str) -> tuple[str, str]:
-        """How the process died, such as "was ended by SIGKILL", and what can be done about it.
-
-        Args:
-            setting: Name of the setting that has the number of processes.
-        """
+        """How the process died, such as "was ended by SIGKILL", and what can be done about it. `setting`: that of the number of
+        processes."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(END_TIMEOUT)
         code = self.process.returncode

@@ -52,11 +52,8 @@ class Probe(NamedTuple):
 
 
 def open_store(url: str) -> Store:
-    """Open the object store of a URL; it is sent no request.
-
-    Raises:
-        StoreError: obstore or credentials are missing, a variable is malformed, or the URL is not that of a prefix.
-    """
+    """Open the object store of a URL; it is sent no request. Raises StoreError: obstore or credentials are missing, a variable is
+    malformed, or the URL is not that of a prefix."""
     found = store_url(url)
     if found is None:
         raise StoreError(f"{shorten(url)} is a folder of this machine; name a prefix in an object store, such as s3://bucket/prefix")
@@ -90,11 +87,7 @@ def connect(url: str) -> Any:
 
 def _check_environment(scheme: str, url: str) -> str:
     """Check the variables that obstore reads, of which malformed ones make it panic; returns the endpoint, empty: the cloud's own. Unsets
-    variables that are empty.
-
-    Raises:
-        StoreError: A variable is malformed, or there are no credentials.
-    """
+    variables that are empty. Raises StoreError: a variable is malformed, or there are no credentials."""
     for name, value in list(os.environ.items()):
         endpoint, header = name in _ENDPOINTS[scheme], _HEADERS.fullmatch(name) is not None
         if (endpoint or header) and not value:
@@ -123,11 +116,8 @@ def _is_endpoint(address: str) -> bool:
 
 
 def probe(store: Store) -> Probe:
-    """Probe a store's capabilities: write, look up, read and delete a small object below CONTROL.
-
-    Raises:
-        StoreError: The store cannot be read and written, or this machine's clock is off by more than MAX_SKEW.
-    """
+    """Probe a store's capabilities: write, look up, read and delete a small object below CONTROL. Raises StoreError: the store cannot be
+    read and written, or this machine's clock is off by more than MAX_SKEW."""
     key, data = f"{CONTROL}/probe/{uuid.uuid4().hex}", b"probe"
     sent = datetime.datetime.now(datetime.UTC)
     store.put(key, data)

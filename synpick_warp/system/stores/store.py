@@ -88,16 +88,8 @@ class TransientError(Exception):
 
 
 def persist(request: Callable[[], _Result], what: str, tries: int = TRIES) -> _Result:
-    """Retry a request while it raises `TransientError`, with exponential back-off and jitter; returns its result.
-
-    Args:
-        request: The request; must be safe to repeat.
-        what: What it does, for the message: "write s3://bucket/key".
-        tries: Attempts.
-
-    Raises:
-        StoreError: No attempt succeeded.
-    """
+    """Retry a request, which must be safe to repeat, while it raises `TransientError`, with exponential back-off and jitter; returns its
+    result. `what` it does is for the message: "write s3://bucket/key". Raises StoreError: no attempt succeeded."""
     pause = FIRST_PAUSE
     for attempt in range(1, tries + 1):
         try:
@@ -118,11 +110,7 @@ class Store:
     """Object store below a prefix. Thread-safe. Each method repeats requests that fail for a while, then raises StoreError."""
 
     def __init__(self, url: str, backend: Any) -> None:
-        """
-        Args:
-            url: Address of the prefix, without a slash at the end.
-            backend: Store of obstore at this prefix.
-        """
+        """Address of the prefix, without a slash at the end, and obstore's store there."""
         self.url, self._store = url, backend
         self._obs = importlib.import_module("obstore")
         self._errors = self._obs.exceptions
@@ -215,12 +203,8 @@ class Store:
         return Stat(found["size"], found["last_modified"])
 
     def list(self, folder: str, after: str = "") -> Iterator[tuple[str, int]]:
-        """List the objects below a folder, sorted by key, page by page: yields key and size [B].
-
-        Args:
-            folder: First parts of their keys, without a slash at the end; empty: all objects.
-            after: Only keys that sort after this one.
-        """
+        """List the objects below a folder, which is the first parts of their keys (empty: all), sorted by key, page by page: yields key and
+        size [B]. `after`: only keys that sort after this one."""
         last = after
 
         def read(after: str) -> Any:

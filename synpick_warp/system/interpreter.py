@@ -1,10 +1,13 @@
-"""Descriptors of the standard streams: closed ones are opened on the null device, so that no other file takes their numbers."""
+"""State of the interpreter: descriptors of the standard streams, of which closed ones are opened on the null device, so that no other file
+takes their numbers, and a pause of the garbage collector."""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import os
+from collections.abc import Iterator
 
 STANDARD_ERROR = 2
 """Descriptor of the standard error, the last of the three."""
@@ -24,3 +27,18 @@ def open_standard_descriptors() -> None:
 def duplicate_above_streams(handle: int) -> int:
     """Duplicate a descriptor to a number above those of the standard streams. The caller closes it."""
     return fcntl.fcntl(handle, fcntl.F_DUPFD_CLOEXEC, STANDARD_ERROR + 1)
+
+
+@contextlib.contextmanager
+def collection_paused() -> Iterator[None]:
+    """Context manager that pauses the cyclic garbage collector, for imports and for building worlds, whose many objects stay alive.
+
+    Without it, collections that free nothing take a fifth of the CPU time of importing the modules and building 300 worlds.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
