@@ -21,7 +21,7 @@ from synpick_warp.cloud.claims import LeaseLostError
 from synpick_warp.cloud.ledger import INDEX, Ledger
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
-from synpick_warp.errors import OutputError, StoreError, SynpickError
+from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.factory.episodes import BakeSummary
@@ -198,15 +198,11 @@ class Delivery:
                 os.rmdir(parent)
 
     def _fail(self, error: BaseException) -> None:
-        """Record an error, if it is the first."""
+        """Record an error, if it is the first; one of the operating system becomes a StoreError."""
         with self._lock:
             if self._fault is None:
-                self._fault = error if isinstance(error, SynpickError) else _describe(error)
-
-
-def _describe(error: BaseException) -> BaseException:
-    """Convert an error of the operating system to StoreError; others stay as they are."""
-    return StoreError(f"an upload failed: {error}; the same command resumes") if isinstance(error, OSError) else error
+                failed = StoreError(f"an upload failed: {error}; the same command resumes")
+                self._fault = failed if isinstance(error, OSError) else error
 
 
 class WatchedProgress(ForwardingProgress):

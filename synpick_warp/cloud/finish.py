@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import heapq
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -30,19 +28,6 @@ AHEAD = 256
 """Index files that are requested together, and then unpacked in the order of their episodes."""
 
 
-@contextlib.contextmanager
-def _clear_errors(ledger: Ledger, folder: Path) -> Iterator[None]:
-    """Convert errors of missing objects to StoreError, and those of the temporary folder to OutputError."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        said = (str(error).splitlines() or ["an object"])[0]
-        advice = "restore it, or delete the done mark of its episode, manifest/NUMBER.json, and resume the bake without --claim"
-        raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
-    except OSError as error:
-        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
-
-
 def finalize_store(ledger: Ledger, folder: Path) -> int:
     """Finalize a data set: writes the indices over all episodes, if all are done and the indices do not cover them yet. Returns the number
     of episodes that are not done; 0: the data set is finished. `folder`: an empty one, for temporary files.
@@ -57,10 +42,16 @@ def finalize_store(ledger: Ledger, folder: Path) -> int:
     if missing := sum(map(len, ledger.remaining(ledger.layout.plan()))):
         return missing
     work = folder / "set"
-    with _clear_errors(ledger, folder):
+    try:
         episodes, needs = _gather(ledger, work), Needs.of(ledger.config)
         with WriterPool(count_writers(ledger.config.bake.writers, needs.slot_bytes), needs.slot_bytes) as pool:
             finalize_data_set(work, ExportSettings.of(ledger.config), needs.classes, pool, episodes)
+    except FileNotFoundError as error:
+        said = (str(error).splitlines() or ["an object"])[0]
+        advice = "restore it, or delete the done mark of its episode, manifest/NUMBER.json, and resume the bake without --claim"
+        raise StoreError(f"what the indices of {ledger.store.url} are made of is missing: {said}; {advice}") from None
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}; set TMPDIR to a folder with more space") from None
     if not ledger.finished():  # Else another bake of these episodes, or of more, has ended meanwhile.
         _put_indices(ledger, work)
     return 0

@@ -272,8 +272,7 @@ def cell(folder, lines, settings=None):
 
 
 @pytest.mark.parametrize(
-    ("lines", "model"),
-    [('file = "camera.file"', "pinhole"), (f"{INLINE}pixel_center = 0.0\ndistortion = {list(FIVE)}", None)],
+    ("lines", "model"), [('file = "camera.file"', "pinhole"), (f"{INLINE}pixel_center = 0.0\ndistortion = {list(FIVE)}", None)]
 )
 def test_a_camera_table_has_the_numbers_of_its_file(lines, model, tmp_path):
     """They are written to config.toml, and the file is not read again."""

@@ -231,10 +231,6 @@ def test_options_that_would_have_no_effect_are_refused(tmp_path):
     assert "camera cannot be set on the command line; write [[camera]] tables into a file" in refusal(load, tmp_path, LEFT, camera__fov=3)
 
 
-CLOSE = "distortion = [-0.25, 0, 0, 0]\n[camera.jitter]\n"
-"""A lens that folds over 4 % farther from the axis than the image's corners are."""
-
-
 def test_perception_takes_the_first_camera_that_does_not_move(tmp_path):
     rig = load(tmp_path, HAND + LEFT + '[bake]\nmode = "pick"\n').rig
     assert (rig.index(""), rig.groups) == (1, ((0,), (1,)))

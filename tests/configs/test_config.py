@@ -377,11 +377,7 @@ SEARCHED = r"a maximum of at most 2.5\d, from which on 256 disparities are searc
     ("overrides", "key", "allowed"),
     [
         ({"cameras.ups": [[0, 1, 0]]}, "cameras.ups", "one direction for each of the 3"),
-        (
-            {"cameras.ups": [[0, 0, 0]] * 3},
-            "cameras.ups",
-            UPRIGHT,
-        ),
+        ({"cameras.ups": [[0, 0, 0]] * 3}, "cameras.ups", UPRIGHT),
         ({"cameras.target": [0, 0, 2]}, "cameras.positions", "positions other than cameras.target"),
         ({"cameras.positions": [], "cameras.ups": []}, "cameras.positions", "at least one position"),
         ({"tote.floor_size": [0.6, 0.3]}, "tote.rim_size", "at least tote.floor_size on both sides"),
@@ -416,11 +412,7 @@ SEARCHED = r"a maximum of at most 2.5\d, from which on 256 disparities are searc
         ({"cameras.target": [0, 0.5, 1.9], "cameras.fov": 40}, "cameras.target", SEES),
         (SENSOR | {"depth_sensor.distances": [5, 9]}, "depth_sensor.distances", REACHES),
         (SENSOR | {"depth_sensor.distances": [0.1, 1]}, "depth_sensor.distances", "a range that reaches the tote"),
-        (
-            SENSOR | {"depth_sensor.baseline": 1e-5},
-            "depth_sensor.baseline",
-            FINE,
-        ),
+        (SENSOR | {"depth_sensor.baseline": 1e-5}, "depth_sensor.baseline", FINE),
         ({"render.layers": ["ir_right"], "depth_sensor.distances": [5, 9]}, "depth_sensor.distances", REACHES),
         ({"render.layers": ["depth_stereo"], "depth_sensor.baseline": 0.3}, "depth_sensor.distances", SEARCHED),
         ({"depth_sensor.grazing_angle": 1}, "depth_sensor.grazing_angle", "at least 10, at most 89"),

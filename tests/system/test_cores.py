@@ -17,12 +17,16 @@ from tests.worlds.model_files import put
 
 MASK = 64
 """Cores of the affinity mask in these tests."""
+MEMINFO = "MemTotal:       1000 kB\nMemAvailable:    800 kB\nSwapFree:        50 kB\n"
 
 
-def write(root: Path, files: dict[str, str]) -> Path:
-    """Copies of the kernel's interface files (procfs, cgroupfs) by their paths below `root`; returns `root`."""
+def interface(root: Path, groups: str | None, files: dict[str, str]) -> Path:
+    """The kernel's interface below `root`, which is returned: memory, the control groups of this process (None: no file), and theirs."""
+    put(root / "proc/meminfo", MEMINFO)
+    if groups is not None:
+        put(root / "proc/self/cgroup", groups)
     for name, text in files.items():
-        put(root / name, text)
+        put(root / "sys/fs/cgroup" / name, text)
     return root
 
 
@@ -32,75 +36,44 @@ def mask(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("files", "cores"),
+    ("groups", "files", "cores"),
     [
-        ({}, MASK),
-        ({"proc/self/cgroup": "0::/job\n", "sys/fs/cgroup/job/cpu.max": "max 100000\n"}, MASK),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "200000 100000\n"}, 2),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "150000 100000\n"}, 2),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "10000 100000\n"}, 1),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": "9900000 100000\n"}, MASK),
+        (None, {}, MASK),
+        ("0::/job\n", {"job/cpu.max": "max 100000\n"}, MASK),
+        ("0::/\n", {"cpu.max": "200000 100000\n"}, 2),
+        ("0::/\n", {"cpu.max": "150000 100000\n"}, 2),
+        ("0::/\n", {"cpu.max": "10000 100000\n"}, 1),
+        ("0::/\n", {"cpu.max": "9900000 100000\n"}, MASK),
         # The tightest of nested groups counts.
+        ("0::/a/b\n", {"a/b/cpu.max": "800000 100000\n", "a/cpu.max": "300000 100000\n"}, 3),
         (
-            {
-                "proc/self/cgroup": "0::/a/b\n",
-                "sys/fs/cgroup/a/b/cpu.max": "800000 100000\n",
-                "sys/fs/cgroup/a/cpu.max": "300000 100000\n",
-            },
-            3,
-        ),
-        (
-            {
-                "proc/self/cgroup": "4:memory:/docker/1\n3:cpu,cpuacct:/docker/1\n",
-                "sys/fs/cgroup/cpu/docker/1/cpu.cfs_quota_us": "400000\n",
-                "sys/fs/cgroup/cpu/docker/1/cpu.cfs_period_us": "100000\n",
-            },
+            "4:memory:/docker/1\n3:cpu,cpuacct:/docker/1\n",
+            {"cpu/docker/1/cpu.cfs_quota_us": "400000\n", "cpu/docker/1/cpu.cfs_period_us": "100000\n"},
             4,
         ),
-        (
-            {
-                "proc/self/cgroup": "3:cpu:/\n",
-                "sys/fs/cgroup/cpu/cpu.cfs_quota_us": "-1\n",
-                "sys/fs/cgroup/cpu/cpu.cfs_period_us": "100000\n",
-            },
-            MASK,
-        ),
+        ("3:cpu:/\n", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, MASK),
     ],
 )
-def test_quotas_of_control_groups_limit_the_cores_of_the_mask(files, cores, tmp_path):
-    assert count_cores(write(tmp_path, files)) == cores
+def test_quotas_of_control_groups_limit_the_cores_of_the_mask(groups, files, cores, tmp_path):
+    assert count_cores(interface(tmp_path, groups, files)) == cores
 
 
-MEMINFO = "MemTotal:       1000 kB\nMemAvailable:    800 kB\nSwapFree:        50 kB\n"
+LIMITED = {"a/memory.max": f"{600 * 1024}\n", "a/memory.current": f"{500 * 1024}\n"}
+DOCKER = {"memory/memory.limit_in_bytes": f"{300 * 1024}", "memory/memory.usage_in_bytes": f"{100 * 1024}"}
 
 
 @pytest.mark.parametrize(
-    ("files", "kibibytes"),
+    ("groups", "files", "kibibytes"),
     [
-        ({}, 850),
-        ({"proc/self/cgroup": "0::/a/b\n", "sys/fs/cgroup/a/memory.max": "max\n", "sys/fs/cgroup/a/memory.current": "1024\n"}, 850),
-        (
-            {
-                "proc/self/cgroup": "0::/a/b\n",
-                "sys/fs/cgroup/a/memory.max": f"{600 * 1024}\n",
-                "sys/fs/cgroup/a/memory.current": f"{500 * 1024}\n",
-                "sys/fs/cgroup/a/memory.stat": f"anon 7\ninactive_file {100 * 1024}\n",
-            },
-            250,
-        ),
-        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "2048\n", "sys/fs/cgroup/memory.current": "4096\n"}, 50),
-        (
-            {
-                "proc/self/cgroup": "5:cpu:/x\n4:memory:/docker/1\n",
-                "sys/fs/cgroup/memory/memory.limit_in_bytes": f"{300 * 1024}",
-                "sys/fs/cgroup/memory/memory.usage_in_bytes": f"{100 * 1024}",
-            },
-            250,
-        ),
+        (None, {}, 850),
+        ("0::/a/b\n", {"a/memory.max": "max\n", "a/memory.current": "1024\n"}, 850),
+        ("0::/a/b\n", LIMITED | {"a/memory.stat": f"anon 7\ninactive_file {100 * 1024}\n"}, 250),
+        ("0::/\n", {"memory.max": "2048\n", "memory.current": "4096\n"}, 50),
+        ("5:cpu:/x\n4:memory:/docker/1\n", DOCKER, 250),
     ],
 )
-def test_free_memory_counts_caches_swap_and_the_limits_of_control_groups(files, kibibytes, tmp_path):
-    assert free_host_memory(write(tmp_path, {"proc/meminfo": MEMINFO, **files})) == kibibytes * 1024
+def test_free_memory_counts_caches_swap_and_the_limits_of_control_groups(groups, files, kibibytes, tmp_path):
+    assert free_host_memory(interface(tmp_path, groups, files)) == kibibytes * 1024
 
 
 @given(
@@ -110,7 +83,7 @@ def test_free_memory_counts_caches_swap_and_the_limits_of_control_groups(files, 
 )
 @hypothesis_settings(max_examples=fuzz_examples(50), deadline=None)
 def test_any_text_in_the_files_of_control_groups_gives_a_number(tmp_path_factory, quota, files, groups):
-    root = write(tmp_path_factory.mktemp("root"), {"proc/meminfo": MEMINFO, "proc/self/cgroup": "0::/\n", "sys/fs/cgroup/cpu.max": quota})
+    root = interface(tmp_path_factory.mktemp("root"), "0::/\n", {"cpu.max": quota})
     assert 1 <= count_cores(root) <= MASK
     (root / "proc/self/cgroup").write_bytes(b"0::/\n" + groups)
     for name, content in files.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import hypot
 from typing import Annotated, Any, ClassVar
 
@@ -50,16 +51,6 @@ _RIGID = 1e-3
 """Tolerance of the elements of a rotation: published matrices have six digits."""
 
 
-def _parse_discrete(value: Any) -> Any:
-    """Discrete symmetries as lists of numbers: 16 of a matrix, or axis, fold and offset, if there is one."""
-    return _parse_each(value, _flatten_discrete, _DISCRETE)
-
-
-def _parse_continuous(value: Any) -> Any:
-    """Continuous symmetries as lists of numbers: axis, and offset, if there is one."""
-    return _parse_each(value, _flatten_continuous, _CONTINUOUS)
-
-
 def _parse_each(value: Any, flatten: Callable[[Any], list[Any]], rule: str) -> Any:
     """Convert each symmetry of a list; raises ValueError with the rule."""
     if not isinstance(value, list | tuple):
@@ -76,7 +67,7 @@ def _parse_each(value: Any, flatten: Callable[[Any], list[Any]], rule: str) -> A
 
 
 def _flatten_discrete(one: Any) -> list[Any]:
-    """Numbers of a discrete symmetry; an empty list if its form is another one."""
+    """Numbers of a discrete symmetry: 16 of a matrix, or axis, fold and offset, if there is one; none if its form is another one."""
     if isinstance(one, dict) and {"axis", "fold"} <= one.keys() <= {"axis", "fold", "offset"}:
         one = [*_triple(one["axis"]), one["fold"], *(_triple(one["offset"]) if "offset" in one else ())]
     elif isinstance(one, dict) and one.keys() == {"matrix"}:
@@ -89,7 +80,7 @@ def _flatten_discrete(one: Any) -> list[Any]:
 
 
 def _flatten_continuous(one: Any) -> list[Any]:
-    """Numbers of a continuous symmetry; an empty list if its form is another one."""
+    """Numbers of a continuous symmetry: axis, and offset, if there is one; none if its form is another one."""
     if isinstance(one, dict) and {"axis"} <= one.keys() <= {"axis", "offset"}:
         one = [*_triple(one["axis"]), *(_triple(one["offset"]) if "offset" in one else ())]
     row = list(one) if isinstance(one, list | tuple) else []
@@ -186,12 +177,12 @@ class ObjectRow:
         (),
         f"Discrete symmetries in the frame of the mesh file, replacing those of models_info.json; each {_DISCRETE}. Without an offset the "
         "axis passes through the centroid of the surface. Products of those listed are added.",
-        parse=_parse_discrete,
+        parse=partial(_parse_each, flatten=_flatten_discrete, rule=_DISCRETE),
     )
     symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], "m"] = setting(
         (),
         f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
-        parse=_parse_continuous,
+        parse=partial(_parse_each, flatten=_flatten_continuous, rule=_CONTINUOUS),
     )
 
 

@@ -31,13 +31,6 @@ def encode_jpeg(image: np.ndarray, quality: int) -> memoryview:
     return data.data
 
 
-def zigzag_order() -> np.ndarray:
-    """Row-major index of each coefficient in zigzag order (64) int32."""
-    rows, columns = np.divmod(np.arange(64), 8)
-    diagonal = rows + columns
-    return np.lexsort((np.where(diagonal % 2, rows, columns), diagonal)).astype(np.int32)
-
-
 @functools.cache
 def _segments(quality: int) -> tuple[tuple[int, bytes], ...]:
     """Marker and content of each segment before the entropy-coded data, as libjpeg writes them; only the frame's depend on the image."""

@@ -22,7 +22,8 @@ import torch  # pyright: ignore[reportMissingImports]
 from torch import nn  # pyright: ignore[reportMissingImports]
 from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-from synpick_warp.system.codecs.jpeg import QUALITIES, quantization, zigzag_order
+from synpick_warp.kernels.encoding.dct import ZIGZAG
+from synpick_warp.system.codecs.jpeg import QUALITIES, quantization
 from tools.examples.train_online import LEARNING_RATE, schedule
 
 LUMA = (0.299, 0.587, 0.114)
@@ -256,7 +257,7 @@ def _jpeg_tables(device: torch.device) -> tuple[torch.Tensor, torch.Tensor, torc
     """Quantization tables (quality, 3, 8, 8) of levels 0..1, the orthonormal DCT matrix (8, 8), and the inverse of YCC (3, 3)."""
     steps = np.empty((QUALITIES, 2, BLOCK * BLOCK), np.float32)
     for quality in range(QUALITIES):
-        steps[quality, :, zigzag_order()] = quantization(quality).T / 255.0
+        steps[quality, :, list(ZIGZAG)] = quantization(quality).T / 255.0
     frequency, place = np.mgrid[:BLOCK, :BLOCK]
     matrix = np.cos((2 * place + 1) * frequency * np.pi / (2 * BLOCK)) * np.where(frequency, 0.5, 0.5**1.5)
     made = (steps.reshape(QUALITIES, 2, BLOCK, BLOCK)[:, [0, 1, 1]], matrix, np.linalg.inv(YCC))
