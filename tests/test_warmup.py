@@ -14,7 +14,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.compilation import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds
-from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild
+from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, dry_launches
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import boxes, mistake
 from tests.worlds.small_worlds import settings
@@ -63,10 +63,10 @@ def test_dry_launches_find_all_that_a_warm_up_loads(device):
     factory = smallest(TINY, device)
     found = []
     for _ in range(2):
-        with DryLaunches() as dry:
+        with dry_launches() as builds:
             launch_all(factory.simulation, factory.stream)
         factory.simulation.clear_graphs()
-        found.append(set(dry.builds))
+        found.append(set(builds))
         launch_all(factory.simulation, factory.stream)
         factory.simulation.clear_graphs()
     assert found[0] == found[1] >= early.keys()
@@ -79,7 +79,7 @@ def test_a_dry_run_takes_a_camera_on_the_gripper(device):
     row = CameraRow(fov=60.0, pose=Pose(position=(0.1, 0.0, 0.1), look_at=(0.0, 0.0, -0.1), up=(0.0, 1.0, 0.0)), fixed_to="gripper")
     config = dataclasses.replace(settings(bake__mode="move", cameras__resolution=[32, 18]), camera=(row,))
     factory = smallest(config, device)
-    with DryLaunches():
+    with dry_launches():
         launch_all(factory.simulation, factory.stream)
 
 

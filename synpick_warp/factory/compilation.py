@@ -12,7 +12,7 @@ from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, read_tick
-from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, build_of, compilation_lock
+from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.progress import Progress
 
 
@@ -50,10 +50,10 @@ def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStr
         simulation: Worlds that have not ticked yet. No kernel runs, so that their state stays; contents of scratch arrays may change.
         stream: Renderer and encoders; None: nothing is rendered.
     """
-    with DryLaunches() as dry:
+    with dry_launches() as builds:
         launch_all(simulation, stream)
     simulation.clear_graphs()
-    compiler.submit(dry.builds)
+    compiler.submit(builds)
 
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:

@@ -16,7 +16,7 @@ import warp as wp
 from synpick_warp.errors import DeviceError
 from synpick_warp.system.hardware import green_contexts, kernels
 from synpick_warp.system.hardware.green_contexts import SmPartition
-from synpick_warp.system.hardware.kernels import Compiler, DryLaunches, ModuleBuild, build_of, compilation_lock, split_modules
+from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, build_of, compilation_lock, dry_launches, split_modules
 
 MODULES = 1
 
@@ -43,15 +43,15 @@ def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_ca
     scale = make_kernel(3.0)
     values = wp.ones(4, dtype=float, device=device)
     load = wp.Module.load
-    with DryLaunches() as dry:
+    with dry_launches() as builds:
         for block in (64, 128, 64):
             wp.launch(scale, dim=4, inputs=[values], device=device, block_dim=block)
         wp.launch(scale, dim=4, inputs=[values], device=device)
     assert wp.Module.load is load
     np.testing.assert_array_equal(values.numpy(), 1.0)
     blocks = (64, 128, 256) if device.is_cuda else (1,)
-    assert list(dry.builds) == [ModuleBuild(scale.module, device.alias, block) for block in blocks]
-    assert build_of(scale, device) == list(dry.builds)[-1]
+    assert list(builds) == [ModuleBuild(scale.module, device.alias, block) for block in blocks]
+    assert build_of(scale, device) == list(builds)[-1]
     assert list(empty_cache.iterdir()) == []
     wp.launch(scale, dim=4, inputs=[values], device=device)
     np.testing.assert_array_equal(values.numpy(), 3.0)

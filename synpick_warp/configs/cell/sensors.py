@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from synpick_warp.codes import Effect, names
 from synpick_warp.configs.calibration.tables import SENSORS
 from synpick_warp.configs.fields import Fraction, setting
 
@@ -41,20 +42,8 @@ class Effects:
 
 def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
     """Minimum and maximum of each parameter of the camera effects, in the order of `Effect`; 0, 0: off."""
-    exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
-    return {
-        "exposure": (-exposure, exposure),
-        "red": (-balance, balance),
-        "blue": (-balance, balance),
-        "vignette": effects.vignette,
-        "chromatic_aberration": effects.chromatic_aberration,
-        "blur": effects.blur,
-        "shot_noise": effects.shot_noise,
-        "read_noise": effects.read_noise,
-        "jpeg_quality": effects.jpeg_quality,
-        "contrast": effects.contrast,
-        "saturation": effects.saturation,
-    }
+    spreads = {"exposure": effects.exposure_jitter, "red": effects.white_balance_jitter, "blue": effects.white_balance_jitter}
+    return {name: (-spreads[name], spreads[name]) if name in spreads else getattr(effects, name) for name in names(Effect)}
 
 
 @dataclass(frozen=True)

@@ -115,28 +115,20 @@ def make_build(module: wp.Module, device: Any, block: int | None) -> ModuleBuild
     return ModuleBuild(module, wp.get_device(device).alias, module.options["block_dim"] if block is None else block)
 
 
-class DryLaunches:
-    """Dry run of kernel launches, by replacing `wp.Module.load`: in all threads kernels neither load nor run; copies and fills do run.
+@contextlib.contextmanager
+def dry_launches() -> Iterator[dict[ModuleBuild, None]]:
+    """Dry run of kernel launches, by replacing `wp.Module.load`: in all threads kernels neither load nor run; copies and fills do run. The
+    value has the modules that the launches need, in the order of their first launch."""
+    load, builds = wp.Module.load, dict[ModuleBuild, None]()
 
-    Attributes:
-        builds: Modules that the launches need, in the order of their first launch.
-    """
+    def record(module: wp.Module, device: Any, block_dim: int | None = None, *_: object, **__: object) -> None:
+        builds[make_build(module, device, block_dim)] = None
 
-    def __init__(self) -> None:
-        self.builds: dict[ModuleBuild, None] = {}
-        self._load: Any = None
-
-    def __enter__(self) -> Self:
-        self._load, builds = wp.Module.load, self.builds
-
-        def record(module: wp.Module, device: Any, block_dim: int | None = None, *_: object, **__: object) -> None:
-            builds[make_build(module, device, block_dim)] = None
-
-        wp.Module.load = record  # type: ignore[method-assign]
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        wp.Module.load = self._load  # type: ignore[method-assign]
+    wp.Module.load = record  # type: ignore[method-assign]
+    try:
+        yield builds
+    finally:
+        wp.Module.load = load  # type: ignore[method-assign]
 
 
 class Compiler:

@@ -34,12 +34,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
     launch kernels. If calls fail, the error of the first failed item is raised, and pending items are cancelled.
     """
     with ThreadPoolExecutor(count_cores(), thread_name_prefix=SETUP) as pool:
-        futures = [pool.submit(function, item) for item in items]
-        try:
-            return [future.result() for future in futures]
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        return list(pool.map(function, items))
 
 
 def is_only_launcher() -> bool:
