@@ -180,7 +180,13 @@ def strips(ring: np.ndarray, *, below: bool = False) -> Patch:
 
 def solid(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
     """Closed solid: a loft with caps at both ends."""
-    return join(cap(rings[0], rect, below=True), loft(rings, rect), cap(rings[-1], rect))
+    return sections((rings, rect), ends=(rect, rect))
+
+
+def sections(*parts: tuple[np.ndarray, Rect], ends: tuple[Rect, Rect]) -> Patch:
+    """Closed solid of lofts, each of rings and a texture rectangle, the first and the last with a cap in the rectangles `ends`."""
+    lofts = [loft(*part) for part in parts]
+    return join(cap(parts[0][0][0], ends[0], below=True), *lofts, cap(parts[-1][0][-1], ends[1]))
 
 
 def torus(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 
 from synpick_warp.configs.episodes.objects import HOUSEHOLD, INDUSTRIAL
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.embedded import goods, parts, tools, vessels
-from synpick_warp.scenes.embedded.packs import Shape
+from synpick_warp.scenes.embedded import parts, tools, vessels
+from synpick_warp.scenes.embedded.packs import Shape, make_goods
 from synpick_warp.scenes.modelling import Patch, make_mesh, rotation
 from synpick_warp.scenes.types import Material, RawObject
 from synpick_warp.system.linear_algebra import matmul
@@ -58,18 +58,18 @@ class _Row:
 
 
 ROWS = (
-    _Row("coffee_tin", goods.coffee_tin, 0.414, 0.6, 0.2, discrete=_rotations(("z", 180))),
-    _Row("cracker_carton", goods.cracker_carton, 0.411, 0.1, 0.5),
-    _Row("sugar_carton", goods.sugar_carton, 0.514, 0.1, 0.5),
-    _Row("soup_tin", goods.soup_tin, 0.349, 0.1, 0.5),
-    _Row("squeeze_bottle", goods.squeeze_bottle, 0.603, 0.3, 0.5),
-    _Row("fish_tin", goods.fish_tin, 0.171, 0.6, 0.2),
-    _Row("dessert_carton", goods.dessert_carton, 0.187, 0.1, 0.5),
-    _Row("jelly_carton", goods.jelly_carton, 0.097, 0.1, 0.5),
-    _Row("meat_tin", goods.meat_tin, 0.370, 0.6, 0.3),
+    _Row("coffee_tin", partial(make_goods, "coffee_tin"), 0.414, 0.6, 0.2, discrete=_rotations(("z", 180))),
+    _Row("cracker_carton", partial(make_goods, "cracker_carton"), 0.411, 0.1, 0.5),
+    _Row("sugar_carton", partial(make_goods, "sugar_carton"), 0.514, 0.1, 0.5),
+    _Row("soup_tin", partial(make_goods, "soup_tin"), 0.349, 0.1, 0.5),
+    _Row("squeeze_bottle", partial(make_goods, "squeeze_bottle"), 0.603, 0.3, 0.5),
+    _Row("fish_tin", partial(make_goods, "fish_tin"), 0.171, 0.6, 0.2),
+    _Row("dessert_carton", partial(make_goods, "dessert_carton"), 0.187, 0.1, 0.5),
+    _Row("jelly_carton", partial(make_goods, "jelly_carton"), 0.097, 0.1, 0.5),
+    _Row("meat_tin", partial(make_goods, "meat_tin"), 0.370, 0.6, 0.3),
     _Row("banana", tools.banana, 0.066, 0.3, 0.3),
     _Row("pitcher", vessels.pitcher, 0.244, 0.1, 0.5),
-    _Row("cleaner_bottle", goods.cleaner_bottle, 1.131, 0.1, 0.5),
+    _Row("cleaner_bottle", partial(make_goods, "cleaner_bottle"), 1.131, 0.1, 0.5),
     _Row("bowl", vessels.bowl, 0.147, 0.6, 0.3, concave=True, continuous=_about((0.0, 0.0, 1.0))),
     _Row("mug", vessels.mug, 0.118, 0.6, 0.3, concave=True),
     _Row("drill", tools.drill, 0.895, 0.1, 0.6, concave=True),
@@ -107,7 +107,7 @@ def procedural_objects(sets: Collection[str] = (HOUSEHOLD,)) -> list[RawObject]:
     return [_make_object(obj_id, row) for obj_id, (name, row) in rows if name in sets]
 
 
-@functools.cache
+@cache
 def _make_object(obj_id: int, row: _Row) -> RawObject:
     """Make an embedded object, once a process; nobody changes it."""
     made = row.make()

@@ -1,9 +1,12 @@
-"""Packaging: procedural cartons, tins and bottles with printed labels. Lengths [m]."""
+"""Packaging: procedural cartons, tins and bottles with printed labels, by the table goods.toml. Lengths [m]."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +16,12 @@ from synpick_warp.scenes.modelling import (
     BOX_FACES,
     Patch,
     at_height,
-    cap,
     ellipse,
     join,
     lathe,
-    loft,
     rounded_box,
     rounded_rectangle,
+    sections,
     solid,
 )
 
@@ -33,24 +35,36 @@ SILVER: Color = (204, 205, 208)
 
 Shape = tuple[Patch, np.ndarray]
 """Surface of an object and its texture (H, W, 3) uint8."""
-Motif = Callable[[np.ndarray], None]
-"""Function that draws a picture onto a label."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """Texts, colours and picture of a printed label, and the seed of its random details."""
+    """Texts, colours and picture (see goods.toml) of a printed label, and the seed of its random details."""
 
-    title: tuple[str, ...]
+    title: list[str]
     subtitle: str
     net: str
     color: Color
     accent: Color
     text: Color
-    motif: Motif
     seed: int
+    picture: list[dict[str, Any]]
     food: bool = True
     """Print a table of nutrition facts, instead of directions."""
+
+
+def make_goods(name: str) -> Shape:
+    """Make the object of a table of goods.toml."""
+    row = dict(_read_goods()[name])
+    label = Label(**{key: row.pop(key) for key in Label.__annotations__ if key in row})
+    kind = row.pop("kind")
+    return carton(**row, label=label) if kind == "carton" else tin(**row, label=label) if kind == "tin" else bottle(**row, label=label)
+
+
+@functools.cache
+def _read_goods() -> dict[str, dict[str, Any]]:
+    """Tables of goods.toml, by the objects' names."""
+    return tomllib.loads(Path(__file__).with_name("goods.toml").read_text())
 
 
 def front(width: int, height: int, label: Label) -> np.ndarray:
@@ -58,7 +72,14 @@ def front(width: int, height: int, label: Label) -> np.ndarray:
     image = paint.blank(width, height, label.color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.05), label.accent)
     paint.fill(image, (0.0, 0.93, 1.0, 1.0), label.accent)
-    label.motif(image)
+    for group in label.picture:
+        for x, y in group.get("at", [(0, 0)]):
+            for *shape, red, green, blue in group["marks"]:
+                if len(shape) == 3:
+                    paint.dot(image, x + shape[0], y + shape[1], shape[2], (red, green, blue))
+                else:
+                    left, top, right, bottom = shape
+                    paint.fill(image, (x + left, y + top, x + right, y + bottom), (red, green, blue))
     lines = len(label.title)
     for row, line in enumerate(label.title):
         paint.write(image, line, (0.06, 0.08 + 0.3 * row / lines, 0.94, 0.08 + 0.3 * (row + 0.95) / lines), label.text)
@@ -120,7 +141,7 @@ def end(width: int, height: int, label: Label) -> np.ndarray:
     return image
 
 
-def carton(size: tuple[float, float, float], label: Label) -> Shape:
+def carton(size: list[float], label: Label) -> Shape:
     """Make a carton; its largest faces are front and back."""
     scale = (SHEET - 8 * paint.PADDING) / (2 * (size[0] + size[1]))
     x, y, z = (round(length * scale) for length in size)
@@ -129,7 +150,7 @@ def carton(size: tuple[float, float, float], label: Label) -> Shape:
     panels = {"+x": side, "-x": other_side, "+y": side, "-y": other_side, "+z": end, "-z": end, f"+{thin}": front, f"-{thin}": back}
     images = {name: panels[name](*extent[name], label) for name in BOX_FACES}
     texture, at = paint.pack(images, SHEET)
-    return rounded_box(size, CARTON_EDGE, at), texture
+    return rounded_box((size[0], size[1], size[2]), CARTON_EDGE, at), texture
 
 
 def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np.ndarray:
@@ -143,52 +164,77 @@ def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np
     return np.concatenate([left, middle, right], axis=1)
 
 
-def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str, np.ndarray], metal: Color, seed: int) -> Shape:
+def tin(
+    ring: list[float],
+    height: float,
+    label: Label,
+    top: dict[str, Any],
+    bottom: dict[str, Any],
+    *,
+    twice: bool = False,
+    sides: bool = False,
+) -> Shape:
     """Make a tin: metal rims at both ends, the label between them.
 
     Args:
-        ring: Outline (n, 2) of the rim [m].
+        ring: Width and depth of an ellipse, or width, depth and radius of the corners of a rounded rectangle [m].
         height: Height [m].
-        label_image: The label, unrolled.
-        ends: Images `top` and `bottom`.
-        metal: Colour of the rims.
-        seed: Seed of the scratches.
+        label: The label.
+        top: Print of the upper end: see `_draw_end`.
+        bottom: Print of the lower end.
+        twice: Whether the label has its front twice.
+        sides: Whether the label has its sides alone; the front is printed on the lid.
     """
-    texture, at = paint.pack({"label": label_image, "metal": paint.brushed(256, 64, metal, seed), **ends}, SHEET)
+    outline = ellipse(*ring, SIDES) if len(ring) == 2 else rounded_rectangle(*ring, 10)
+    # As wide as the texture atlas without padding, as high as the tin between its rims.
+    width = SHEET - 2 * paint.PADDING
+    high = round(width * (height - 0.008) / np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1).sum())
+    if sides:
+        third = width // 3
+        panels = [draw(wide, high, label) for draw, wide in ((other_side, third), (side, width - 2 * third), (other_side, third))]
+        print_ = np.concatenate(panels, axis=1)
+    else:
+        print_ = wrapper(width, high, label, twice=twice)
+    images = {"label": print_, "metal": paint.brushed(256, 64, SILVER, label.seed + 8)}
+    texture, at = paint.pack(images | {"top": _draw_end(top, label), "bottom": _draw_end(bottom, label)}, SHEET)
     half = height / 2
-    narrow = 1 - 0.0012 / np.abs(ring).max()
+    narrow = 1 - 0.0012 / np.abs(outline).max()
 
     def level(scale: float, z: float) -> np.ndarray:
-        """The ring, scaled, at a height [m]."""
-        return at_height(ring * scale, z)
+        """The outline, scaled, at a height [m]."""
+        return at_height(outline * scale, z)
 
     lower = np.stack([level(0.93, -half + 0.002), level(0.95, -half), level(0.99, -half), level(1.0, -half + 0.001)])
     lower = np.concatenate([lower, np.stack([level(1.0, -half + 0.003), level(narrow, -half + 0.004)])])
     upper = lower[::-1] * (1, 1, -1)
     body = np.stack([lower[-1], *(level(narrow, z) for z in np.linspace(-half, half, 5)[1:-1]), upper[0]])
-    patch = join(
-        cap(lower[0], at["bottom"], below=True),
-        loft(lower, at["metal"]),
-        loft(body, at["label"]),
-        loft(upper, at["metal"]),
-        cap(upper[-1], at["top"]),
-    )
-    return patch, texture
+    parts = (lower, at["metal"]), (body, at["label"]), (upper, at["metal"])
+    return sections(*parts, ends=(at["bottom"], at["top"])), texture
 
 
-def stamped_end(size: int, color: Color, seed: int, text: str) -> np.ndarray:
-    """Draw the end of a tin: concentric grooves, and a line of print if there is text."""
-    image = (0.6 * paint.rings(size, (color, (140, 141, 146)), 3.0) + 0.4 * paint.brushed(size, size, color, seed)).astype(np.uint8)
-    if text:
-        paint.write(image, text, (0.25, 0.42, 0.75, 0.58), (70, 72, 80), paint.FONT)
+def _draw_end(end: dict[str, Any], label: Label) -> np.ndarray:
+    """Draw the end of a tin: `front`, the front panel of this side [px]; `count` concentric grooves of two colours, `rings`; or scratched
+    grooves with a line of print, `stamp`, unless it is empty."""
+    if "front" in end:
+        return front(end["front"], end["front"], label)
+    size = 256
+    if "rings" in end:
+        return paint.rings(size, end["rings"], end["count"])
+    grooves = paint.rings(size, (SILVER, (140, 141, 146)), 3.0)
+    image = (0.6 * grooves + 0.4 * paint.brushed(size, size, SILVER, end["seed"])).astype(np.uint8)
+    if end["stamp"]:
+        paint.write(image, end["stamp"], (0.25, 0.42, 0.75, 0.58), (70, 72, 80), paint.FONT)
     return image
 
 
 def bottle(
-    levels: list[tuple[float, float, float, float]],
+    levels: list[list[float]],
     neck: list[tuple[float, float]],
     band: tuple[int, int],
-    images: dict[str, np.ndarray],
+    label_height: int,
+    body: dict[str, Any],
+    cap: dict[str, Any],
+    label: Label,
 ) -> Shape:
     """Make a bottle with a screw cap.
 
@@ -196,28 +242,14 @@ def bottle(
         levels: Cross-sections (width, depth, superellipse exponent, z) of the body from the bottom to the neck [m].
         neck: (radius, z) of the cap's profile, from its lower edge to its top [m].
         band: First and last level with the label.
-        images: `label` (unrolled), `body`, `cap`.
+        label_height: [px]
+        body: Colour and seed of the body's plastic.
+        cap: Of the cap's.
+        label: The label.
     """
+    images = {"label": wrapper(SHEET - 6, label_height, label), "body": paint.plain(**body), "cap": paint.plain(**cap)}
     texture, at = paint.pack(images, SHEET)
     rings = np.stack([at_height(ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])
     first, last = band
-    body = join(
-        cap(rings[0], at["body"], below=True),
-        loft(rings[: first + 1], at["body"]),
-        loft(rings[first : last + 1], at["label"]),
-        loft(rings[last:], at["body"]),
-        cap(rings[-1], at["body"]),
-    )
-    return join(body, solid(lathe(neck, SIDES), at["cap"])), texture
-
-
-def tin_label_size(ring: np.ndarray, height: float) -> tuple[int, int]:
-    """Width and height of a tin's label [px]: as wide as the texture atlas without padding, as high as the tin between its rims."""
-    around = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1).sum()
-    width = SHEET - 2 * paint.PADDING
-    return width, round(width * (height - 0.008) / around)
-
-
-def label_ring(width: float, depth: float, radius: float) -> np.ndarray:
-    """Outline (n, 2) of a tin with flat sides, a rounded rectangle [m]."""
-    return rounded_rectangle(width, depth, radius, 10)
+    parts = (rings[: first + 1], at["body"]), (rings[first : last + 1], at["label"]), (rings[last:], at["body"])
+    return join(sections(*parts, ends=(at["body"], at["body"])), solid(lathe(neck, SIDES), at["cap"])), texture

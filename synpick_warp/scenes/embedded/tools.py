@@ -12,12 +12,11 @@ from synpick_warp.scenes.modelling import (
     Patch,
     Rect,
     at_height,
-    cap,
     ellipse,
     join,
     lathe,
-    loft,
     rounded_box,
+    sections,
     solid,
     sweep,
     torus,
@@ -42,8 +41,7 @@ def banana() -> Shape:
     section = (1 + 0.045 * np.cos(5 * angles))[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     texture, at = paint.pack({"peel": paint.peel(384, 768, 1000), "tip": paint.plain((70, 50, 28), 1002)}, 640)
     rings = sweep(path, section, radius[:, None], (0.0, 0.0, 1.0))
-    patch = join(cap(rings[0], at["tip"], below=True), loft(rings, at["peel"]), cap(rings[-1], at["tip"]))
-    return patch.rotate("z", 25.0), texture
+    return sections((rings, at["peel"]), ends=(at["tip"], at["tip"])).rotate("z", 25.0), texture
 
 
 def drill() -> Shape:
@@ -58,17 +56,10 @@ def drill() -> Shape:
     motor = [(0.0285, -0.078), (0.0285, -0.05), (0.0285, -0.02), (0.0285, 0.0)]
     tail = [(0.014, -0.092), (0.022, -0.0905), (0.027, -0.0850), (0.0285, -0.078)]
     nose = [(0.0285, 0.0), (0.0275, 0.018), (0.0235, 0.034), (0.021, 0.035)]
-    parts = [lathe(part, 40) for part in (tail, motor, nose)]
-    housing = join(
-        cap(parts[0][0], at["black"], below=True),
-        loft(parts[0], at["black"]),
-        loft(parts[1], at["motor"]),
-        loft(parts[2], at["black"]),
-        cap(parts[2][-1], at["black"]),
-    )
-    chuck = solid(
-        lathe([(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)], 40), at["steel"]
-    )
+    parts = (tail, "black"), (motor, "motor"), (nose, "black")
+    housing = sections(*((lathe(part, 40), at[name]) for part, name in parts), ends=(at["black"], at["black"]))
+    jaws = [(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)]
+    chuck = solid(lathe(jaws, 40), at["steel"])
     grip = [
         (-0.040, 0.040, 0.034, -0.072),
         (-0.037, 0.036, 0.032, -0.050),
@@ -133,14 +124,8 @@ def marker() -> Shape:
     plug = [(0.0060, -0.0605), (0.0075, -0.0602), (0.0085, -0.0585), (0.0086, -0.0550), (0.0094, -0.0545)]
     barrel = [(0.0094, -0.0545), (0.0094, -0.02), (0.0094, 0.0140)]
     lid = [(0.0094, 0.0140), (0.0103, 0.0145), (0.0103, 0.0200), (0.0100, 0.0215), (0.0100, 0.0450), (0.0093, 0.0590), (0.0080, 0.0605)]
-    rings = [lathe(part, 32) for part in (plug, barrel, lid)]
-    patch = join(
-        cap(rings[0][0], at["plug"], below=True),
-        loft(rings[0], at["plug"]),
-        loft(rings[1], at["bands"]),
-        loft(rings[2], at["cap"]),
-        cap(rings[2][-1], at["cap"]),
-    )
+    parts = (plug, "plug"), (barrel, "bands"), (lid, "cap")
+    patch = sections(*((lathe(part, 32), at[name]) for part, name in parts), ends=(at["plug"], at["cap"]))
     return patch.rotate("x", -90.0), texture
 
 
@@ -165,12 +150,7 @@ def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
     widths = [0.098 * width * factor for factor in (0.6, 1.0, 1.0, 1.2, 1.15, 0.95, 0.75, 0.6)]
     rings = _bar_rings(spine, 0.0, depths, widths)
     sleeve = len(rings) * 2 // 5
-    arm = join(
-        cap(rings[0], at["orange"], below=True),
-        loft(rings[: sleeve + 1], at["orange"]),
-        loft(rings[sleeve:], at["black"]),
-        cap(rings[-1], at["black"]),
-    )
+    arm = sections((rings[: sleeve + 1], at["orange"]), (rings[sleeve:], at["black"]), ends=(at["orange"], at["black"]))
     pad = rounded_box((0.055 * width, 0.11 * length, 0.75 * depth), 0.0022, dict.fromkeys(BOX_FACES, at["orange"]))
     half = join(arm, pad.translate(-0.036 * width, 0.445 * length, 0.0))
     coil = [(0.055 * width, -depth / 2), (0.065 * width, -0.47 * depth), (0.065 * width, 0.47 * depth), (0.055 * width, depth / 2)]

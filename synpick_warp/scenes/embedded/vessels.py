@@ -6,7 +6,7 @@ import numpy as np
 
 from synpick_warp.scenes.embedded import textures as paint
 from synpick_warp.scenes.embedded.packs import Shape
-from synpick_warp.scenes.modelling import Patch, Rect, cap, ellipse, join, lathe, loft, solid, sweep
+from synpick_warp.scenes.modelling import Patch, Rect, ellipse, join, lathe, sections, solid, sweep
 
 SIDES = 48
 """Points per ring of a vessel."""
@@ -29,16 +29,8 @@ def bowl() -> Shape:
     red, cream, dark = (176, 32, 30), (238, 230, 210), (50, 24, 22)
     images = {"red": paint.blank(16, 16, red), "cream": paint.blank(16, 16, cream), "dark": paint.blank(16, 16, dark)}
     texture, at = paint.pack(images, 128)
-    rings = [lathe(part, SIDES) for part in (outside, upper, rim, inside)]
-    patch = join(
-        cap(rings[0][0], at["dark"], below=True),
-        loft(rings[0], at["red"]),
-        loft(rings[1], at["cream"]),
-        loft(rings[2], at["dark"]),
-        loft(rings[3], at["cream"]),
-        cap(rings[3][-1], at["cream"]),
-    )
-    return patch, texture
+    parts = (outside, "red"), (upper, "cream"), (rim, "dark"), (inside, "cream")
+    return sections(*((lathe(part, SIDES), at[name]) for part, name in parts), ends=(at["dark"], at["cream"])), texture
 
 
 def mug() -> Shape:
@@ -50,15 +42,8 @@ def mug() -> Shape:
     blue = (36, 96, 132)
     images = {"print": _mug_print(900, 230, blue), "blue": paint.plain(blue, 1401), "cream": paint.plain((240, 236, 224), 1402)}
     texture, at = paint.pack(images, 1024)
-    rings = [lathe(part, SIDES) for part in (foot, outside, rim, inside)]
-    body = join(
-        cap(rings[0][0], at["cream"], below=True),
-        loft(rings[0], at["blue"]),
-        loft(rings[1], at["print"]),
-        loft(rings[2], at["blue"]),
-        loft(rings[3], at["cream"]),
-        cap(rings[3][-1], at["cream"]),
-    )
+    parts = (foot, "blue"), (outside, "print"), (rim, "blue"), (inside, "cream")
+    body = sections(*((lathe(part, SIDES), at[name]) for part, name in parts), ends=(at["cream"], at["cream"]))
     return join(body, _handle((0.0446, 0.0247, 0.0255), (0.013, 0.0085), at["blue"])), texture
 
 
@@ -71,15 +56,8 @@ def pitcher() -> Shape:
     blue = (44, 92, 178)
     images = {"scale": _pitcher_scale(960, 560, blue), "blue": paint.plain(blue, 1101)}
     texture, at = paint.pack(images, 1024)
-    rings = [_add_spout(lathe(part, SIDES)) for part in (foot, outside, rim, inside)]
-    body = join(
-        cap(rings[0][0], at["blue"], below=True),
-        loft(rings[0], at["blue"]),
-        loft(rings[1], at["scale"]),
-        loft(rings[2], at["blue"]),
-        loft(rings[3], at["blue"]),
-        cap(rings[3][-1], at["blue"]),
-    )
+    parts = (foot, "blue"), (outside, "scale"), (rim, "blue"), (inside, "blue")
+    body = sections(*((_add_spout(lathe(part, SIDES)), at[name]) for part, name in parts), ends=(at["blue"], at["blue"]))
     wall_tilt = 2.56  # draft angle of the wall [°]
     handle = _handle((0.0597, 0.030, 0.075), (0.024, 0.011), at["blue"]).rotate("y", wall_tilt).translate(0.0, 0.0, 0.012)
     return join(body, handle), texture
