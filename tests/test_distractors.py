@@ -22,8 +22,7 @@ from synpick_warp.dataset.commit.writing import digest_inputs
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.build import count_distractor_slots
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.embedded.solids import solids
+from synpick_warp.scenes.embedded.objects import procedural_objects, solids
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim import arrange
 from synpick_warp.system.progress import SilentProgress

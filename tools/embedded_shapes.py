@@ -18,11 +18,10 @@ from synpick_warp.configs.episodes.objects import EMBEDDED
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.catalog import read_objects, shape_recipe
 from synpick_warp.scenes.collision import shapes
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe
-from synpick_warp.scenes.collision.shapes import collision_shapes
+from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes
 from synpick_warp.scenes.collision.simplification import simplify_hull
-from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
-from synpick_warp.scenes.embedded.parts import MILLIMETER
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.parts import MILLIMETER, PIECES
 from synpick_warp.scenes.types import Shape
 from tools.options import make_parser
 
@@ -54,7 +53,7 @@ def main() -> None:
 
 def modelled_shape(name: str, recipe: ShapeRecipe) -> Shape:
     """Collision shape of an object that comes with its convex pieces, moved as its mesh: the middle of the bounding box to the origin."""
-    pieces = PIECES[name]()
+    pieces = PIECES[name]
     points = np.concatenate(pieces)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     return tuple(simplify_hull((MILLIMETER * (piece - middle)).round(_DIGITS), recipe.piece_vertices) for piece in pieces)

@@ -31,10 +31,9 @@ from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pic
 from synpick_warp.scenes.bins import Bin, make_bins, make_fixtures
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
-from synpick_warp.scenes.capacities import FEW, with_capacities
+from synpick_warp.scenes.capacities import FEW, check_fill, with_capacities
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.fills import check_fill
-from synpick_warp.scenes.grippers.registry import check_reach, make_head
+from synpick_warp.scenes.grippers import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import choose_transfers

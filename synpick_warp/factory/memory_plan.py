@@ -30,7 +30,7 @@ from synpick_warp.scenes import build
 from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.build import FREE_DOFS
 from synpick_warp.scenes.capacities import FEW
-from synpick_warp.scenes.grippers.registry import make_head
+from synpick_warp.scenes.grippers import make_head
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import TransferSettings, choose_transfers

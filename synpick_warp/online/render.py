@@ -77,15 +77,8 @@ def _world(rows: Sequence[int], poses: Sequence[Any], device: wp.Device) -> Snap
 def _entry(obj_id: int, mesh: Mesh, unit: float) -> CatalogEntry:
     """Catalog entry of a mesh that is only drawn."""
     if isinstance(mesh, Path | str):
-        shape, found = read_mesh(Path(mesh), unit)
-        material = replace(
-            GREY,
-            color=found.color,
-            texture=found.texture,
-            metallic=GREY.metallic if found.metallic is None else found.metallic,
-            roughness=GREY.roughness if found.roughness is None else found.roughness,
-        )
-        return _drawn(obj_id, Path(mesh).stem, shape, material)
+        shape, found, _ = read_mesh(Path(mesh), unit)
+        return _drawn(obj_id, Path(mesh).stem, shape, found.complete(GREY.metallic, GREY.roughness))
     vertices, faces = (np.asarray(array) for array in mesh)
     corners = vertices.astype(np.float64)[faces.astype(np.int64)] * unit
     return _drawn(obj_id, f"object_{obj_id}", make_mesh(Patch(corners, np.zeros((len(corners), 3, 2))), centered=False), GREY)

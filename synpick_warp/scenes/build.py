@@ -21,12 +21,9 @@ from synpick_warp.configs.dataset.splits import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField
-from synpick_warp.scenes.bins import guide_walls, make_bins
-from synpick_warp.scenes.fills import count_entries
-from synpick_warp.scenes.grippers.head import Head
-from synpick_warp.scenes.grippers.mechanism import GRIPPER_BODIES, GRIPPER_DOFS, add_gripper, hull_mesh
-from synpick_warp.scenes.grippers.registry import make_head
-from synpick_warp.scenes.tote import TABLE_SIZE
+from synpick_warp.scenes.bins import TABLE_SIZE, guide_walls, make_bins
+from synpick_warp.scenes.capacities import count_entries
+from synpick_warp.scenes.grippers import GRIPPER_BODIES, GRIPPER_DOFS, Head, add_gripper, hull_mesh, make_head
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
 # Mass [kg] and inertia [kg·m²] of an empty slot. Its gravity is compensated, so any positive values will do.
@@ -114,9 +111,7 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
     Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
 
     Args:
-        arrangement: Settings of the draw.
         rules: Whether objects repeat in an episode: the values by `find_repeat_rules`.
-        catalog: The objects.
 
     Raises:
         ConfigError: No object fits into the volume budget, or `count_entries` refuses a part.
@@ -209,13 +204,7 @@ def _draw_trials(volume: np.ndarray, budget: float | np.float32, rule: Arrangeme
 
 
 def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltModel:
-    """Build and finalize the model of all worlds.
-
-    Args:
-        config: Settings; the model has `bake.worlds` worlds.
-        catalog: The objects.
-        device: Device of the model's arrays.
-    """
+    """Build and finalize the model of `bake.worlds` worlds."""
     most = config.randomize.most_distractors
     slots = count_slots(without_distractors(config.arrangement, most), find_repeat_rules(config.bake, config.pick, config.move), catalog)
     single, compound = (count + more for count, more in zip(slots, count_distractor_slots(most, catalog, config.arrangement), strict=True))

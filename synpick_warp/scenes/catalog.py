@@ -12,24 +12,21 @@ from trimesh.bounds import oriented_bounds
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, HULL, MASS_RANGE, MESH, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
-from synpick_warp.errors import CatalogError, SynpickError
+from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import FileMaterial
-from synpick_warp.scenes.assets.asset_files import asset_scope
-from synpick_warp.scenes.assets.meshes import MeshOptions, connected_parts, merge_positions, read_mesh_file, solid_volume
+from synpick_warp.scenes.assets.asset_files import asset_scope, ignore, list_names, read_isolated
+from synpick_warp.scenes.assets.cad import STEP_SUFFIXES
+from synpick_warp.scenes.assets.meshes import MeshOptions, connected_parts, merge_positions, read_mesh, solid_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh, read_models_info
-from synpick_warp.scenes.assets.step import STEP_SUFFIXES
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe
-from synpick_warp.scenes.collision.depth import is_concave
-from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
-from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
-from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.embedded.solids import solids
+from synpick_warp.scenes.collision.hulls import hull_size, is_concave, mass_properties
+from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir
+from synpick_warp.scenes.embedded.objects import procedural_objects, solids
 from synpick_warp.scenes.symmetries.objects import add_symmetries
 from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
-from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
+from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, RawObject, TriangleMesh
 from synpick_warp.system.linear_algebra import norm
-from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import Limits
 
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
 _MIN_DIAMETER = 2e-3
@@ -40,7 +37,6 @@ _MAX_ORIGIN_DISTANCE = 1.5
 _SPECK, _LENGTHENED = 0.01, 0.95
 # Part of its hull's volume above which a mesh has bodies that overlap; the rest is rounding.
 _OVERFULL = 1.001
-_MAX_LISTED = 8
 READ_LIMITS = Limits(600.0, 2**33)
 """Limits of a mesh file with its textures: 10 min and 8 GiB; the largest files that are read take a minute and 3 GiB."""
 _UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres, unless objects.unit says otherwise"
@@ -49,11 +45,7 @@ _UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metr
 _SMALL, _TYPICAL = 5e-3, 0.1
 
 
-def _ignore(line: str) -> None:
-    """Default for `report`: drops the line."""
-
-
-def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable[[str], None] = _ignore) -> Catalog:
+def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable[[str], None] = ignore) -> Catalog:
     """Load the object catalog.
 
     `bake.models` is a BOP model folder (obj_NNNNNN.ply in millimetres, models_info.json), a folder of meshes in metres, which get obj_ids
@@ -64,7 +56,6 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     Args:
         config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
         cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
-        report: Called with each line of progress.
 
     Raises:
         CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
@@ -107,7 +98,7 @@ def _load_entries(
 
 
 def read_objects(
-    models: str, objects: Objects, rows: tuple[ObjectRow, ...], bins: tuple[BinSizes, ...], report: Callable[[str], None] = _ignore
+    models: str, objects: Objects, rows: tuple[ObjectRow, ...], bins: tuple[BinSizes, ...], report: Callable[[str], None] = ignore
 ) -> list[RawObject]:
     """Read and check the objects of a folder, or if it is empty the embedded ones, without collision shapes; files and errors as of
     `load_catalog`."""
@@ -204,17 +195,14 @@ def _read_folder(folder: Path, rules: _Rules, report: Callable[[str], None], fau
         infos = read_models_info(folder / "models_info.json", [model.obj_id for model in models], without)
     calls = [(model, infos.get(model.obj_id, FileModelInfo()), rules) for model in models]
     raws, sizes = [], []
-    for model, result in zip(models, run_isolated(_read_model, calls, READ_LIMITS), strict=True):
+    smaller = "decimate its mesh and scale down its textures, or remove the file"
+    results = read_isolated(_read_model, calls, READ_LIMITS, CatalogError, smaller, "repair or simplify the file")
+    for model, result in zip(models, results, strict=True):
         if isinstance(result, _SizeError | tuple) and model.path.suffix.lower() not in STEP_SUFFIXES:
             sizes.append(result.size if isinstance(result, _SizeError) else result[0].hull.diameter)
             faults.advice = _advise_unit(sizes, _unit(rules.objects, model), rules.bins[0])
-        if isinstance(result, Failure):
-            fault = f"{model.path}: the process that reads it {result.reason}"
-            if result.by_machine:
-                raise CatalogError(f"{fault}; decimate its mesh and scale down its textures, or remove the file")
-            faults.add(CatalogError(f"{fault}; repair or simplify the file"))
-        elif isinstance(result, SynpickError):
-            faults.add(CatalogError(str(result)))
+        if isinstance(result, CatalogError):
+            faults.add(result)
         else:
             raw, lines = result
             for line in lines:
@@ -253,14 +241,15 @@ def _read_model(model: ModelFile, info: FileModelInfo, rules: _Rules) -> tuple[R
     unit, center = _unit(objects, model), objects.center and not model.is_bop
     options = MeshOptions(objects.crease_angle, center, not objects.strict, unit if center or objects.unit != AUTO_UNIT else "")
     with asset_scope(model.root) as scope:
-        found = read_mesh_file(model.path, UNITS[unit], options, lines.append)
+        found = read_mesh(model.path, UNITS[unit], options, lines.append)
     mesh = found.mesh
     hull, tolerance = hull_size(mesh.vertices), objects.diameter_tolerance
     if model.is_bop and hull.diameter > 0.0:
         info, said = _check_info(info, mesh, hull, model, objects.strict)
         lines += said
     rows = (row for row in rules.rows if (row.id == model.obj_id if model.is_bop else row.name == model.name))
-    row = next((row for row in rows if _fits(row, hull.diameter, tolerance)), None)
+    # A row without a diameter applies to any object.
+    row = next((row for row in rows if not row.diameter or abs(hull.diameter - row.diameter) < tolerance * row.diameter), None)
     raw = _raw(model, mesh, hull, found.material, row, objects)
     lines += _describe_specks(mesh, hull.diameter, str(model.path))
     _check_size(raw, str(model.path if model.is_bop else raw.name), rules.bins)
@@ -307,34 +296,18 @@ def _raw(model: ModelFile, mesh: TriangleMesh, hull: HullSize, given: FileMateri
     """Combine mesh file and row. Material properties of the file have priority over the row, the row over the section objects."""
     defaults = row or objects
     concave = row.concave if row else None
-    material = Material(
-        given.color,
-        given.texture,
-        defaults.metallic if given.metallic is None else given.metallic,
-        defaults.roughness if given.roughness is None else given.roughness,
-    )
     return RawObject(
         obj_id=model.obj_id,
         name=row.name if row and row.name else model.name,
         mesh=mesh,
         hull=hull,
-        material=material,
+        material=given.complete(defaults.metallic, defaults.roughness),
         mass=row.mass if row else None,
         concave=is_concave(mesh.vertices, mesh.faces, hull.volume, objects.concave_ratio) if concave is None else concave,
         symmetries_discrete=(),
         symmetries_continuous=(),
         source=None,
     )
-
-
-def _near(value: float, expected: float, tolerance: float) -> bool:
-    """Whether a value equals the expected one within a relative tolerance."""
-    return abs(value - expected) < tolerance * expected
-
-
-def _fits(row: ObjectRow, size: float, tolerance: float) -> bool:
-    """Whether the row applies to an object of this diameter; a row without one applies to any."""
-    return row.diameter == 0.0 or _near(size, row.diameter, tolerance)
 
 
 def _check_size(raw: RawObject, origin: str, bins: Sequence[BinSizes]) -> None:
@@ -405,8 +378,6 @@ def describe_masses(raws: Sequence[RawObject], objects: Objects, masses: Sequenc
     """Line on the masses [kg] of objects that have them by their density; empty: there are none.
 
     Args:
-        raws: Objects.
-        objects: Settings.
         masses: Their masses, if their collision shapes are known.
         guesses: Those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the density.
     """
@@ -415,10 +386,9 @@ def describe_masses(raws: Sequence[RawObject], objects: Objects, masses: Sequenc
     told = {raw.name: mass for raw, mass in pairs if raw.mass is None and not (known and bool(_solid(raw)) == guesses)}
     if not told:
         return ""
-    names = [*list(told)[:_MAX_LISTED], *([f"{len(told) - _MAX_LISTED} more"] if len(told) > _MAX_LISTED else [])]
     low, high = (f"{pick(told.values()):.3g}" for pick in (min, max))
     what = "convex hulls" if objects.mass_volume == HULL else "collision shapes, where meshes are open" if guesses and known else "meshes"
-    line = f"mass of {', '.join(names)}: {low if low == high else f'{low} to {high}'} kg, {objects.density:g} kg/m³ of their {what}"
+    line = f"mass of {list_names(told)}: {low if low == high else f'{low} to {high}'} kg, {objects.density:g} kg/m³ of their {what}"
     advice = (
         "close the meshes, or set mass in [[object_rows]]" if known else "set objects.density to the material's, or mass in [[object_rows]]"
     )
@@ -461,11 +431,9 @@ def shape_recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
 def _entry(raw: RawObject, pieces: tuple[ConvexPiece, ...], mass: float) -> CatalogEntry:
     """Build the catalog entry of an object from its collision shape and mass."""
     properties = mass_properties(pieces)
+    names = ("obj_id", "name", "mesh", "material", "symmetries_discrete", "symmetries_continuous", "source")
     return CatalogEntry(
-        obj_id=raw.obj_id,
-        name=raw.name,
-        mesh=raw.mesh,
-        material=raw.material,
+        **{name: getattr(raw, name) for name in names},
         pieces=pieces,
         volume=properties.volume,
         radius=float(np.linalg.norm(raw.mesh.vertices, axis=1).max()),
@@ -473,7 +441,4 @@ def _entry(raw: RawObject, pieces: tuple[ConvexPiece, ...], mass: float) -> Cata
         center_of_mass=properties.center_of_mass,
         inertia=mass * properties.unit_inertia,
         diameter=raw.hull.diameter,
-        symmetries_discrete=raw.symmetries_discrete,
-        symmetries_continuous=raw.symmetries_continuous,
-        source=raw.source,
     )

@@ -11,22 +11,21 @@ import itertools
 import os
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.errors import LightError, SynpickError
+from synpick_warp.errors import LightError
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.assets.asset_files import check_file_name, locate
+from synpick_warp.scenes.assets.asset_files import check_file_name, ignore, locate, read_isolated
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.linear_algebra import DECIMALS, dot
-from synpick_warp.system.processes.isolation import MAX_PIXELS, Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import MAX_PIXELS, Limits
 
 READ_LIMITS = Limits(300.0, 2**32)
 """Limits of a map: 5 min and 4 GiB; the largest takes some seconds and 1.2 GB."""
@@ -58,11 +57,7 @@ _RESOLUTION = re.compile(rb"([-+])([XY])\s+(\d{1,9})\s+([-+])([XY])\s+(\d{1,9})\
 _RGBE, _XYZE = b"32-bit_rle_rgbe", b"32-bit_rle_xyze"
 
 
-def _ignore(line: str) -> None:
-    """Default for `report`: drops the line."""
-
-
-def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bool = False) -> tuple[EnvironmentMap, ...]:
+def load_lights(folder: str, report: Callable[[str], None] = ignore, strict: bool = False) -> tuple[EnvironmentMap, ...]:
     """Load all environment maps of a folder and its direct subfolders, sorted by name.
 
     A folder with an .ibl file is an sIBL set (hdrlabs.com/sibl), of which the reflection map and the sun are used. In other folders
@@ -71,7 +66,6 @@ def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bo
 
     Args:
         folder: The folder; empty: the embedded maps.
-        report: Called with each line on what is left out or missing.
         strict: Whether the first map that cannot be used is an error.
 
     Raises:
@@ -92,7 +86,17 @@ def load_lights(folder: str, report: Callable[[str], None] = _ignore, strict: bo
         raise LightError(f"lights folder {folder} cannot be read: {error.strerror}; check its permissions") from error
     if not files:
         raise LightError(f"lights folder {folder} contains no environment map; add .hdr files or sIBL sets (.ibl with its maps)")
-    maps, faults = _load_all(files, report, strict)
+    maps, faults = [], []
+    calls, smaller = [(path, strict, MAX_HEIGHT) for path in files], "scale the map down, or remove it"
+    for result in read_isolated(_load_map, calls, READ_LIMITS, LightError, smaller, "replace it"):
+        if isinstance(result, LightError):
+            faults.append(result)
+            if strict:
+                raise result
+            continue
+        maps.append(result[0])
+        for line in result[1]:
+            report(line)
     if not maps:
         if len(faults) == 1:
             raise faults[0]
@@ -110,26 +114,6 @@ def _list_maps(folder: Path) -> list[Path]:
     """The maps directly in a folder: its sIBL sets, or if there are none its image files."""
     files = sorted(path for path in folder.iterdir() if not path.is_dir() and path.suffix.lower() in _SUFFIXES)
     return [path for path in files if path.suffix.lower() == ".ibl"] or files
-
-
-def _load_all(files: list[Path], report: Callable[[str], None], strict: bool) -> tuple[list[EnvironmentMap], list[LightError]]:
-    """Load maps in isolated processes; returns them, and the errors of the others."""
-    maps, faults = [], []
-    results = run_isolated(_load_map, [(path, strict, MAX_HEIGHT) for path in files], READ_LIMITS)
-    for path, result in zip(files, results, strict=True):
-        if isinstance(result, Failure) and result.by_machine:
-            raise LightError(f"{path}: the process that reads it {result.reason}; scale the map down, or remove it")
-        if isinstance(result, Failure | SynpickError):
-            reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
-            faults.append(LightError(reason))
-            if strict:
-                raise faults[-1]
-        else:
-            light, lines = result
-            maps.append(light)
-            for line in lines:
-                report(line)
-    return maps, faults
 
 
 def _load_map(path: Path, strict: bool, max_height: int) -> tuple[EnvironmentMap, list[str]]:
@@ -275,12 +259,12 @@ def _decode(path: Path) -> np.ndarray | None:
     data = read_file(path, MAX_MAP_FILE, LightError)
     if data.startswith(_EXR) or path.suffix.lower() == ".exr":
         raise LightError(f"{path}: OpenEXR maps are not read; save it as Radiance (.hdr)")
-    header = None
+    orient: Callable[[np.ndarray], np.ndarray] = np.asarray
     if data[:2] == b"#?":
-        found = canonical_radiance(data, path)
+        found = _canonical_radiance(data, path)
         if found is None:
             return None
-        data, header = found
+        data, orient = found
     logging = cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
@@ -293,7 +277,7 @@ def _decode(path: Path) -> np.ndarray | None:
         return None
     finally:
         logging.setLogLevel(level)
-    return image if image is None or header is None else orient_radiance(image, header)
+    return None if image is None else orient(image)
 
 
 def _validate(image: np.ndarray, path: Path, max_height: int) -> np.ndarray:
@@ -330,32 +314,11 @@ def _check_rows(image: np.ndarray, path: Path) -> None:
         )
 
 
-@dataclass(frozen=True)
-class RadianceHeader:
-    """Size, orientation and exposure of the pixels of a Radiance file, as its header states."""
-
-    width: int
-    """[px]"""
-    height: int
-    transposed: bool
-    """Scanlines are columns."""
-    flip_rows: bool
-    """The first row is the lowest."""
-    flip_columns: bool
-    """The first column is the rightmost."""
-    exposure: float
-    """Factor by which radiances were multiplied."""
-
-
-def canonical_radiance(data: bytes, path: Path) -> tuple[bytes, RadianceHeader] | None:
+def _canonical_radiance(data: bytes, path: Path) -> tuple[bytes, Callable[[np.ndarray], np.ndarray]] | None:
     """Rewrite the header of a Radiance file: magic, FORMAT, scanlines from the top, from left to right.
 
-    Args:
-        data: The file.
-        path: Its path, for errors.
-
     Returns:
-        The file with another header, whose image `orient_radiance` turns; and what the header said. None: it has no such header.
+        The file with another header, and what turns its image as the header said, and divides by its exposure. None: it has no such header.
 
     Raises:
         LightError: The colours are not RGB.
@@ -378,12 +341,15 @@ def canonical_radiance(data: bytes, path: Path) -> tuple[bytes, RadianceHeader] 
         raise LightError(f"{path} has XYZ colours (32-bit_rle_xyze), which are not read; convert it to RGB")
     if kinds and kinds[-1] != _RGBE:
         return None
-    transposed = first == b"X"
-    signs = {first: first_sign, second: second_sign}
-    count, length = int(first_size), int(second_size)
-    width, height = (count, length) if transposed else (length, count)
-    head = b"#?RADIANCE\nFORMAT=%s\n\n-Y %d +X %d\n" % (_RGBE, count, length)
-    return head + data[at:], RadianceHeader(width, height, transposed, signs[b"Y"] == b"+", signs[b"X"] == b"-", _exposure(lines))
+    signs, exposure = {first: first_sign, second: second_sign}, _exposure(lines)
+
+    def orient(image: np.ndarray) -> np.ndarray:
+        """Turn the image to rows from the top and columns from the left, and divide by the exposure."""
+        image = image.swapaxes(0, 1) if first == b"X" else image
+        image = image[:: -1 if signs[b"Y"] == b"+" else 1, :: -1 if signs[b"X"] == b"-" else 1]
+        return image if exposure == 1.0 else image / np.float32(exposure)
+
+    return b"#?RADIANCE\nFORMAT=%s\n\n-Y %d +X %d\n" % (_RGBE, int(first_size), int(second_size)) + data[at:], orient
 
 
 def _exposure(lines: list[bytes]) -> float:
@@ -398,14 +364,3 @@ def _exposure(lines: list[bytes]) -> float:
             if 0.0 < value < float("inf"):
                 exposure *= value
     return exposure if 0.0 < exposure < float("inf") else 1.0
-
-
-def orient_radiance(image: np.ndarray, header: RadianceHeader) -> np.ndarray:
-    """Turn the image of a rewritten file to rows from the top and columns from the left, and divide by the exposure."""
-    if header.transposed:
-        image = image.swapaxes(0, 1)
-    if header.flip_rows:
-        image = image[::-1]
-    if header.flip_columns:
-        image = image[:, ::-1]
-    return image if header.exposure == 1.0 else image / np.float32(header.exposure)

@@ -12,12 +12,12 @@ import numpy as np
 from synpick_warp.codes import LookPart
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.errors import CatalogError, SynpickError
+from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
-from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.asset_files import check_file_name, read_isolated
 from synpick_warp.scenes.embedded.surfaces import surface_textures
 from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+from synpick_warp.system.processes.isolation import Limits
 
 LIMITS = Limits(60.0, 2**31)
 """Limits of the process that decodes a texture: 1 min and 2 GiB."""
@@ -70,8 +70,6 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
 
     Args:
         key: The setting that names the folder.
-        folder: The folder.
-        report: Called with each line on what is left out.
         strict: Whether the first image that cannot be used is an error.
 
     Raises:
@@ -87,16 +85,11 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
     if not 0 < len(files) <= MAX_TEXTURES:
         raise CatalogError(f"{key}: the folder {folder} has {len(files)} images ({', '.join(SUFFIXES)}); allowed: 1 to {MAX_TEXTURES}")
     textures, faults = [], []
-    for path, result in zip(files, run_isolated(_read, [(path,) for path in files], LIMITS), strict=True):
-        if isinstance(result, Failure) and result.by_machine:
-            raise CatalogError(f"{path}: the process that reads it {result.reason}; scale the image down, or remove it")
-        if isinstance(result, Failure | SynpickError):
-            reason = f"{path}: the process that reads it {result.reason}; replace it" if isinstance(result, Failure) else str(result)
-            faults.append(CatalogError(reason))
-            if strict:
-                raise faults[-1]
-        else:
-            textures.append(result)
+    smaller = "scale the image down, or remove it"
+    for result in read_isolated(_read, [(path,) for path in files], LIMITS, CatalogError, smaller, "replace it"):
+        (faults if isinstance(result, CatalogError) else textures).append(result)
+        if faults and strict:
+            raise faults[0]
     if not textures:
         raise CatalogError(f"{key}: none of the {len(files)} images of {folder} can be used; the first: {faults[0]}")
     for fault in faults:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.scenes.assets.polygons import clip_ears
+from synpick_warp.scenes.assets.mesh_parts import clip_ears
 from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul
 
@@ -217,7 +217,6 @@ def make_mesh(patch: Patch, *, centered: bool) -> TriangleMesh:
     """Merge vertices, drop degenerate triangles, and compute vertex normals that stay hard at edges above `CREASE`.
 
     Args:
-        patch: The whole surface.
         centered: Translate the centre of the bounding box to the origin.
     """
     corners = patch.corners.reshape(-1, 3)

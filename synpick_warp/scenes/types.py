@@ -16,9 +16,7 @@ from synpick_warp.system.linear_algebra import dot
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangle mesh with outward orientation: vertices [m], vertex indices of the faces, and per vertex unit normals and texture
-    coordinates (v up).
-    """
+    """Triangle mesh with outward orientation."""
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
@@ -55,8 +53,7 @@ class HullSize(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RawObject:
-    """Mesh, material and symmetries of an object as read from a file or made procedurally, before collision shape and mass properties are
-    computed."""
+    """Object as read from a file or made procedurally, before collision shape and mass properties are computed."""
 
     obj_id: int
     """BOP's obj_id: class of the object."""
@@ -92,16 +89,13 @@ Shape = tuple[ConvexPiece, ...]
 
 @dataclass(frozen=True, eq=False)
 class CatalogEntry:
-    """Catalog object: visual mesh, material, convex collision pieces and their volume, mass properties, bounding radius about the object's
-    origin, diameter, symmetries.
-    """
+    """Object of a catalog: that of `RawObject`, whose fields it shares, with collision shape and mass properties."""
 
     obj_id: int
     name: str
     mesh: TriangleMesh
     material: Material
-    pieces: tuple[ConvexPiece, ...]
-    """Collision shape: one hull, or the pieces of a convex decomposition."""
+    pieces: Shape
     volume: float
     """Volume of the collision shape [m³]; counts against arrangement.volume."""
     radius: float
@@ -115,11 +109,8 @@ class CatalogEntry:
     diameter: float
     """Largest distance between two vertices [m]."""
     symmetries_discrete: tuple[tuple[float, ...], ...]
-    """Rigid transforms under which the object looks the same: row-major 4 x 4 matrices as in BOP, but in metres."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    """(unit axis, point on it [m])."""
     source: Path | None
-    """The PLY file of a BOP model folder; None: embedded, or from another format."""
     suctionable: tuple[float, float] | None = field(default=None, hash=False)
     """Area on which a suction cup seals [m²], and its fraction of the surface; None: not measured."""
 

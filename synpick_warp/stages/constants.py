@@ -20,9 +20,8 @@ from synpick_warp.kernels import structs
 from synpick_warp.kernels.distributions import LookTable
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bin_meshes.inside import HeightField
-from synpick_warp.scenes.fills import count_entries
-from synpick_warp.scenes.grippers.head import Head
-from synpick_warp.scenes.grippers.mechanism import CUP_ARMATURE
+from synpick_warp.scenes.capacities import count_entries
+from synpick_warp.scenes.grippers import CUP_ARMATURE, Head
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, CatalogEntry
 from synpick_warp.stages.render.looks import build_look_table

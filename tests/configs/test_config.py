@@ -20,8 +20,7 @@ from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.grippers.mechanism import finger_collider
-from synpick_warp.scenes.grippers.suction1 import cup_collider
+from synpick_warp.scenes.grippers import cup_collider, finger_collider
 from tests.builders import refusal
 
 RELATED = {

@@ -19,10 +19,10 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import shape_recipe
 from synpick_warp.scenes.collision.hulls import mass_properties
 from synpick_warp.scenes.collision.simplification import simplify_hull
-from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.parts import PIECES
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.symmetries.detection import find_symmetries
-from synpick_warp.scenes.symmetries.groups import close_group
+from synpick_warp.scenes.symmetries.detection import close_group, find_symmetries
 from synpick_warp.stages.render.light_tables import precompute_environment
 from synpick_warp.system.hardware.device import start_warp
 from synpick_warp.system.linear_algebra import rotation

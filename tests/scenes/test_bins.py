@@ -17,10 +17,9 @@ from synpick_warp.configs.schema import Tote
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.bins import guide_walls, make_bins
+from synpick_warp.scenes.bins import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide_walls, make_bins, rim_height, tote_colliders, tote_fixture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
-from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, rim_height, tote_colliders, tote_fixture
 from tests.harness.pieces import assert_closed, felt, filled, is_convex
 from tests.twins.raycast import edges_match, first_hit
 

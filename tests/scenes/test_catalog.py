@@ -21,8 +21,7 @@ from synpick_warp.scenes import catalog as catalogs
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.collision import hulls
-from synpick_warp.scenes.collision.depth import is_concave, relative_depth
-from synpick_warp.scenes.collision.hulls import hull_size
+from synpick_warp.scenes.collision.hulls import hull_size, is_concave, relative_depth
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
 from tests.builders import refusal
@@ -442,7 +441,7 @@ def test_concave_real_objects_are_those_of_the_table_and_some_that_it_takes_for_
     """The table of the paper has hulls for a banana, scissors, a marker with a clip and two clamps."""
     found = set()
     for obj_id, litres in REAL_HULLS.items():
-        mesh, _ = read_mesh(real_models / f"obj_{obj_id:06d}.ply", 1e-3)
+        mesh, *_ = read_mesh(real_models / f"obj_{obj_id:06d}.ply", 1e-3)
         if is_concave(mesh.vertices, mesh.faces, litres * 1e-3, Objects.concave_ratio):
             found.add(obj_id)
     assert found == REAL_CONCAVE | {10, 17, 18, 19, 20}

@@ -26,9 +26,8 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import smooth_normals
 from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.collision import simplification
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_planes, hull_volume, mass_properties
-from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
+from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, decompose, default_cache_dir
 from synpick_warp.scenes.collision.simplification import MIN_VERTICES, simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 from synpick_warp.system.processes.isolation import Failure
@@ -159,7 +158,7 @@ GUARDLESS = """
 import sys
 from pathlib import Path
 import numpy as np, trimesh
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe
+from synpick_warp.scenes.collision.shapes import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
 from synpick_warp.scenes.types import TriangleMesh
 

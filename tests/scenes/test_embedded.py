@@ -16,11 +16,11 @@ from synpick_warp.scenes import modelling
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.catalog import read_objects, shape_recipe
 from synpick_warp.scenes.collision import shapes
-from synpick_warp.scenes.collision.decomposition import decompose
-from synpick_warp.scenes.collision.shapes import shipped_shape
+from synpick_warp.scenes.collision.shapes import decompose, shipped_shape
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.embedded import objects
-from synpick_warp.scenes.embedded.objects import PIECES, procedural_objects
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.parts import PIECES
 from synpick_warp.scenes.embedded.surfaces import KINDS, SIDE, surface_textures
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
 from synpick_warp.scenes.symmetries.detection import find_symmetries

@@ -19,8 +19,8 @@ from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build, capacities
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
 from synpick_warp.scenes.bins import make_bins
+from synpick_warp.scenes.capacities import check_fill, count_entries, drop_height
 from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.fills import check_fill, count_entries, drop_height
 from synpick_warp.scenes.types import Catalog, ConvexPiece
 from tests.builders import refusal
 from tests.worlds.bin_meshes import round_bin, sloped_bin

@@ -13,9 +13,7 @@ import trimesh
 
 from synpick_warp.errors import CatalogError, LightError, SynpickError
 from synpick_warp.exporters.bop.shared.models import write_models
-from synpick_warp.scenes import catalog as catalog_reader
-from synpick_warp.scenes import lights as lights_reader
-from synpick_warp.scenes import looks as looks_reader
+from synpick_warp.scenes.assets import asset_files
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.system.processes import isolation
 from synpick_warp.system.processes.isolation import Failure
@@ -64,26 +62,24 @@ LIGHT = cv2.imencode(".hdr", np.full((8, 16, 3), 0.5, np.float32))[1].tobytes()
 
 @pytest.mark.parametrize("reason", ["took longer than 600 s of processor time and was stopped", "was killed, probably for lack of memory"])
 @pytest.mark.parametrize(
-    ("reader", "option", "suffix", "content", "remedy"),
+    ("option", "suffix", "content", "remedy"),
     [
-        (catalog_reader, "bake.models", "ply", box(0.1, 0.1, 0.1), "decimate its mesh and scale down its textures, or remove the file"),
-        (lights_reader, "bake.lights", "hdr", LIGHT, "scale the map down, or remove it"),
-        (looks_reader, "randomize.table_textures", "png", picture(), "scale the image down, or remove it"),
+        ("bake.models", "ply", box(0.1, 0.1, 0.1), "decimate its mesh and scale down its textures, or remove the file"),
+        ("bake.lights", "hdr", LIGHT, "scale the map down, or remove it"),
+        ("randomize.table_textures", "png", picture(), "scale the image down, or remove it"),
     ],
 )
-def test_a_file_for_which_the_machine_does_not_suffice_is_not_left_out(
-    tmp_path, monkeypatch, reader, option, suffix, content, remedy, reason
-):
+def test_a_file_for_which_the_machine_does_not_suffice_is_not_left_out(tmp_path, monkeypatch, option, suffix, content, remedy, reason):
     """Elsewhere the same command would make another data set. What is damaged stays left out."""
     for name, data in (("damaged", b"none"), ("good", content), ("slow", content)):
         put(tmp_path / "given" / f"{name}.{suffix}", data)
-    real = reader.run_isolated
+    real = asset_files.run_isolated
 
     def too_slow(function, calls, limits):
         for call, result in zip(calls, real(function, calls, limits), strict=True):
             yield Failure(reason, by_machine=True) if f"slow.{suffix}" in str(call) else result
 
-    monkeypatch.setattr(reader, "run_isolated", too_slow)
+    monkeypatch.setattr(asset_files, "run_isolated", too_slow)
     folder = tmp_path / "given"
     said = mistake("bake", "--config", "smoke", "--device", "cpu", "--out", tmp_path / "set", "--set", f"{option}={folder}")
     assert said == f"{folder / f'slow.{suffix}'}: the process that reads it {reason}; {remedy}"

@@ -16,9 +16,7 @@ from synpick_warp.configs.schema import Gripper
 from synpick_warp.dataset.commit.manifest import describe_differences, make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
-from synpick_warp.scenes.grippers.registry import HEADS, check_reach, make_head
-from synpick_warp.scenes.grippers.tool_mesh import measure_tool
+from synpick_warp.scenes.grippers import HEADS, check_reach, finger_collider, finger_fixture, make_head, measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.harness.pieces import assert_closed, felt, is_convex
 from tests.twins.raycast import first_hit

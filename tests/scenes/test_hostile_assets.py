@@ -70,7 +70,7 @@ def read(name: str, content: bytes, more: dict[str, bytes], check: Callable[[Pat
 
 
 def check_mesh(path: Path) -> None:
-    mesh, material = read_mesh(path, 1.0)
+    mesh, material, _ = read_mesh(path, 1.0)
     assert np.isfinite(mesh.vertices).all()
     assert np.isfinite(mesh.uv).all()
     assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-3)

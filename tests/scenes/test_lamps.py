@@ -9,10 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.lamps import LAMP_RADIUS, MIN_LAMP_SHARE, extract_lamps, sample_disc, stratify_light
+from synpick_warp.scenes.environment import (
+    BACKGROUND_ROWS,
+    LAMP_RADIUS,
+    LUMINANCE,
+    MAX_SUN_TANGENT,
+    MIN_LAMP_SHARE,
+    SOLAR_TANGENT,
+    WHITE_VALUE,
+    draw_sun_disc,
+    extract_lamps,
+    extract_sun,
+    map_directions,
+    replace_sun,
+    resize_map,
+    sample_disc,
+    stratify_light,
+)
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT, SOLAR_TANGENT, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.stages.render.light_tables import precompute_environment, sh_basis
 from tests.worlds.shapes import UPRIGHT, camera, entry, sheet

@@ -361,7 +361,7 @@ def test_normals_do_not_depend_on_seams(seed):
 def test_the_real_objects_agree_with_their_table(real_models):
     extents = json.loads((real_models / "models_info.json").read_text())
     for obj_id, entry in extents.items():
-        mesh, finish = read_mesh(real_models / f"obj_{int(obj_id):06d}.ply", 1e-3)
+        mesh, finish, _ = read_mesh(real_models / f"obj_{int(obj_id):06d}.ply", 1e-3)
         assert finish.texture is not None
         assert len(mesh.faces) == 16384
         assert np.allclose(mesh.vertices.min(axis=0) * 1e3, [entry[f"min_{a}"] for a in "xyz"], atol=1e-2)

@@ -37,7 +37,7 @@ def write(folder, mesh: trimesh.Trimesh, kind: str, *, split: bool = False):
 @pytest.mark.parametrize("split", [False, True])
 def test_a_box_shows_three_normals_in_the_layer(tmp_path, device, kind, split):
     box = trimesh.creation.box((0.1, 0.08, 0.06))
-    mesh, _ = read_mesh(write(tmp_path, box, kind, split=split), 1.0)
+    mesh, *_ = read_mesh(write(tmp_path, box, kind, split=split), 1.0)
     pose = (0.0, 0.0, 0.2, -0.28, 0.12, 0.35, 0.88)
     view = camera(160, 90, 500.0, (0.0, 0.0, 1.0))
     rendered = render_layers(ToyScene([entry(mesh)], [[(0, pose)]], (view,)), device, names=("normals",))
@@ -49,7 +49,7 @@ def test_a_box_shows_three_normals_in_the_layer(tmp_path, device, kind, split):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_ball_stays_smooth(tmp_path, kind):
     ball = trimesh.creation.icosphere(3, 0.1)
-    mesh, _ = read_mesh(write(tmp_path, ball, kind), 1.0)
+    mesh, *_ = read_mesh(write(tmp_path, ball, kind), 1.0)
     assert len(mesh.vertices) == len(ball.vertices)
     assert np.abs(mesh.normals - mesh.vertices / 0.1).max() < 0.03
 
@@ -118,7 +118,7 @@ def test_split_vertices_leave_mass_collision_and_models_as_they_are(tmp_path):
     assert trimesh.Trimesh(places, faces, process=False).is_watertight
     catalog = load_models(file.parent, tmp_path)[0]
     write_models(tmp_path / "out", catalog)
-    again, _ = read_mesh(tmp_path / "out" / "obj_000001.ply", 1e-3)
+    again, *_ = read_mesh(tmp_path / "out" / "obj_000001.ply", 1e-3)
     assert np.array_equal(again.normals, other.mesh.normals)
     exported = trimesh.load_mesh(tmp_path / "out" / "obj_000001.ply")
     exported.merge_vertices(merge_norm=True)

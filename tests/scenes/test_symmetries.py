@@ -21,8 +21,7 @@ from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.symmetries.detection import find_symmetries
-from synpick_warp.scenes.symmetries.groups import close_group, find_element
+from synpick_warp.scenes.symmetries.detection import close_group, find_element, find_symmetries
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from tests.builders import refusal
 from tests.worlds.model_files import exported, load_models, put
@@ -126,7 +125,7 @@ QUICK = (2, 13, 17, 19, 20)
 
 @pytest.mark.parametrize("obj_id", [row if row in QUICK else pytest.param(row, marks=pytest.mark.slow) for row in REAL])
 def test_the_groups_of_scanned_objects(real_models, obj_id):
-    mesh, _ = read_mesh(real_models / f"obj_{obj_id:06d}.ply", 1e-3)
+    mesh, *_ = read_mesh(real_models / f"obj_{obj_id:06d}.ply", 1e-3)
     found = find_symmetries(mesh.vertices, mesh.faces, size := hull_size(mesh.vertices).diameter, 0.03 * size)
     assert (len(found.discrete), len(found.continuous)) == REAL[obj_id]
     assert max([*found.deviations, *(turn.deviation for turn in found.continuous)], default=0.0) <= 0.03 * size

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.mesh_parts import clip_ears, find_concave
 from synpick_warp.scenes.assets.meshes import MeshOptions, read_mesh, signed_volume
-from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
 from tests.worlds.model_files import picture, put, read_told, texels
 
 RED = "newmtl skin\nKd 1 0 0\n"
@@ -212,12 +212,12 @@ def test_textures_that_repeat_beside_others(tmp_path, low, high):
 
 def test_the_atlas_is_scaled_down_where_textures_are_too_many(tmp_path, monkeypatch):
     monkeypatch.setattr("synpick_warp.scenes.assets.appearance.MAX_TEXTURE_PIXELS", 2**12)
-    for name in ("one.png", "two.png"):
-        picture(tmp_path / name, size=(64, 60))
+    for name, size in (("one.png", (64, 20)), ("two.png", (8, 200))):
+        picture(tmp_path / name, size=size)
     obj = HEAD + "usemtl one\n" + "".join(FACES[:2]) + "usemtl two\n" + "".join(FACES[2:])
     _, finish, said = read(tmp_path, "newmtl one\nmap_Kd one.png\nnewmtl two\nmap_Kd two.png\n", obj)
     assert said == "its textures together are too large: scaled by 1/2"
-    assert finish.texture.shape == (60, 32, 3)
+    assert finish.texture.shape == (110, 32, 3)
 
 
 # ---- concave polygons ----
@@ -269,7 +269,7 @@ def test_concave_polygons_cover_their_outline_alone(tmp_path, outline, name):
     flat = abs(float((points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum())) / 2
     sides = float(np.linalg.norm(following - points, axis=1).sum())
     for start in range(len(points)):
-        mesh, _ = read_mesh(write(tmp_path / name, *prism(OUTLINES[outline], start)), 1.0)
+        mesh, *_ = read_mesh(write(tmp_path / name, *prism(OUTLINES[outline], start)), 1.0)
         area = np.linalg.norm(normals_of(mesh.vertices, mesh.faces), axis=1).sum() / 2.0
         assert area == pytest.approx(2 * flat + sides, rel=1e-6)
         assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(flat, rel=1e-6)
@@ -292,6 +292,6 @@ def test_too_many_corners_are_told_and_convex_polygons_are_not_concave(monkeypat
     corners, lengths, ignored = np.arange(8), np.array([4, 4]), []
     assert find_concave(np.concatenate([square, dart]), corners, lengths, ignored).tolist() == [1]
     assert not ignored
-    monkeypatch.setattr("synpick_warp.scenes.assets.polygons._MAX_WORK", 15)
+    monkeypatch.setattr("synpick_warp.scenes.assets.mesh_parts._MAX_WORK", 15)
     assert not len(find_concave(np.concatenate([square, dart]), corners, lengths, ignored))
     assert ignored == ["concavity of polygons with many corners"]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Lost, Phase, Stream
 from synpick_warp.kernels.sim import rest
-from synpick_warp.scenes.tote import FLOOR_DEPTH
+from synpick_warp.scenes.bins import FLOOR_DEPTH
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
 from tests.worlds.kernel_worlds import SHAPES, KernelWorlds

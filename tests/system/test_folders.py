@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.cli.main import main
-from synpick_warp.scenes.collision.shapes import _save
+from synpick_warp.scenes.collision.shapes import _Saver
 from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.system.hardware.caches import link_files
 from synpick_warp.system.inputs.paths import make_folder
@@ -76,8 +76,9 @@ def test_outputs_lie_at_any_depth(data, here, command, output):
 def test_caches_and_textures_lie_at_any_depth(here):
     deep = Path("/".join(["d"] * DEPTH))
     lines: list[str] = []
-    assert _save(deep / "shape.npz", (ConvexPiece(np.eye(4, 3, dtype=np.float32), FACES),), lines.append)
+    _Saver(lines.append)(deep / "shape.npz", (ConvexPiece(np.eye(4, 3, dtype=np.float32), FACES),))
     assert not lines
+    assert (deep / "shape.npz").is_file()
     source = here / "source"
     source.mkdir()
     link_files(source, deep / "kernels")

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from synpick_warp.configs.cell.bins import Tote
-from synpick_warp.scenes.tote import tote_fixture
+from synpick_warp.scenes.bins import tote_fixture
 
 Mesh = trimesh.Trimesh
 

@@ -122,7 +122,7 @@ def put(path: Path, content: str | bytes) -> Path:
 
 def read(path: Path, content: str | bytes, options: MeshOptions | None = None, scale: float = 1.0) -> tuple[Any, Any]:
     """Write a model file, and read it: mesh and finish."""
-    return read_mesh(put(path, content), scale, options or MeshOptions())
+    return read_mesh(put(path, content), scale, options or MeshOptions())[:2]
 
 
 def read_told(path: Path, content: str | bytes | None = None, options: MeshOptions | None = None) -> tuple[Any, Any, list[str]]:
@@ -130,7 +130,7 @@ def read_told(path: Path, content: str | bytes | None = None, options: MeshOptio
     if content is not None:
         put(path, content)
     lines: list[str] = []
-    mesh, finish = read_mesh(path, 1.0, options or MeshOptions(), lines.append)
+    mesh, finish, _ = read_mesh(path, 1.0, options or MeshOptions(), lines.append)
     return mesh, finish, [line.removeprefix(f"{path}: ") for line in lines]
 
 

@@ -25,12 +25,12 @@ from synpick_warp.apps.evaluation.results import TargetList, TargetRow, count_ta
 from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.dataset.bop.models import find_models
 from synpick_warp.dataset.reading import DataSet
-from synpick_warp.errors import CatalogError, ConfigError, DatasetError, SynpickError
+from synpick_warp.errors import CatalogError, ConfigError, DatasetError
+from synpick_warp.scenes.assets.asset_files import read_isolated
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.catalog import READ_LIMITS
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.processes.isolation import Failure, run_isolated
 from synpick_warp.system.progress import Report, ignore_progress
 
 SPACING = 0.003
@@ -67,17 +67,12 @@ def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectMo
     """Read the models of objects of a data set, ordered by obj_id; raises DatasetError if it has no models, or an object has none, and
     CatalogError if a model or its texture is missing or damaged."""
     found = find_models(folder, object_ids, "poses are estimated")
-    results = run_isolated(read_mesh, [(path, _MILLIMETRE) for path, _ in found.values()], READ_LIMITS)
+    calls, advice = [(path, _MILLIMETRE) for path, _ in found.values()], "repair or simplify the file"
     models = []
-    for (object_id, (path, _)), result in zip(found.items(), results, strict=True):
-        if isinstance(result, Failure):
-            raise CatalogError(f"{path}: the process that reads it {result.reason}; repair or simplify the file")
-        if isinstance(result, SynpickError):
+    for object_id, result in zip(found, read_isolated(read_mesh, calls, READ_LIMITS, CatalogError, advice, advice), strict=True):
+        if isinstance(result, CatalogError):
             raise result
-        mesh, given = result
-        metallic = _METALLIC if given.metallic is None else given.metallic
-        roughness = _ROUGHNESS if given.roughness is None else given.roughness
-        models.append(ObjectModel(object_id, mesh, Material(given.color, given.texture, metallic, roughness)))
+        models.append(ObjectModel(object_id, result.mesh, result.material.complete(_METALLIC, _ROUGHNESS)))
     return models
 
 

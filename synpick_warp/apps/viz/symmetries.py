@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import Image, blank, put_text, stacked, with_text, write_picture
-from synpick_warp.scenes.symmetries.detection import Turn, find_axes, turn_matrix
-from synpick_warp.scenes.symmetries.groups import describe_counts
+from synpick_warp.scenes.symmetries.detection import Turn, describe_counts, find_axes, turn_matrix
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.scenes.types import RawObject
 

@@ -29,12 +29,9 @@ from synpick_warp.exporters.usd.parts import (
     write_texture,
 )
 from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, bin_asset, drawn_texture, object_asset
-from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.grippers.head import rod_inertia
-from synpick_warp.scenes.grippers.mechanism import finger_collider, finger_fixture
-from synpick_warp.scenes.grippers.registry import make_head
+from synpick_warp.scenes.bins import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE, make_bins
+from synpick_warp.scenes.grippers import finger_collider, finger_fixture, make_head, rod_inertia
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.tote import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, Fixture, Material, TriangleMesh
 
 

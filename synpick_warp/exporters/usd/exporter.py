@@ -14,8 +14,7 @@ from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, UsdSettings, bin_asset, object_asset
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
-from synpick_warp.scenes.bins import make_bins
-from synpick_warp.scenes.tote import TABLE_ROUGHNESS
+from synpick_warp.scenes.bins import TABLE_ROUGHNESS, make_bins
 from synpick_warp.scenes.types import Material
 from synpick_warp.views.frames import EpisodeEnd, TickBatch
 

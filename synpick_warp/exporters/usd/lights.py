@@ -10,8 +10,17 @@ import OpenEXR
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.types import StageLight
-from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun, sun_fraction
+from synpick_warp.scenes.environment import (
+    BACKGROUND_ROWS,
+    LUMINANCE,
+    MAX_SUN_TANGENT,
+    WHITE_VALUE,
+    draw_sun_disc,
+    map_directions,
+    replace_sun,
+    resize_map,
+    sun_fraction,
+)
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.system.linear_algebra import dot
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
+from synpick_warp.scenes.types import Material
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -43,6 +45,25 @@ class FileMaterial:
     """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1)."""
     metallic: float | None
     roughness: float | None
+
+    def complete(self, metallic: float, roughness: float) -> Material:
+        """Material with these values where the file states none."""
+        given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
+        return Material(self.color, self.texture, *given)
+
+
+# Default base colour (sRGB): a light grey, since highlights do not show on pure white.
+GREY = (0.7, 0.7, 0.7)
+WHITE = (1.0, 1.0, 1.0)
+NO_MATERIAL = FileMaterial(GREY, None, None, None)
+"""Material of a part whose file has none: light grey, the rest by the settings."""
+_ROUNDING = 1e-6
+
+
+def plain_color(color: tuple[float, float, float] | None) -> tuple[float, float, float]:
+    """Colour of a material whose image is not there: its own, unless it has none, or white or black, which exporters write beside an
+    image; then light grey."""
+    return GREY if color is None or all(value < _ROUNDING for value in color) or all(value > 1.0 - _ROUNDING for value in color) else color
 
 
 def srgb_to_linear(value: Any) -> np.ndarray:
@@ -81,8 +102,6 @@ def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray
     """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded.
 
     Args:
-        data: The image file.
-        source: Where it comes from, for errors.
         linear: Whether the image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are.
 
     Raises:
@@ -105,6 +124,22 @@ def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray
         except Exception as error:  # Pillow's decoders raise nearly anything on damaged files
             raise CatalogError(f"{source}: not readable as an image ({describe_error(error)}); use PNG or JPEG") from None
     raise CatalogError(f"{source}: too large an image, {size} pixels; {limit}")
+
+
+@dataclass(eq=False)
+class ImageCache:
+    """Images of one model by any key, each decoded once; limits the number of pixels of all together."""
+
+    owner: Path
+    images: dict[Any, np.ndarray] = field(default_factory=dict)
+
+    def decode(self, key: Any, data: bytes, source: str, linear: bool = False) -> np.ndarray:
+        """Decode an image as `decode_texture` does; raises CatalogError also if all together have too many pixels."""
+        if key not in self.images:
+            self.images[key] = decode_texture(data, source, linear)
+            if sum(image.size // 3 for image in self.images.values()) > MAX_TEXTURE_PIXELS:
+                raise CatalogError(f"{self.owner}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
+        return self.images[key]
 
 
 def bake_vertex_colors(
@@ -207,7 +242,6 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
 
     Args:
         parts: Texture coordinates (V, 2) in 0..1, or None, and the material, of each part.
-        owner: The mesh file, for errors.
         said: Warnings are added to it.
 
     Returns:
@@ -268,8 +302,6 @@ def decode_exr(data: bytes, source: str, most: int) -> np.ndarray:
     """Decode the colour or grey channels of an OpenEXR image as (H, W, 3) float32, linear; the first layer that has them.
 
     Args:
-        data: The file.
-        source: Where it comes from, for errors.
         most: Maximum number of pixels, which is checked by the header.
 
     Raises:

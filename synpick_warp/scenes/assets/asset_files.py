@@ -10,17 +10,19 @@ import logging
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
 from synpick_warp.errors import CatalogError, SynpickError
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.paths import MAX_NAME, path_inside
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 MAX_MESH_FILE = 2**28
 """Largest binary mesh file [bytes]: 256 MiB, some 2 million triangles with their textures."""
@@ -30,9 +32,10 @@ MAX_ROWS = 2**21
 """Maximum number of vertices, and of triangles, of one model: 2 million; finer scans show no more at any resolution here."""
 MAX_PARTS = 2**12
 """Maximum number of parts, materials, nodes or buffers of one model: 4096."""
-MAX_SHOWN = 200
-"""Length to which a library's message is cut."""
+MAX_SHOWN, MAX_LISTED = 200, 8
+"""Length to which a library's message is cut, and number of names or notes that a line lists."""
 
+_Image = TypeVar("_Image")
 # Texture folders of common exporters, relative to the folder of the mesh or of the object.
 _TEXTURE_FOLDERS = ((), ("textures",), ("texture",), ("materials", "textures"), ("materials",), ("maps",), ("images",), ("tex",))
 
@@ -52,6 +55,71 @@ class MissingFileError(CatalogError):
     def __init__(self, message: str, name: str = "") -> None:
         super().__init__(message)
         self.name = name
+
+
+def ignore(line: str) -> None:
+    """Default for `report`: drops the line."""
+
+
+def list_names(names: Iterable[str]) -> str:
+    """List names for a message; of more than MAX_LISTED, the rest by their number."""
+    listed = list(names)
+    return ", ".join(listed[:MAX_LISTED] + ([f"{len(listed) - MAX_LISTED} more"] if len(listed) > MAX_LISTED else []))
+
+
+@dataclass(eq=False)
+class Notes:
+    """Notes of a reader on a mesh file: warnings on what was replaced, and features that are not used; told in one line per file."""
+
+    substitute: bool = False
+    """Whether an image that is not there is replaced by a colour, which is noted; otherwise it is an error."""
+    said: list[str] = field(default_factory=list)
+    """Warnings: what is missing and what is used instead."""
+    ignored: list[str] = field(default_factory=list)
+    """Names of features that the file has and that are not used."""
+
+    def image(self, read: Callable[[], _Image]) -> _Image | None:
+        """Result of `read`; None if the image is not there and is replaced by a colour."""
+        try:
+            return read()
+        except MissingFileError as error:
+            if not self.substitute:
+                raise
+            self.said.append(f"the image {ascii(error.name)[:80]} is missing, a plain colour is used")
+            return None
+
+    def line(self, source: object) -> str | None:
+        """All notes as one line; None: there are none."""
+        said = list(dict.fromkeys(self.said))[:MAX_LISTED]
+        said += [f"ignored: {list_names(dict.fromkeys(self.ignored))}"] if self.ignored else []
+        return f"{source}: {'; '.join(said)}" if said else None
+
+
+def read_isolated(
+    function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], limits: Limits, error: type[SynpickError], smaller: str, repair: str
+) -> Iterator[Any]:
+    """Call a function for files, in a process each (`run_isolated`).
+
+    Args:
+        calls: Its arguments; the first is the path, or has it as `path`.
+        smaller: Advice for a file for which time or memory of this machine does not suffice.
+        repair: Advice for a file on which the process crashes.
+
+    Yields:
+        What the function returned, or as `error` why there is nothing.
+
+    Raises:
+        SynpickError: As `error`: time or memory does not suffice, so that elsewhere the same file might be read.
+    """
+    for (file, *_), result in zip(calls, run_isolated(function, calls, limits), strict=True):
+        if isinstance(result, Failure):
+            advice = smaller if result.by_machine else repair
+            fault = error(f"{getattr(file, 'path', file)}: the process that reads it {result.reason}; {advice}")
+            if result.by_machine:
+                raise fault
+            yield fault
+        else:
+            yield error(str(result)) if isinstance(result, SynpickError) and not isinstance(result, error) else result
 
 
 @contextmanager
@@ -114,15 +182,9 @@ def asset_scope(root: Path) -> Iterator[AssetScope]:
 
 
 def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[Path, bytes]:
-    """Read a file that a model file names, inside the object's folder only (`asset_scope`).
+    """Read a file of up to `limit` bytes that a model file, `owner`, names, inside the object's folder only (`asset_scope`).
 
     A name that is not there is also tried with Windows' separators, in other letter case, and in the folders where exporters put textures.
-
-    Args:
-        folder: Folder of the model file.
-        name: The name in it.
-        owner: The model file, for errors.
-        limit: Largest size [bytes].
 
     Raises:
         MissingFileError: There is no such file.
@@ -152,10 +214,6 @@ def locate(folder: Path, name: str, owner: object, error: type[SynpickError], ro
     """Path of a file that another one names; if it is not there, of what the name may mean (see `read_referred`), if that is there.
 
     Args:
-        folder: Folder of the file that names it.
-        name: The name.
-        owner: The file that names it, for errors.
-        error: Class of the exception.
         root: Folder that the name must not lead out of; None: `folder`.
 
     Raises:

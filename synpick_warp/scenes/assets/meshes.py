@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from synpick_warp.errors import CatalogError
+from synpick_warp.configs.episodes.objects import UNITS
+from synpick_warp.configs.fields import PATH_RULE
+from synpick_warp.errors import CatalogError, ConfigError, SynpickError
 from synpick_warp.scenes.assets.appearance import (
     UV_TOLERANCE,
+    WHITE,
     FileMaterial,
     as_color,
     bake_vertex_colors,
@@ -21,15 +26,15 @@ from synpick_warp.scenes.assets.appearance import (
     srgb_to_linear,
     tile_texture,
 )
-from synpick_warp.scenes.assets.asset_files import MAX_ROWS, quiet_decoding
+from synpick_warp.scenes.assets.asset_files import MAX_ROWS, Notes, ignore, quiet_decoding
+from synpick_warp.scenes.assets.cad import STEP_SUFFIXES, read_step, read_stl
 from synpick_warp.scenes.assets.gltf.parts import read_gltf
-from synpick_warp.scenes.assets.mesh_parts import WHITE, MeshPart, Notes, check_indices
+from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
-from synpick_warp.scenes.assets.step import STEP_SUFFIXES, read_step
-from synpick_warp.scenes.assets.stl import read_stl
-from synpick_warp.scenes.assets.wavefront.obj import read_obj
+from synpick_warp.scenes.assets.wavefront import read_obj
 from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 _READERS: dict[str, Callable[[Path, Notes], list[MeshPart]]] = {
     ".ply": read_ply,
@@ -45,6 +50,10 @@ SUFFIXES = tuple(_READERS)
 # Maximum coordinate [m]: larger ones are mistakes, and lose precision in 32-bit floats.
 _MAX_EXTENT = 1e4
 _MILLIMETRE = 1e-3
+MAX_CELL_FACES = 200_000
+"""Triangles of the mesh of a bin or a tool: more take minutes, and slow every picture."""
+CELL_LIMITS = Limits(600.0, 2**33)
+"""Limits of reading it."""
 # Maximum texture coordinate: larger ones are mistakes, with a resolution of a thousandth of the image in 32-bit floats.
 _MAX_UV = 1e4
 
@@ -63,12 +72,7 @@ class MeshOptions:
     """Name of the unit, which is told with the mesh's size; empty: neither is told."""
 
 
-def _ignore(line: str) -> None:
-    """Default for `report`: drops the line."""
-
-
-@dataclass(frozen=True, eq=False)
-class MeshFile:
+class MeshFile(NamedTuple):
     """Mesh [m] and material of a mesh file, and by what the mesh was moved to be centred (3) [m]."""
 
     mesh: TriangleMesh
@@ -76,21 +80,12 @@ class MeshFile:
     moved: np.ndarray
 
 
-def read_mesh(
-    path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore
-) -> tuple[TriangleMesh, FileMaterial]:
-    """Mesh and material of a mesh file; arguments and errors as of `read_mesh_file`."""
-    found = read_mesh_file(path, unit, options, report)
-    return found.mesh, found.material
-
-
-def read_mesh_file(path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = _ignore) -> MeshFile:
+def read_mesh(path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = ignore) -> MeshFile:
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
 
     Args:
         path: A .ply, .obj, .glb, .gltf, .stl, .step or .stp file.
         unit: Length of the file's unit [m]; STEP files name their own.
-        options: How the mesh is completed.
         report: Called with one line if features of the file are ignored or replaced.
 
     Raises:
@@ -109,6 +104,58 @@ def read_mesh_file(path: Path, unit: float, options: MeshOptions = MeshOptions()
     if line is not None:
         report(line)
     return found
+
+
+def read_measured(function: Callable[[Any], Any], settings: Any, file: str, owner: str) -> Any:
+    """What `function(settings)` reads of a mesh file, in an isolated process, or read before in this process unless the file has changed.
+
+    Raises:
+        ConfigError: The mesh cannot be used by its `owner`.
+    """
+    path = Path(file)
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise ConfigError(f"{owner}: {path} cannot be read ({error.strerror}); {PATH_RULE}") from error
+    return _read_measured(function, settings, file, owner, (stat.st_mtime_ns, stat.st_size))
+
+
+@lru_cache(maxsize=64)
+def _read_measured(function: Callable[[Any], Any], settings: Any, file: str, owner: str, stamp: tuple[int, int]) -> Any:
+    """As `read_measured`; `stamp`: time of change and size of the file."""
+    (found,) = run_isolated(function, [(settings,)], CELL_LIMITS)
+    if isinstance(found, Failure):
+        raise ConfigError(f"{owner}: the process that reads {file} {found.reason}; repair or simplify the mesh")
+    if isinstance(found, SynpickError):
+        raise ConfigError(f"{owner}: {found}")
+    return found
+
+
+def read_cell_mesh(
+    file: str, unit: str, sides: tuple[float, float], likely: tuple[float, float], key: str, report: Callable[[str], None] = ignore
+) -> MeshFile:
+    """Read the mesh of a part of the cell: a bin, or a tool's body.
+
+    Args:
+        file, unit, report: As of `read_mesh`; the unit by its name.
+        sides, likely: Least and largest longest side [m], and those by which another unit is proposed, as value of the setting `key`.
+
+    Raises:
+        CatalogError: As `read_mesh`; or the file is no mesh, has too many triangles, or is too small or too large.
+    """
+    path = Path(file)
+    if path.suffix.lower() not in SUFFIXES:
+        raise CatalogError(f"{path} is no mesh; allowed: {', '.join(SUFFIXES)}")
+    found = read_mesh(path, UNITS[unit], MeshOptions(substitute=True), report)
+    if len(found.mesh.faces) > MAX_CELL_FACES:
+        raise CatalogError(f"{path} has {len(found.mesh.faces):,} triangles; allowed: {MAX_CELL_FACES:,}; decimate the mesh")
+    lengths = np.ptp(found.mesh.vertices.astype(np.float64), axis=0)
+    if sides[0] <= lengths.max() <= sides[1]:
+        return found
+    fitting = [f'"{name}"' for name, size in UNITS.items() if likely[0] <= lengths.max() / UNITS[unit] * size <= likely[1]]
+    advice = f"; did you mean {key} = {' or '.join(fitting)}?" if fitting else ""
+    shown = " x ".join(f"{side:.4g}" for side in lengths)
+    raise CatalogError(f"{file} is {shown} m, unit {unit}; allowed: a longest side of {sides[0]:g} to {sides[1]:g} m{advice}")
 
 
 def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> MeshFile:
@@ -137,8 +184,7 @@ def complete_normals(part: MeshPart, crease_angle: float) -> MeshPart:
     given = np.isfinite(length) & (length > 0.0)
     if part.normals is None or not given.any():
         source, faces, normals = crease_normals(part.vertices, part.faces, crease_angle)
-        rows = {name: None if (data := getattr(part, name)) is None else data[source] for name in ("vertices", "uv", "colors")}
-        return replace(part, faces=faces, normals=normals, **rows)
+        return part.take(source, faces, normals=normals)
     smooth = part.normals / np.where(given, length, 1.0)
     if not given.all():
         smooth = np.where(given, smooth, smooth_normals(part.vertices, part.faces))
@@ -200,9 +246,7 @@ def _orient_outward(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray
 
 
 def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
-    """Part without degenerate triangles and unused vertices, still in its own unit (`unit` metres); raises CatalogError if it
-    is invalid.
-    """
+    """Part without degenerate triangles and unused vertices, still in its own unit (`unit` metres); raises CatalogError if invalid."""
     if not np.isfinite(part.vertices).all():
         raise CatalogError(f"{path}: {int((~np.isfinite(part.vertices)).any(axis=1).sum())} vertices are not finite; repair the mesh")
     check_indices(part.faces, len(part.vertices), path)
@@ -216,10 +260,7 @@ def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
     used, index = np.unique(faces, return_inverse=True)
     if part.uv is not None and not (np.abs(part.uv[used]) <= _MAX_UV).all():
         raise CatalogError(f"{path}: texture coordinates that are not finite or beyond {_MAX_UV:g}; repair the mesh")
-    if len(used) == len(part.vertices):
-        return replace(part, faces=faces)
-    rows = {name: None if (data := getattr(part, name)) is None else data[used] for name in ("normals", "uv", "colors")}
-    return replace(part, vertices=part.vertices[used], faces=index.reshape(-1, 3), **rows)
+    return replace(part, faces=faces) if len(used) == len(part.vertices) else part.take(used, index.reshape(-1, 3))
 
 
 def _bake_colors(part: MeshPart) -> MeshPart:
@@ -232,15 +273,8 @@ def _bake_colors(part: MeshPart) -> MeshPart:
         return replace(part, colors=None, material=replace(part.material, color=color))
     skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture)
     uv, texture = bake_vertex_colors(part.faces, part.colors, factor, skin)
-    order = part.faces.reshape(-1)
-    return MeshPart(
-        part.vertices[order],
-        np.arange(len(order)).reshape(-1, 3),
-        None if part.normals is None else part.normals[order],
-        uv,
-        None,
-        replace(part.material, color=WHITE, texture=texture),
-    )
+    material = replace(part.material, color=WHITE, texture=texture)
+    return part.take(part.faces.reshape(-1), np.arange(part.faces.size).reshape(-1, 3), uv=uv, colors=None, material=material)
 
 
 def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes) -> MeshPart:
@@ -285,14 +319,7 @@ def _unroll(part: MeshPart, notes: Notes) -> MeshPart:
     uv = part.uv[source] - rows[:, 1:]
     tiles = np.maximum(np.ceil(uv.max(axis=0) - UV_TOLERANCE), 1.0).astype(int)
     image = tile_texture(texture, (int(tiles[0]), int(tiles[1])), notes.said)
-    return MeshPart(
-        part.vertices[source],
-        index.reshape(-1, 3),
-        None if part.normals is None else part.normals[source],
-        uv / tiles,
-        None,
-        replace(part.material, texture=image),
-    )
+    return part.take(source, index.reshape(-1, 3), uv=uv / tiles, material=replace(part.material, texture=image))
 
 
 def _area(part: MeshPart) -> float:

@@ -13,10 +13,10 @@ from pathlib import Path
 
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.asset_files import check_file_name, list_names
+from synpick_warp.scenes.assets.cad import STEP_SUFFIXES
 from synpick_warp.scenes.assets.meshes import SUFFIXES
 from synpick_warp.scenes.assets.models_info import bop_obj_id
-from synpick_warp.scenes.assets.step import STEP_SUFFIXES
 
 MAX_DEPTH = 3
 """Depth to which an object's folder is searched for its mesh."""
@@ -34,7 +34,6 @@ _UNREAD = """
     urdf usd usda usdc usdz vrm vrml vtk vtp vtu wrl x x3d x3db x3dv x_b x_t xacro xyz zae ztl
 """
 """Endings of files of geometry that are not read."""
-_MAX_LISTED = 8
 
 Say = Callable[[str], None]
 Fault = Callable[[CatalogError], None]
@@ -58,7 +57,6 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
     """List the objects of a model folder.
 
     Args:
-        folder: The folder.
         report: Called with each line on what is ignored.
         fault: Called with the error of each object that cannot be used; it may raise it.
 
@@ -74,9 +72,8 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
         found = [] if files else _in_subfolders(entries, unread, report)
     except OSError as error:
         raise CatalogError(f"models folder {folder}: cannot be listed ({error.strerror})") from error
-    names = [ascii(str(path.relative_to(folder)))[1:-1] for path in unread]
-    more = [f"{len(names) - _MAX_LISTED} more"] if len(names) > _MAX_LISTED else []
-    said = f"of a format that is not read: {', '.join(names[:_MAX_LISTED] + more)}; save them as {_READ}"
+    names = list_names(ascii(str(path.relative_to(folder)))[1:-1] for path in unread)
+    said = f"of a format that is not read: {names}; save them as {_READ}"
     if not files and not found:
         raise CatalogError(f"models folder {folder}: {said if unread else f'it contains no models; add obj_NNNNNN.ply, or {_READ}'}")
     if unread:
@@ -128,7 +125,6 @@ def _list_own(files: list[Path], found: list[tuple[Path, Path]], folder: Path) -
     Args:
         files: Meshes side by side.
         found: Folder of an object, and its mesh.
-        folder: The model folder.
     """
     models: list[ModelFile] = []
     faults: list[CatalogError] = []

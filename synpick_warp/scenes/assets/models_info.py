@@ -102,7 +102,6 @@ def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[Catalo
     """Read models_info.json; an empty dictionary if the file is missing, which is no error.
 
     Args:
-        path: The file.
         obj_ids: Objects that must have an entry; other entries are ignored.
         fault: Called with the error of an object that has no entry, or one whose diameter or symmetries are invalid. If it does not
             raise it, the object has no entry in the result.
@@ -134,12 +133,8 @@ def _convert(entry: Any, obj_id: int, path: Path) -> FileModelInfo:
 
 
 def check_against_mesh(info: FileModelInfo, vertices: np.ndarray, diameter: float) -> tuple[FileModelInfo, list[str]]:
-    """Compare an entry with its mesh: is the diameter the bounding box's diagonal, or of another mesh, and do the symmetries hold?
-
-    Args:
-        info: The entry.
-        vertices: The mesh's (V, 3) [m].
-        diameter: The mesh's own [m].
+    """Compare an entry with its mesh, of vertices (V, 3) and a diameter [m]: is the diameter the bounding box's diagonal, or of another
+    mesh, and do the symmetries hold?
 
     Returns:
         The entry, converted if its lengths are in metres, and what is wrong with it.

@@ -16,11 +16,8 @@ _REACH = 32
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Compute smooth vertex normals: area-weighted means over all triangles at a position, so that texture seams do not show.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
+    """Compute smooth normals of vertices (V, 3) and faces (F, 3): area-weighted means over all triangles at a position, so that texture
+    seams do not show.
 
     Returns:
         Unit normals (V, 3) float32. Where the triangles at a position cancel out, those of the vertex alone are used, or +z.

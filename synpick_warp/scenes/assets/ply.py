@@ -17,19 +17,19 @@ import numpy as np
 from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, NO_MATERIAL, WHITE, FileMaterial, decode_texture
 from synpick_warp.scenes.assets.asset_files import (
     MAX_MESH_FILE,
     MAX_ROWS,
     MAX_TEXT_MESH,
+    Notes,
     check_decimals,
     decode_text,
     quiet_decoding,
     read_referred,
     reading_as,
 )
-from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes, check_indices
-from synpick_warp.scenes.assets.polygons import clip_ears, find_concave
+from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices, clip_ears, find_concave
 from synpick_warp.system.inputs.files import read_file
 
 MAX_HEADER = 2**16
@@ -83,10 +83,6 @@ def read_ply_file(path: Path) -> bytes:
 def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
     """Name and content of the texture that a PLY header names in a line `comment TextureFile NAME` (in any case), inside the file's folder;
     None if there is none.
-
-    Args:
-        data: The file.
-        path: Its path.
 
     Raises:
         MissingFileError: There is no such file.
@@ -268,11 +264,7 @@ def _triangles(
     """Triangulate polygons, and strips.
 
     Args:
-        face: The element of polygons.
-        strips: The element of strips.
         vertices: Positions (V, 3); None: there are none.
-        path: The file, for errors.
-        notes: What is left out.
 
     Returns:
         The vertices of all corners (C,) and triangles of corners (F, 3); and the face of each triangle (F,), None for strips.

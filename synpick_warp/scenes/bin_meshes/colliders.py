@@ -20,10 +20,13 @@ from synpick_warp.scenes.assets.meshes import merge_positions
 from synpick_warp.scenes.bin_meshes.compartments import Compartment, enclose
 from synpick_warp.scenes.bin_meshes.inside import BinSurface, subdivide
 from synpick_warp.scenes.collision.simplification import hull_piece
-from synpick_warp.scenes.tote import FLOOR_DEPTH, MIN_WALL
 from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul, norm
 
+FLOOR_DEPTH = 0.1
+"""Thickness of the floor's collision shape [m]: more than any object moves in one step, so that none tunnels."""
+MIN_WALL = 0.02
+"""Minimum thickness of the walls' collision shapes at the rim [m], for the same reason."""
 TOLERANCE = 2e-3
 """Distance of a facet's vertices from its plane [m], as of the tote's rounded corners; doubled until there are at most MAX_PIECES."""
 MAX_TOLERANCE = 4e-3
@@ -62,12 +65,7 @@ class _Faces:
 
 
 def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: BinSurface) -> tuple[ConvexPiece, ...]:
-    """Build the collision shapes of a mesh.
-
-    Args:
-        vertices: (V, 3) [m], z up.
-        faces: (F, 3).
-        surface: Its height field and inside.
+    """Build the collision shapes of a mesh, vertices (V, 3) [m], z up, and faces (F, 3), with the surface of its inside.
 
     Raises:
         CatalogError: There are more than MAX_PIECES.

@@ -5,19 +5,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from synpick_warp.configs.cell.bins import AXES, BOX, FILE, BinRow, MeasuredBin
-from synpick_warp.configs.episodes.objects import UNITS
-from synpick_warp.configs.fields import PATH_RULE
-from synpick_warp.errors import CatalogError, ConfigError, SynpickError
-from synpick_warp.scenes.assets.appearance import FileMaterial
-from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL
-from synpick_warp.scenes.assets.meshes import SUFFIXES, MeshOptions, read_mesh
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.appearance import NO_MATERIAL, FileMaterial
+from synpick_warp.scenes.assets.meshes import read_cell_mesh, read_measured
 from synpick_warp.scenes.bin_meshes.colliders import make_box, make_colliders
 from synpick_warp.scenes.bin_meshes.compartments import (
     MIN_SIDE,
@@ -33,14 +29,11 @@ from synpick_warp.scenes.bin_meshes.compartments import (
 from synpick_warp.scenes.bin_meshes.inside import MIN_DEPTH, BinSurface, HeightField, find_inside, make_limits
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
-from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 SIDES = (0.02, 10.0)
 """Least and largest side of a bin [m], as of those that are given by sizes."""
-LIMITS = Limits(600.0, 2**33)
-"""Limits of reading a mesh."""
-MAX_FACES = 200_000
-"""Triangles of a mesh: more take minutes, and slow every picture."""
+LIKELY_SIDES = (0.1, 2.0)
+"""Of most bins [m]."""
 COARSE = 64
 """Cells of the height field where only its direction is in question."""
 DIGITS = 6
@@ -82,35 +75,14 @@ def read_bin(row: BinRow) -> BinModel:
     Raises:
         ConfigError: It cannot be used as a bin.
     """
-    path = Path(row.file or "")
-    try:
-        stat = path.stat()
-    except OSError as error:
-        raise ConfigError(f"bin {row.name}: {path} cannot be read ({error.strerror}); {PATH_RULE}") from error
-    return _read(replace(row, measured=None, weight=1.0), (stat.st_mtime_ns, stat.st_size))
-
-
-@lru_cache(maxsize=64)
-def _read(row: BinRow, stamp: tuple[int, int]) -> BinModel:
-    """Read the mesh of a bin in an isolated process; `stamp`: time of change and size of the file."""
-    (found,) = run_isolated(_model, [(row,)], LIMITS)
-    if isinstance(found, Failure):
-        raise ConfigError(f"bin {row.name}: the process that reads {row.file} {found.reason}; repair or simplify the mesh")
-    if isinstance(found, SynpickError):
-        raise ConfigError(f"bin {row.name}: {found}")
-    return found
+    return read_measured(_model, replace(row, measured=None, weight=1.0), row.file or "", f"bin {row.name}")
 
 
 def _model(row: BinRow) -> BinModel:
     """Read and measure the mesh of a bin. Runs in an isolated process."""
     path, lines = Path(row.file or ""), []
-    if path.suffix.lower() not in SUFFIXES:
-        raise CatalogError(f"{path} is no mesh; allowed: {', '.join(SUFFIXES)}")
     unit, up = row.unit or "m", row.up or "z"
-    mesh, material = read_mesh(path, UNITS[unit], MeshOptions(substitute=True), lines.append)
-    if len(mesh.faces) > MAX_FACES:
-        raise CatalogError(f"{path} has {len(mesh.faces):,} triangles; allowed: {MAX_FACES:,}; decimate the mesh")
-    _check_sides(mesh, path, unit)
+    mesh, material, _ = read_cell_mesh(str(path), unit, SIDES, LIKELY_SIDES, "unit", lines.append)
     mesh = _rotate(mesh, lambda vectors: matmul(vectors, _rotation(up).astype(np.float32).T))
     yaw = find_turn(mesh.vertices[mesh.faces].astype(np.float64))
     mesh = _rotate(mesh, lambda vectors: turned(vectors.astype(np.float64), -yaw).astype(np.float32)) if yaw else mesh
@@ -164,17 +136,6 @@ def _make_pieces(
             f"close the gaps of the mesh, or simplify it{advice}"
         )
     return pieces
-
-
-def _check_sides(mesh: TriangleMesh, path: Path, unit: str) -> None:
-    """Refuse a mesh that is too small or too large for a bin, with the unit in which it would not be."""
-    sides = np.ptp(mesh.vertices.astype(np.float64), axis=0)
-    if SIDES[0] <= sides.max() and sides.max() <= SIDES[1]:
-        return
-    fitting = [f'"{name}"' for name, size in UNITS.items() if 0.1 <= sides.max() / UNITS[unit] * size <= 2.0]
-    advice = f"; did you mean unit = {' or '.join(fitting)}?" if fitting else ""
-    shown = " x ".join(f"{side:.4g}" for side in sides)
-    raise CatalogError(f"{path} is {shown} m, unit {unit}; allowed: a longest side of {SIDES[0]:g} to {SIDES[1]:g} m{advice}")
 
 
 def _rotate(mesh: TriangleMesh, rotate: Callable[[np.ndarray], np.ndarray]) -> TriangleMesh:
@@ -317,10 +278,5 @@ def _raise_to_piece(heights: np.ndarray, points: np.ndarray, piece: ConvexPiece)
 
 def bin_material(model: BinModel, row: BinRow) -> Material:
     """Material of a bin: that of its file; what this does not state is the row's."""
-    given = model.material
-    return Material(
-        row.color if given.texture is None and given.color == NO_MATERIAL.color else given.color,
-        given.texture,
-        row.metallic if given.metallic is None else given.metallic,
-        row.roughness if given.roughness is None else given.roughness,
-    )
+    material = model.material.complete(row.metallic, row.roughness)
+    return replace(material, color=row.color) if material.texture is None and material.color == NO_MATERIAL.color else material

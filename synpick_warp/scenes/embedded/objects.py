@@ -1,19 +1,21 @@
-"""The embedded object sets: 21 household objects, with sizes and masses like those of the YCB-Video objects, and 7 industrial parts."""
+"""The embedded object sets: 21 household objects, with sizes and masses like those of the YCB-Video objects, and 7 industrial parts; and
+geometric solids as distractors beside them (Tobin et al., IROS 2017), plain or textured. Lengths [m]."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
 
 from synpick_warp.configs.episodes.objects import HOUSEHOLD, INDUSTRIAL
 from synpick_warp.scenes.collision.hulls import hull_size
-from synpick_warp.scenes.embedded import parts, tools, vessels
+from synpick_warp.scenes.embedded import household, parts
 from synpick_warp.scenes.embedded.packs import Shape, make_goods
-from synpick_warp.scenes.modelling import Patch, make_mesh, rotation
-from synpick_warp.scenes.types import Material, RawObject
+from synpick_warp.scenes.embedded.surfaces import surface_textures
+from synpick_warp.scenes.modelling import BOX_FACES, NO_TEXTURE, Patch, lathe, make_mesh, project_from_box, rotation, rounded_box, solid
+from synpick_warp.scenes.types import Material, RawObject, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
 
 Matrix = tuple[float, ...]
@@ -67,18 +69,18 @@ ROWS = (
     _Row("dessert_carton", partial(make_goods, "dessert_carton"), 0.187, 0.1, 0.5),
     _Row("jelly_carton", partial(make_goods, "jelly_carton"), 0.097, 0.1, 0.5),
     _Row("meat_tin", partial(make_goods, "meat_tin"), 0.370, 0.6, 0.3),
-    _Row("banana", tools.banana, 0.066, 0.3, 0.3),
-    _Row("pitcher", vessels.pitcher, 0.244, 0.1, 0.5),
+    _Row("banana", household.banana, 0.066, 0.3, 0.3),
+    _Row("pitcher", household.pitcher, 0.244, 0.1, 0.5),
     _Row("cleaner_bottle", partial(make_goods, "cleaner_bottle"), 1.131, 0.1, 0.5),
-    _Row("bowl", vessels.bowl, 0.147, 0.6, 0.3, concave=True, continuous=_about((0.0, 0.0, 1.0))),
-    _Row("mug", vessels.mug, 0.118, 0.6, 0.3, concave=True),
-    _Row("drill", tools.drill, 0.895, 0.1, 0.6, concave=True),
-    _Row("wood_block", tools.wood_block, 0.729, 0.3, 0.5, discrete=_rotations(("z", 90), ("x", 180))),
-    _Row("scissors", tools.scissors, 0.082, 0.1, 0.5),
-    _Row("marker", tools.marker, 0.016, 0.1, 0.5, continuous=_about((0.0, 1.0, 0.0))),
-    _Row("clamp", tools.clamp, 0.125, 0.1, 0.5, discrete=_rotations(("y", 180))),
-    _Row("large_clamp", tools.large_clamp, 0.202, 0.1, 0.5, discrete=_rotations(("x", 180))),
-    _Row("foam_block", tools.foam_block, 0.028, 0.1, 0.7, discrete=_rotations(("z", 180), ("x", 180))),
+    _Row("bowl", household.bowl, 0.147, 0.6, 0.3, concave=True, continuous=_about((0.0, 0.0, 1.0))),
+    _Row("mug", household.mug, 0.118, 0.6, 0.3, concave=True),
+    _Row("drill", household.drill, 0.895, 0.1, 0.6, concave=True),
+    _Row("wood_block", household.wood_block, 0.729, 0.3, 0.5, discrete=_rotations(("z", 90), ("x", 180))),
+    _Row("scissors", household.scissors, 0.082, 0.1, 0.5),
+    _Row("marker", household.marker, 0.016, 0.1, 0.5, continuous=_about((0.0, 1.0, 0.0))),
+    _Row("clamp", household.clamp, 0.125, 0.1, 0.5, discrete=_rotations(("y", 180))),
+    _Row("large_clamp", household.large_clamp, 0.202, 0.1, 0.5, discrete=_rotations(("x", 180))),
+    _Row("foam_block", household.foam_block, 0.028, 0.1, 0.7, discrete=_rotations(("z", 180), ("x", 180))),
 )
 """The objects with obj_id 1 to 21, in this order; masses, concavity and materials are in the preset `synpick`."""
 
@@ -95,8 +97,6 @@ PARTS = (
     _Row("box", parts.box, 0.15, 0.0, 0.5, discrete=_rotations(("z", 180), ("x", 180)), color=PLASTIC),
 )
 """The parts with obj_id 22 to 28; of steel (7850 kg/m³), the tee of malleable iron (7200 kg/m³), the box filled to 0.15 kg."""
-PIECES = {"bracket": parts.bracket_pieces, "pipe_tee": parts.tee_pieces, "sheet_part": parts.sheet_pieces}
-"""Convex pieces of parts [mm], in the frame of their drawing: fewer than a decomposition that follows holes would have."""
 SETS = {HOUSEHOLD: ROWS, INDUSTRIAL: PARTS}
 """Sets by their name in `objects.embedded`; obj_ids are counted over all of them."""
 
@@ -125,3 +125,72 @@ def _make_object(obj_id: int, row: _Row) -> RawObject:
         symmetries_continuous=row.continuous,
         source=None,
     )
+
+
+SIDES = 32
+"""Points per ring of a round solid."""
+DENSITY = 400.0
+"""[kg/m³], between foam and wood."""
+SCALES = ((1.0, 1.0, 1.0), (1.6, 1.6, 1.8), (1.2, 2.0, 2.2), (2.2, 1.4, 1.0))
+"""Factors on x, y and z of textured solids: tins, cartons, books and bottles of a household."""
+REPEAT = 0.3
+"""Width of one repeat of a textured solid's texture [m]."""
+_EDGE = 0.003
+"""Radius of the edges of boxes."""
+
+
+def _box(*size: float) -> Patch:
+    """Box with rounded edges."""
+    x, y, z = size
+    return rounded_box((x, y, z), _EDGE, dict.fromkeys(BOX_FACES, NO_TEXTURE))
+
+
+def _turned(points: int, *profile: tuple[float, float]) -> Patch:
+    """Surface of revolution, or with few points a prism or pyramid, through (radius, z)."""
+    return solid(lathe(list(profile), points))
+
+
+def _ball(radius: float) -> Patch:
+    """Sphere."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, SIDES // 2)[1:-1]
+    return _turned(SIDES, *((radius * float(np.cos(angle)), radius * float(np.sin(angle))) for angle in angles))
+
+
+def solids(textured: bool = False) -> list[RawObject]:
+    """Make the solids, all convex: closed meshes [m], centred on their bounding boxes; deterministic. Textured, each has all SCALES."""
+    rows = (
+        ("cube", _box(0.05, 0.05, 0.05), (0.75, 0.2, 0.15)),
+        ("slab", _box(0.12, 0.08, 0.016), (0.2, 0.35, 0.7)),
+        ("bar", _box(0.14, 0.025, 0.025), (0.85, 0.7, 0.2)),
+        ("cylinder", _turned(SIDES, (0.02, -0.05), (0.02, 0.05)), (0.25, 0.6, 0.3)),
+        ("disc", _turned(SIDES, (0.045, -0.01), (0.045, 0.01)), (0.8, 0.8, 0.78)),
+        ("cone", _turned(SIDES, (0.035, -0.04), (0.003, 0.04)), (0.85, 0.45, 0.1)),
+        ("ball", _ball(0.032), (0.5, 0.25, 0.6)),
+        ("prism", _turned(6, (0.03, -0.03), (0.03, 0.03)), (0.15, 0.15, 0.16)),
+    )
+    made = [
+        _raw(obj_id, name, make_mesh(patch, centered=True), Material(color, None, 0.0, 0.5))
+        for obj_id, (name, patch, color) in enumerate(rows, start=1)
+    ]
+    return _dress(made) if textured else made
+
+
+def _raw(obj_id: int, name: str, mesh: TriangleMesh, material: Material) -> RawObject:
+    """Object of a convex mesh, with DENSITY."""
+    hull = hull_size(mesh.vertices)
+    return RawObject(obj_id, name, mesh, hull, material, DENSITY * hull.volume, False, (), (), None)
+
+
+def _dress(plain: list[RawObject]) -> list[RawObject]:
+    """Solids in all SCALES, each with a texture of its own by cube projection."""
+    made = []
+    for scale in SCALES:
+        for raw in plain:
+            normals = raw.mesh.normals / np.array(scale, np.float32)
+            normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+            mesh = project_from_box(replace(raw.mesh, vertices=raw.mesh.vertices * np.array(scale, np.float32), normals=normals))
+            mesh = replace(mesh, uv=(mesh.uv / REPEAT + 0.5).astype(np.float32))
+            index = len(made)
+            material = Material((1.0, 1.0, 1.0), surface_textures(1, index)[0], 0.0, 0.5)
+            made.append(_raw(index + 1, f"textured_{raw.name}_{index}", mesh, material))
+    return made

@@ -178,24 +178,22 @@ def tin(
 
     Args:
         ring: Width and depth of an ellipse, or width, depth and radius of the corners of a rounded rectangle [m].
-        height: Height [m].
-        label: The label.
         top: Print of the upper end: see `_draw_end`.
-        bottom: Print of the lower end.
         twice: Whether the label has its front twice.
         sides: Whether the label has its sides alone; the front is printed on the lid.
     """
-    outline = ellipse(*ring, SIDES) if len(ring) == 2 else rounded_rectangle(*ring, 10)
+    across, deep, *radius = ring
+    outline = rounded_rectangle(across, deep, radius[0], 10) if radius else ellipse(across, deep, SIDES)
     # As wide as the texture atlas without padding, as high as the tin between its rims.
     width = SHEET - 2 * paint.PADDING
     high = round(width * (height - 0.008) / np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1).sum())
     if sides:
         third = width // 3
         panels = [draw(wide, high, label) for draw, wide in ((other_side, third), (side, width - 2 * third), (other_side, third))]
-        print_ = np.concatenate(panels, axis=1)
+        printed = np.concatenate(panels, axis=1)
     else:
-        print_ = wrapper(width, high, label, twice=twice)
-    images = {"label": print_, "metal": paint.brushed(256, 64, SILVER, label.seed + 8)}
+        printed = wrapper(width, high, label, twice=twice)
+    images = {"label": printed, "metal": paint.brushed(256, 64, SILVER, label.seed + 8)}
     texture, at = paint.pack(images | {"top": _draw_end(top, label), "bottom": _draw_end(bottom, label)}, SHEET)
     half = height / 2
     narrow = 1 - 0.0012 / np.abs(outline).max()
@@ -244,8 +242,6 @@ def bottle(
         band: First and last level with the label.
         label_height: [px]
         body: Colour and seed of the body's plastic.
-        cap: Of the cap's.
-        label: The label.
     """
     images = {"label": wrapper(SHEET - 6, label_height, label), "body": paint.plain(**body), "cap": paint.plain(**cap)}
     texture, at = paint.pack(images, SHEET)

@@ -131,26 +131,28 @@ def box() -> Patch:
     return rounded_box((0.080, 0.060, 0.040), 0.002, dict.fromkeys(BOX_FACES, NO_TEXTURE))
 
 
-def bracket_pieces() -> list[np.ndarray]:
-    """Corners of the convex pieces of the bracket: its legs, without holes."""
-    return [_box((5.0, -20.0, 0.0), (60.0, 20.0, 5.0)), _box((0.0, -20.0, 0.0), (5.0, 20.0, 50.0))]
-
-
-def tee_pieces() -> list[np.ndarray]:
-    """Corners of the convex pieces of the pipe tee: two cylinders as wide as its bands, without bores."""
-    run, branch = (np.concatenate([_ring(_CIRCLE, 17.0, z) for z in ends]) for ends in ((-38.0, 38.0), (10.0, 38.0)))
-    return [run[:, [2, 0, 1]], branch]
-
-
-def sheet_pieces() -> list[np.ndarray]:
-    """Corners of the convex pieces of the sheet part: flanges and web, without slots."""
-    x, y, z = 31.0, 25.0, 11.0
-    return [_box((-x, -y, -z), (-1.0, y, 2.0 - z)), _box((-1.0, -y, -z), (1.0, y, z)), _box((1.0, -y, z - 2.0), (x, y, z))]
+def _pipe(radius: float, low: float, high: float) -> np.ndarray:
+    """Points of a cylinder about z."""
+    return np.concatenate([_ring(_CIRCLE, radius, z) for z in (low, high)])
 
 
 def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
     """Corners (8, 3) of a box."""
     return np.array(list(itertools.product(*zip(low, high, strict=True))))
+
+
+PIECES = {
+    "bracket": [_box((5.0, -20.0, 0.0), (60.0, 20.0, 5.0)), _box((0.0, -20.0, 0.0), (5.0, 20.0, 50.0))],  # its legs, without holes
+    # Two cylinders as wide as the bands of the tee, without bores.
+    "pipe_tee": [_pipe(17.0, -38.0, 38.0)[:, [2, 0, 1]], _pipe(17.0, 10.0, 38.0)],
+    # Flanges and web, without slots.
+    "sheet_part": [
+        _box((-31.0, -25.0, -11.0), (-1.0, 25.0, -9.0)),
+        _box((-1.0, -25.0, -11.0), (1.0, 25.0, 11.0)),
+        _box((1.0, -25.0, 9.0), (31.0, 25.0, 11.0)),
+    ],
+}
+"""Corners of the convex pieces of parts [mm], in the frame of their drawing: fewer than a decomposition that follows holes would have."""
 
 
 def _profile(profile: Sequence[tuple[float, float]], width: float, holes: Sequence[Hole]) -> Patch:

@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from synpick_warp.scenes.symmetries.groups import close_group, find_element
 from synpick_warp.scenes.symmetries.surface import SampledSurface
-from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, lstsq, matmul, norm, rotation, solve
+from synpick_warp.system.linear_algebra import DECIMALS, dot, eigh, lstsq, matmul, nearest_rotation, norm, rotation, solve
 
 MAX_FOLD = 36
 """Largest fold that is looked for; an axis with all folds up to it is continuous."""
@@ -58,10 +57,7 @@ class Symmetries:
 
 def turn_matrix(axis: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray:
     """Rotation by an angle [rad] about an axis through a point, as a 4 x 4 matrix."""
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation(axis, angle)
-    matrix[:3, 3] = point - dot(matrix[:3, :3], point)
-    return matrix
+    return _about(rotation(axis, angle), point)
 
 
 def _axis_angle(matrix: np.ndarray) -> tuple[np.ndarray, float]:
@@ -102,12 +98,9 @@ def _upward(axis: np.ndarray) -> np.ndarray:
 
 
 def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, tolerance: float) -> Symmetries:
-    """Find the rotational symmetries of a mesh.
+    """Find the rotational symmetries of a mesh, vertices (V, 3) and faces (F, 3), of a diameter [m].
 
     Args:
-        vertices: (V, 3) [m].
-        faces: (F, 3).
-        diameter: Diameter [m].
         tolerance: Largest Hausdorff distance [m].
 
     Returns:
@@ -312,3 +305,71 @@ def _common_point(turns: list[Turn], center: np.ndarray) -> np.ndarray:
     weak = 1e-9 * np.eye(3)
     point = solve(sum(across) + weak, sum(dot(one, turn.point) for one, turn in zip(across, turns, strict=True)) + dot(weak, center))
     return point if len(turns) > 1 else turns[0].point
+
+
+MAX_ELEMENTS = 144
+"""Largest group: dihedral ones have two elements for each fold; the rotations of the icosahedron are 60."""
+_EQUAL = 1.0
+"""Angle up to which two declared rotations are the same [°]: their matrices are rounded."""
+
+
+def find_element(elements: np.ndarray, rotation: np.ndarray, within: float = _EQUAL) -> int:
+    """Index of the element (N, 3, 3) that a rotation equals within an angle [°]; -1: none."""
+    traces = np.einsum("nij,ij->n", elements, rotation)
+    best = int(np.argmax(traces))
+    return best if np.sqrt(max(1.0 + traces[best], 0.0)) / 2.0 >= np.cos(np.radians(within / 2.0)).round(DECIMALS) else -1
+
+
+def close_transforms(matrices: list[np.ndarray]) -> list[np.ndarray] | None:
+    """The rigid 4 x 4 matrices as they are, and all of their products that have other rotations; without the identity. None if they are
+    more than MAX_ELEMENTS."""
+    elements = [np.eye(4), *matrices]
+    at = 1
+    while at < len(elements):
+        for matrix in matrices:
+            product = matmul(elements[at], matrix)
+            if find_element(np.array(elements)[:, :3, :3], product[:3, :3]) < 0:
+                elements.append(product)
+                if len(elements) > MAX_ELEMENTS:
+                    return None
+        at += 1
+    return elements[1:]
+
+
+def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
+    """All products of rotations (N, 3, 3), with the identity first; None if they are more than MAX_ELEMENTS, or no group.
+
+    Products within an angle [°] of an element count as it, so that axes which were found with errors of a degree still generate a finite
+    group; `make_exact` then removes the errors.
+    """
+    elements = np.eye(3)[None]
+    at = 0
+    while at < len(elements):
+        for generator in generators:
+            product = matmul(elements[at], generator)
+            if find_element(elements, product, within) < 0:
+                elements = np.concatenate([elements, product[None]])
+                if len(elements) > MAX_ELEMENTS:
+                    return None
+        at += 1
+    return make_exact(elements, within)
+
+
+def make_exact(elements: np.ndarray, within: float) -> np.ndarray | None:
+    """Exact group closest to rotations (N, 3, 3) that are a group up to an angle [°]; None if there is none.
+
+    Element a becomes the mean over all b of (a b) b⁻¹ (Grove, Karcher and Ruh, 1974), which converges quadratically, and then the
+    rotation next to it.
+    """
+    count = len(elements)
+    table = np.array([[find_element(elements, matmul(a, b), within) for b in elements] for a in elements])
+    if (table < 0).any() or any(len(set(row)) < count for row in table):
+        return None
+    for _ in range(8):
+        elements = nearest_rotation(np.einsum("abij,bkj->aik", elements[table], elements) / count)
+    return elements
+
+
+def describe_counts(discrete: int, continuous: int) -> str:
+    """Text on the numbers of an object's symmetries."""
+    return ", ".join(f"{count} {kind}" for count, kind in ((discrete, "discrete"), (continuous, "continuous")) if count) or "none"

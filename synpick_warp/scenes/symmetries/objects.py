@@ -11,8 +11,15 @@ from synpick_warp.configs.episodes.objects import DETECT, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshFile
 from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh
-from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_axes, find_symmetries, turn_matrix
-from synpick_warp.scenes.symmetries.groups import MAX_ELEMENTS, close_transforms
+from synpick_warp.scenes.symmetries.detection import (
+    MAX_ELEMENTS,
+    Symmetries,
+    Turn,
+    close_transforms,
+    find_axes,
+    find_symmetries,
+    turn_matrix,
+)
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.system.linear_algebra import dot, norm
 
@@ -27,11 +34,6 @@ def add_symmetries(
 
     Args:
         info: Entry of models_info.json; without symmetries if there is none.
-        found: The object's mesh.
-        diameter: Its diameter [m].
-        row: Its row of the object table.
-        objects: Settings.
-        origin: The object's file, for messages.
 
     Returns:
         The entry with symmetries, and lines on what was found, or on what is declared and does not hold.

@@ -10,8 +10,7 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from synpick_warp.scenes.assets.meshes import merge_positions
-from synpick_warp.scenes.collision.depth import sample_surface
-from synpick_warp.scenes.collision.hulls import hull_size
+from synpick_warp.scenes.collision.hulls import hull_size, sample_surface
 from synpick_warp.system.linear_algebra import DECIMALS, dot, matmul, norm
 
 _DENSE = 60_000

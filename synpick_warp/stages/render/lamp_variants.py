@@ -9,10 +9,9 @@ import numpy as np
 
 from synpick_warp.codes import Look, LookPart
 from synpick_warp.configs.episodes.randomize import OFF, Randomize
-from synpick_warp.scenes.environment import LUMINANCE, map_directions
+from synpick_warp.scenes.environment import LUMINANCE, draw_sun_disc, map_directions
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.sun import draw_sun_disc
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.render.looks import draw_parameters
 from synpick_warp.system.linear_algebra import DECIMALS, dot

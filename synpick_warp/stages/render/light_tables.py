@@ -14,9 +14,19 @@ from synpick_warp.kernels.render.lighting.brdf import ALBEDO_COLUMNS, ALBEDO_ROW
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, PREFILTER_LEVELS
 from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
-from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.lamps import Lamp, extract_lamps, sample_disc
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun
+from synpick_warp.scenes.environment import (
+    BACKGROUND_ROWS,
+    LUMINANCE,
+    MAX_SUN_TANGENT,
+    WHITE_VALUE,
+    Lamp,
+    draw_sun_disc,
+    extract_lamps,
+    map_directions,
+    replace_sun,
+    resize_map,
+    sample_disc,
+)
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.system.linear_algebra import dot, matmul
 from synpick_warp.system.processes.threads import map_in_threads
@@ -48,7 +58,7 @@ class EnvironmentTables:
     irradiance: np.ndarray
     """(9, 3) float32: coefficients of spherical harmonics."""
     lamps: list[Lamp]
-    """The sun of its sIBL set, if it is narrow, then others, the strongest first; see `scenes.lamps`."""
+    """The sun of its sIBL set, if it is narrow, then others, the strongest first; see `scenes.environment`."""
     exposure: float
     """Factor that brings the map's radiance to display range."""
 

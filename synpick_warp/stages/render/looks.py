@@ -21,8 +21,8 @@ from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, Random
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
+from synpick_warp.scenes.bins import FLOOR_DROP
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.tote import FLOOR_DROP
 from synpick_warp.stages.arrays import ArraySpec, StructArrays, allocate_struct
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels

@@ -19,10 +19,10 @@ from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.bins import TABLE_ROUGHNESS
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.light_tables import (

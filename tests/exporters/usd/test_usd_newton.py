@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from synpick_warp.scenes import build
-from synpick_warp.scenes.grippers.mechanism import finger_collider
-from synpick_warp.scenes.grippers.suction1 import cup_collider
-from synpick_warp.scenes.tote import TABLE_SIZE, tote_colliders
+from synpick_warp.scenes.bins import TABLE_SIZE, tote_colliders
+from synpick_warp.scenes.grippers import cup_collider, finger_collider
 from tests.worlds import small_worlds, usd_sets
 
 pytest.importorskip("newton_usd_schemas")  # Newton's importer needs it

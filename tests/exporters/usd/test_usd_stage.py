@@ -19,8 +19,7 @@ from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_la
 from synpick_warp.exporters.usd.types import UsdSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.environment import map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_TANGENT
+from synpick_warp.scenes.environment import MAX_SUN_TANGENT, map_directions, resize_map
 from synpick_warp.scenes.types import Camera, EnvironmentMap, Sun
 from synpick_warp.stages.render import light_tables
 from synpick_warp.views.frames import EpisodeEnd

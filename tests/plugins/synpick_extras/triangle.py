@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 from synpick_warp.configs.cell.gripper import SUCTION_ARRAY, Gripper
-from synpick_warp.scenes.grippers import suction_array
-from synpick_warp.scenes.grippers.head import Head
+from synpick_warp.scenes.grippers import Head, make_cup_array
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 
 BEHAVIOR = BEHAVIORS[SUCTION_ARRAY]
 
 
 def make_head(gripper: Gripper) -> Head:
-    return suction_array.make_head(dataclasses.replace(gripper, cups=((0.03, 0.0), (-0.02, 0.03), (-0.02, -0.03))))
+    return make_cup_array(dataclasses.replace(gripper, cups=((0.03, 0.0), (-0.02, 0.03), (-0.02, -0.03))))

@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.visibility.bvh_rays import stays_in_interior
 from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.gbuffer import Interior as DeviceInterior
 from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, WIDTH
-from synpick_warp.scenes.tote import tote_fixture
+from synpick_warp.scenes.bins import tote_fixture
 from synpick_warp.scenes.types import Interior, TriangleMesh
 from synpick_warp.stages.render import wide_bvh
 from synpick_warp.stages.render.wide_bvh import ABSENT, MAX_COORDINATE, build_levels, build_wide_bvh, needed_stack

@@ -38,7 +38,7 @@ class Lights:
     """(map, lamp, 2): unit vector towards the lamp's center and tangent of its angular radius; irradiance on a surface that faces it, and
     its share in that of a surface that faces up."""
     lamp_point: wp.array3d[wp.vec3]
-    """(map, lamp, point): unit vectors towards parts of the lamp of equal irradiance; see `scenes.lamps.stratify_light`."""
+    """(map, lamp, point): unit vectors towards parts of the lamp of equal irradiance; see `scenes.environment.stratify_light`."""
     lamp_rays: wp.array[int]
     """(map): shadow rays to each lamp from a pixel of the shadow grid, a power of two; with all lamps at most MAX_LAMPS."""
     total_lamp_irradiance: wp.array[wp.vec3]

@@ -10,7 +10,6 @@ import binascii
 import os
 import re
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import unquote, unquote_to_bytes
@@ -18,8 +17,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import msgspec
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, read_referred
-from synpick_warp.scenes.assets.mesh_parts import Notes
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, Notes, read_referred
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.inputs.json import decode_json
 
@@ -41,17 +39,13 @@ Four = tuple[float, float, float, float]
 _Item = TypeVar("_Item")
 
 
-class _Struct(msgspec.Struct):
-    """A part of the document; keys that are not declared are left out."""
-
-
-class Buffer(_Struct):
+class Buffer(msgspec.Struct):
     """glTF buffer: bytes of a file, of a data URI, or of the binary chunk."""
 
     uri: str | None = None
 
 
-class BufferView(_Struct):
+class BufferView(msgspec.Struct):
     """glTF buffer view: a range of bytes of a buffer."""
 
     buffer: Index
@@ -61,7 +55,7 @@ class BufferView(_Struct):
     extensions: dict[str, Any] = {}
 
 
-class SparsePart(_Struct):
+class SparsePart(msgspec.Struct):
     """Indices of the elements that a sparse accessor replaces, or values with which it does."""
 
     bufferView: Index  # noqa: N815
@@ -69,7 +63,7 @@ class SparsePart(_Struct):
     byteOffset: Index = 0  # noqa: N815
 
 
-class Sparse(_Struct):
+class Sparse(msgspec.Struct):
     """Sparse part of an accessor: number, indices and values of the elements that it replaces."""
 
     count: Index
@@ -77,7 +71,7 @@ class Sparse(_Struct):
     values: SparsePart
 
 
-class Accessor(_Struct):
+class Accessor(msgspec.Struct):
     """glTF accessor: type, number and location of the elements of an array."""
 
     componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]  # noqa: N815
@@ -89,7 +83,7 @@ class Accessor(_Struct):
     sparse: Sparse | None = None
 
 
-class Primitive(_Struct):
+class Primitive(msgspec.Struct):
     """glTF mesh primitive: accessors of its attributes and indices, topology and material."""
 
     attributes: dict[str, Index]
@@ -100,13 +94,13 @@ class Primitive(_Struct):
     extensions: dict[str, Any] = {}
 
 
-class Mesh(_Struct):
+class Mesh(msgspec.Struct):
     """glTF mesh: list of primitives, each with a material."""
 
     primitives: list[Primitive]
 
 
-class Node(_Struct):
+class Node(msgspec.Struct):
     """glTF node: mesh, children and transform."""
 
     mesh: Index | None = None
@@ -118,34 +112,34 @@ class Node(_Struct):
     scale: Three = (1.0, 1.0, 1.0)
 
 
-class Skin(_Struct):
+class Skin(msgspec.Struct):
     """glTF skin: nodes that are joints, and the accessor of their inverse bind matrices (None: identities)."""
 
     joints: list[Index]
     inverseBindMatrices: Index | None = None  # noqa: N815
 
 
-class GltfScene(_Struct):
+class GltfScene(msgspec.Struct):
     """glTF scene: its root nodes."""
 
     nodes: list[Index] = []
 
 
-class Image(_Struct):
+class Image(msgspec.Struct):
     """glTF image: a file, a data URI, or a buffer view."""
 
     uri: str | None = None
     bufferView: Index | None = None  # noqa: N815
 
 
-class Sampler(_Struct):
+class Sampler(msgspec.Struct):
     """glTF sampler: wrap modes along both axes."""
 
     wrapS: int = 10497  # noqa: N815
     wrapT: int = 10497  # noqa: N815
 
 
-class Texture(_Struct):
+class Texture(msgspec.Struct):
     """glTF texture: image, sampler and extensions."""
 
     source: Index | None = None
@@ -153,7 +147,7 @@ class Texture(_Struct):
     extensions: dict[str, Any] = {}
 
 
-class Transform(_Struct):
+class Transform(msgspec.Struct):
     """Offset, rotation and scale of texture coordinates (KHR_texture_transform)."""
 
     offset: tuple[float, float] = (0.0, 0.0)
@@ -162,13 +156,13 @@ class Transform(_Struct):
     texCoord: Index | None = None  # noqa: N815
 
 
-class InfoExtensions(_Struct):
+class InfoExtensions(msgspec.Struct):
     """Extensions of a texture reference that are read."""
 
     transform: Transform | None = msgspec.field(name=TRANSFORM, default=None)
 
 
-class TextureInfo(_Struct):
+class TextureInfo(msgspec.Struct):
     """Reference to a texture: its index, texture coordinate set and extensions."""
 
     index: Index
@@ -176,7 +170,7 @@ class TextureInfo(_Struct):
     extensions: InfoExtensions | None = None
 
 
-class Pbr(_Struct):
+class Pbr(msgspec.Struct):
     """Metallic-roughness parameters and textures of a material."""
 
     baseColorFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
@@ -186,7 +180,7 @@ class Pbr(_Struct):
     metallicRoughnessTexture: TextureInfo | None = None  # noqa: N815
 
 
-class Glossiness(_Struct):
+class Glossiness(msgspec.Struct):
     """Specular-glossiness parameters and textures of a material (KHR_materials_pbrSpecularGlossiness)."""
 
     diffuseFactor: Four = (1.0, 1.0, 1.0, 1.0)  # noqa: N815
@@ -196,13 +190,13 @@ class Glossiness(_Struct):
     specularGlossinessTexture: TextureInfo | None = None  # noqa: N815
 
 
-class MaterialExtensions(_Struct):
+class MaterialExtensions(msgspec.Struct):
     """Extensions of a material that are read."""
 
     glossiness: Glossiness | None = msgspec.field(name=GLOSSINESS, default=None)
 
 
-class GltfMaterial(_Struct):
+class GltfMaterial(msgspec.Struct):
     """glTF material: PBR parameters, extensions, and textures that are reported but not used."""
 
     pbrMetallicRoughness: Pbr | None = None  # noqa: N815
@@ -214,7 +208,7 @@ class GltfMaterial(_Struct):
     alphaMode: str = "OPAQUE"  # noqa: N815
 
 
-class Gltf(_Struct):
+class Gltf(msgspec.Struct):
     """Schema of a glTF document's JSON: arrays of its elements, which refer to one another by index, and the default scene."""
 
     extensionsUsed: list[str] = []  # noqa: N815
@@ -234,16 +228,7 @@ class Gltf(_Struct):
     scene: Index = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Document:
-    """Validated glTF document: its path, JSON content, and the bytes of its buffers."""
-
-    path: Path
-    gltf: Gltf
-    buffers: list[bytes]
-
-
-def read_document(path: Path, notes: Notes, data: bytes | None = None) -> Document:
+def read_document(path: Path, notes: Notes, data: bytes | None = None) -> tuple[Gltf, list[bytes]]:
     """Read a .glb or .gltf file, or decode `data` in its place, and the buffers that it refers to.
 
     Raises:
@@ -260,7 +245,7 @@ def read_document(path: Path, notes: Notes, data: bytes | None = None) -> Docume
         raise CatalogError(f"{path}: it is glTF 1.0, which is not readable; export it as glTF 2.0")
     gltf = decode_json(header, Gltf, where, CatalogError)
     _check_extensions(gltf, path, notes)
-    return Document(path, gltf, _read_buffers(gltf, chunks, path))
+    return gltf, _read_buffers(gltf, chunks, path)
 
 
 def _check_extensions(gltf: Gltf, path: Path, notes: Notes) -> None:

@@ -13,15 +13,17 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import (
     MAX_TEXTURE_FILE,
-    MAX_TEXTURE_PIXELS,
+    NO_MATERIAL,
+    WHITE,
     FileMaterial,
+    ImageCache,
     as_color,
     clamp_texture,
-    decode_texture,
     linear_to_srgb,
+    plain_color,
     srgb_to_linear,
 )
-from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, reading_as
+from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf.document import (
     COMPONENTS,
     COMPRESSED,
@@ -34,8 +36,8 @@ from synpick_warp.scenes.assets.gltf.document import (
     WIDTHS,
     Accessor,
     BufferView,
-    Document,
     Glossiness,
+    Gltf,
     GltfMaterial,
     Node,
     Pbr,
@@ -46,7 +48,7 @@ from synpick_warp.scenes.assets.gltf.document import (
     read_document,
     read_uri,
 )
-from synpick_warp.scenes.assets.mesh_parts import NO_MATERIAL, WHITE, MeshPart, Notes, plain_color
+from synpick_warp.scenes.assets.mesh_parts import MeshPart
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
 # Factors may exceed 0..1 by rounding.
@@ -62,28 +64,25 @@ def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshP
     """Read a .glb or .gltf file: one part for each primitive of each node of the default scene.
 
     Args:
-        path: The file.
-        notes: What is left out is noted there.
         data: Content to decode in place of the file's.
 
     Raises:
         CatalogError: The file or one that it refers to cannot be used.
     """
-    document = read_document(path, notes, data)
+    document, buffers = read_document(path, notes, data)
     with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
-        return _Reader(document, notes).parts()
+        return _Reader(path, document, buffers, notes).parts()
 
 
 class _Reader:
     """Decodes one document; materials and images are decoded once, so that parts share them."""
 
-    def __init__(self, document: Document, notes: Notes) -> None:
-        self.path, self.gltf, self.buffers, self.notes = document.path, document.gltf, document.buffers, notes
-        self.images: dict[int, np.ndarray] = {}
+    def __init__(self, path: Path, gltf: Gltf, buffers: list[bytes], notes: Notes) -> None:
+        self.path, self.gltf, self.buffers, self.notes = path, gltf, buffers, notes
+        self.images = ImageCache(self.path)
         self.files: dict[int, bytes] = {}
         self.tiles: dict[tuple[int, bool, bool], np.ndarray] = {}
         self.materials: dict[int, tuple[FileMaterial, TextureInfo | None]] = {}
-        self.pixels = 0
 
     def parts(self) -> list[MeshPart]:
         """Mesh parts of the default scene, depth first; without scenes, of all nodes.
@@ -322,7 +321,7 @@ class _Reader:
     def texture(self, info: TextureInfo) -> np.ndarray | None:
         """Decode the image of a texture (H, W, 3) uint8; None: it is missing, and replaced by a colour."""
         source = self.source(info)
-        if source not in self.images:
+        if source not in self.files:
             image = item_at(self.gltf.images, source, "image", self.path)
             if image.uri is not None:
                 uri = image.uri
@@ -333,11 +332,8 @@ class _Reader:
                 index = len(self.gltf.bufferViews) if image.bufferView is None else image.bufferView
                 view = item_at(self.gltf.bufferViews, index, "buffer view", self.path)
                 data = self.buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
-            self.files[source], self.images[source] = data, decode_texture(data, f"{self.path}: image {source}")
-            self.pixels += self.images[source].size // 3
-            if self.pixels > MAX_TEXTURE_PIXELS:
-                raise CatalogError(f"{self.path}: its textures have more than {MAX_TEXTURE_PIXELS} pixels together; scale them down")
-        return self.images[source]
+            self.files[source] = data
+        return self.images.decode(source, self.files[source], f"{self.path}: image {source}")
 
     def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
         """Material and coordinates with a sampler's wrap modes applied where coordinates leave 0..1: mirrored repetition as an image twice

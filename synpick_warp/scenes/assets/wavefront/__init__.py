@@ -1,1 +1,0 @@
-"""Wavefront import: OBJ meshes and MTL materials."""

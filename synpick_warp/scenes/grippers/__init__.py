@@ -1,1 +1,0 @@
-"""Grippers: the mechanism that all share, and a file for the head of each kind."""
