@@ -12,7 +12,7 @@ from synpick_warp.cli.main import main
 from synpick_warp.configs.cell.cameras import CameraRow, Pose
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory import assembly, warmup
-from synpick_warp.factory.compilation import launch_all
+from synpick_warp.factory.assembly import launch_all
 from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, dry_launches
 from synpick_warp.system.progress import SilentProgress
@@ -29,7 +29,7 @@ def all_boxes():
 
 
 def smallest(config: Config, device: wp.Device) -> assembly.Factory:
-    return assembly.build_smallest(config, device, SilentProgress(), False, True)
+    return assembly.build_smallest(config, device, SilentProgress(), online=True)
 
 
 def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):

@@ -80,7 +80,7 @@ class CameraRecord(msgspec.Struct):
 
 
 class Row(msgspec.Struct):
-    """Schema of a line of episodes.jsonl; see `episodes.EpisodeRow`."""
+    """Schema of a line of episodes.jsonl; see `factory.episodes.EpisodeOutcome`."""
 
     episode: Index
     arrangement: Index
@@ -105,7 +105,7 @@ class Row(msgspec.Struct):
 
 
 class InstanceObservation(msgspec.Struct):
-    """Schema of the perception result of an instance; see `factory.attempts.InstanceObservation`."""
+    """Perception result of one instance; see `stages.perception.arrays` for units and meaning."""
 
     instance: Index
     object_id: Index
@@ -129,13 +129,14 @@ class InstanceObservation(msgspec.Struct):
 
 
 class RecordedObservation(msgspec.Struct):
-    """Schema of the perception result of an attempt: instances and votes (lower, upper, votes); see
-    `factory.attempts.ObservationRecord`.
-    """
+    """Perception result on which an attempt is based."""
 
     resolution: tuple[Side, Side]
+    """Width and height of the perception image [px]."""
     instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_OBSERVED)]
+    """Instances in the scene, visible or not."""
     votes: Annotated[list[tuple[Index, Index, Amount]], msgspec.Meta(max_length=MAX_OBSERVED * (MAX_OBSERVED - 1))]
+    """(lower, upper, votes): occlusion votes of the contour of `lower` for `upper` lying above it; only nonzero ones."""
 
 
 class AttemptKey(msgspec.Struct):
@@ -145,29 +146,45 @@ class AttemptKey(msgspec.Struct):
     attempt: Index
 
 
-class Attempt(AttemptKey):
-    """Schema of a line of attempts.jsonl; target and grasp None: nothing was seen. See `factory.attempts.AttemptRecord`."""
+class Attempt(AttemptKey, omit_defaults=True):
+    """Attempt to pick, a line of attempts.jsonl: frames, outcome, target and grasp in the world (None: nothing was visible), rays, seals,
+    and what perception saw."""
 
     mode: Literal["pick", "target"]
     frame: Index
+    """Frame on which perception ran; its image does not show the gripper."""
     end_frame: Index
+    """Frame in which the attempt had ended."""
     outcome: str
     sentence: Annotated[str, msgspec.Meta(max_length=1000)]
     target: Index | None
     object_id: Number | None
+    """obj_id of the target."""
     point: Vector | None
+    """Grasp point [m]."""
     normal: Vector | None
+    """Unit surface normal at the grasp point."""
     yaw: float | None
+    """Yaw of the gripper shaft about the vertical [rad]."""
     tilt: Annotated[float, msgspec.Meta(ge=-4.0, le=4.0)] | None
+    """Tilt of the cup about the wrist axis, the shaft's y axis [rad]."""
     rays: Index
     hits: Index
+    """Rays that hit an object when suction was switched on."""
     good_seal: bool
+    """True if at most `suction.tolerated_misses` rays of each cup missed, so that seals had the break force of a good seal; with
+    `suction.vacuum`, if leaks left at least half of it below each cup."""
     engaged: Instances
+    """Instances that rays hit."""
     picked: Instances
+    """Instances that left the scene on the cup."""
     peak_force: Annotated[list[Amount], msgspec.Meta(max_length=100_000)]
+    """Peak seal force [N] in each tick of the lift, that of a seal that broke included; 0 in the first, which ends as suction begins."""
     observation: RecordedObservation
     sealed: Annotated[list[Index], msgspec.Meta(max_length=MAX_CUPS)] | None = None
+    """Cups with a good seal; None, and not in the file, for a gripper of one cup."""
     break_force: Amount | None = None
+    """Least break force of the cups that had something below them [N]; None, and not in the file, without `suction.vacuum` or hits."""
 
     def __post_init__(self) -> None:
         _check_name("outcome", self.outcome, names(Outcome)[1:])

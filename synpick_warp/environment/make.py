@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -26,19 +25,14 @@ from synpick_warp.environment.settings import (
     fixed_settings,
 )
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import build_smallest, build_stages, compiling_if_cold
-from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
-from synpick_warp.factory.sizes import fit_to_device
+from synpick_warp.factory.assembly import build_online
+from synpick_warp.factory.memory_plan import explain_shortage
 from synpick_warp.online.settings import resolve_settings
 from synpick_warp.stages.environment.sight import Sight
-from synpick_warp.stages.environment.twist import TwistLaw
-from synpick_warp.stages.environment.worlds import EnvironmentWorlds
+from synpick_warp.stages.environment.worlds import EnvironmentWorlds, TwistLaw
 from synpick_warp.stages.sim.trials import TrialLaw, make_course
-from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import LoggedProgress, Progress, SilentProgress
+from synpick_warp.system.progress import LoggedProgress, Progress
 
-NO_WRITERS = 0
-"""Writer processes in the memory plan: none."""
 CACHE = 4096
 """Largest number of different piles (`piles`) at which all are kept; of more, a pile is settled again whenever it is drawn."""
 
@@ -61,31 +55,19 @@ def make_picking(
     progress: Progress | None = None,
     perceives: bool = False,
 ) -> PickingEnvironment:
-    """Build a vector environment on a device; `vector.PickingVectorEnv` wraps it for Gymnasium.
+    """Build a vector environment on a device, from checked arguments of `make_env` and settings as for `bake`; `vector.PickingVectorEnv`
+    wraps it for Gymnasium.
 
-    Args:
-        choice: Checked arguments of `make_env`.
-        source, settings: Settings, as for `bake`.
-        device_name: Overrides `bake.device`.
-        progress: Receives stages and notes; None: silent.
-        perceives: Whether the paper's heuristic plans a grasp before each attempt in every task (`worlds.simulation.plan`), not in
-            target alone; it chooses as in a bake of this mode.
-
-    Raises:
-        SynpickError: A setting is not allowed, the machine has too little memory, or device, models, lights, bin or cameras cannot be used.
-    """
+    `device_name` overrides `bake.device`; `perceives`: whether the paper's heuristic plans a grasp before each attempt in every task
+    (`worlds.simulation.plan`), not in target alone; it chooses as in a bake of this mode. Raises SynpickError if a setting is not allowed,
+    the machine has too little memory, or device, models, lights, bin or cameras cannot be used."""
     progress = progress or LoggedProgress()
     config = resolve_settings(source, {**settings, **fixed_settings(choice)}, {"device": device_name})
     if choice.course == TRIAL:
         config = config.with_values({"pick.lift_height": config.picks.lift_height})
-    device = pick_device(config.bake.device)
-    config = fit_to_device(config, device, 1, NO_WRITERS)
-    check_memory(plan_memory(config, device, NO_WRITERS), device)
+    stages = build_online(config, progress, [])
+    config, simulation = stages.config, stages.simulation
     with explain_shortage(config):
-        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
-        with compiling_if_cold(smallest, device, progress):
-            stages = build_stages(config, device, progress, [])
-        config, simulation = stages.config, stages.simulation
         camera = config.rig.index(config.perception.camera)
         group = next(one for one in stages.groups if camera in one.cameras)
         if group.placed:

@@ -1,4 +1,5 @@
-"""Composition root: factory functions that build the stages of a bake (simulated worlds, renderer, encoders) and load its assets.
+"""Composition root: factory functions that build the stages of a bake (simulated worlds, renderer, encoders), load its assets, and compile
+its kernels ahead of time, in parallel threads.
 
 A bake generates a data set. Callers (bake, online stream, warm-up) pass the whole `Config`; stages take the sections that they need.
 """
@@ -7,14 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import gc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 import warp as wp
 
+from synpick_warp.codes import Ending, Status
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.gripper import describe_forces
 from synpick_warp.configs.cell.rig import Rig
@@ -22,12 +23,15 @@ from synpick_warp.configs.dataset.splits import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.schema import Config, Render
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory.attempts import AttemptLog
-from synpick_warp.factory.compilation import is_cache_warm, make_compiler, sole_compiler, submit_launches, submit_slow
-from synpick_warp.factory.memory_plan import check_memory, plan_memory
+from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.factory.episodes import PLACES, EpisodeOutcome
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kernel
+from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
+from synpick_warp.newton_patches.narrow_phase import slow_builds
 from synpick_warp.scenes.bins import Bin, make_bins, make_fixtures
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
@@ -43,12 +47,17 @@ from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, name_lights
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
+from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.views.bins import bin_record
 from synpick_warp.views.frames import most_words
+
+NO_WRITERS = 0
+"""Writer processes in the memory plan where nothing is written."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +92,28 @@ class Stages:
         """The nominal cameras, before the random offsets of each episode."""
         return self.episode_cameras.cameras
 
-    def sampled_fields(self, episode: int, objects: int, distractors: Mapping[int, str]) -> dict[str, Any]:
-        """Fields of `EpisodeRow` that record what is sampled at random for an episode: looks and cameras; None: not randomized.
-
-        Args:
-            objects: Number of instances in the episode.
-            distractors: Names of its distractors, by instance.
-        """
-        looks = draw_looks(self.randomized, self.config.bake.seed, episode, objects, distractors) if self.randomized else None
-        return {"looks": looks, "cameras": self.episode_cameras.record(episode)}
+    def episode_row(self, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeOutcome:
+        """Row of the episode that ended in a world."""
+        episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
+        config, bins, split = self.config, self.config.cell.recorded, DataLayout.of(self.config).split_of(episode)
+        drawn = config.bake.seed, episode, record.objects, dict(record.distractors)
+        return EpisodeOutcome(
+            episode,
+            arrangement,
+            Ending(ending),
+            frame + 1,
+            round(max(0, frame) * self.tick_time, PLACES),
+            record.mode,
+            record.objects,
+            len(record.attempts),
+            record.picked,
+            record.lost,
+            record.left,
+            "" if split is None else split.name,
+            looks=draw_looks(self.randomized, *drawn) if self.randomized else None,
+            bin=bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
+            cameras=self.episode_cameras.record(episode),
+        )
 
     def make_log(self) -> AttemptLog:
         """Create an empty attempt log."""
@@ -114,34 +136,84 @@ def build_factory(
     config: Config,
     progress: Progress,
     episodes: Sequence[int] | None = None,
-    records_physics: bool = False,
-    needs_images: bool = True,
     processes: int = 1,
     longest_first: bool = False,
     expected: int = 0,
 ) -> Factory:
     """Load assets and build the stages on the device.
 
-    Args:
-        episodes: Indices of the episodes to simulate; None: all.
-        records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
-        processes: Processes of the bake, which share the host's memory.
-        longest_first: Whether the episodes are reordered by `order_longest_first`.
-        expected: Number of episodes by which the number of worlds is chosen, if more than `episodes` has.
-
-    Raises:
-        SynpickError: The machine has too little memory, or device, models, lights, bins or cameras cannot be used.
-    """
+    `episodes` are the indices to simulate, None: all, which `longest_first` reorders by `order_longest_first`; `expected` is the number of
+    episodes by which the number of worlds is chosen, if these are fewer. `processes` of the bake share the host's memory. Raises
+    SynpickError if the machine has too little memory, or device, models, lights, bins or cameras cannot be used."""
     device = pick_device(config.bake.device)
     planned = DataLayout.of(config).planned if episodes is None else max(expected, len(episodes))
     needs = Needs.of(config)
     writers = count_writers(config.bake.writers, needs.slot_bytes)
     config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(plan_memory(config, device, writers), device, processes)
-    smallest = partial(build_smallest, config, device, SilentProgress(), records_physics, needs_images)
-    with compiling_if_cold(smallest, device, progress, needs.views):
-        stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
-        return _add_picks(_add_stream(stages, device, needs_images, needs.depth_files), progress)
+    with compiling_if_cold(config, device, progress):
+        stages = build_stages(config, device, progress, episodes, needs.physics, longest_first)
+        return _add_picks(_add_stream(stages, device, needs.images, needs.depth_files), progress)
+
+
+def build_online(config: Config, progress: Progress, episodes: Sequence[int]) -> Stages:
+    """Load assets and build the stages of a stream or an environment, whose views stay on the device. Errors as of `build_factory`."""
+    device = pick_device(config.bake.device)
+    config = fit_to_device(config, device, max(1, len(episodes)), NO_WRITERS)
+    check_memory(plan_memory(config, device, NO_WRITERS), device)
+    with explain_shortage(config), compiling_if_cold(config, device, progress, online=True):
+        return build_stages(config, device, progress, episodes)
+
+
+def is_cache_warm(device: wp.Device) -> bool:
+    """Whether the kernel cache is warm: it has a kernel that every bake launches, and that is compiled after all others.
+
+    Kernels that other settings need may still be missing.
+    """
+    return build_of(take_snapshot_kernel, device).is_cached()
+
+
+def sole_compiler(progress: Progress) -> AbstractContextManager[None]:
+    """Lock under which one process at a time compiles; see `compilation_lock`."""
+    return compilation_lock(lambda: progress.stage("waiting for another process, which compiles kernels"))
+
+
+def make_compiler(device: wp.Device | None, progress: Progress) -> Compiler:
+    """A compiler that reports "compiling kernels: 14 of 37 modules"; it compiles the kernel of `is_cache_warm` last.
+
+    Without a device it has no such kernel, and only reports what launches compile: a warm cache lacks kernels of other settings.
+    """
+    last = None if device is None else build_of(take_snapshot_kernel, device)
+    return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"), last)
+
+
+def submit_slow(compiler: Compiler, device: wp.Device) -> None:
+    """Start to compile what every bake needs and takes longest, before worlds are built that launch it."""
+    compiler.submit([build_of(read_binary_bvh_kernel, wp.get_device("cpu")), *slow_builds(device)])
+
+
+def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:
+    """Start to compile what `launch_all` launches in worlds that have not ticked yet. No kernel runs, so that their state stays; contents
+    of scratch arrays may change. Without a stream nothing is rendered."""
+    with dry_launches() as builds:
+        launch_all(simulation, stream)
+    simulation.clear_graphs()
+    compiler.submit(builds)
+
+
+def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
+    """Launch every kernel of simulation, perception, renderer and encoders once."""
+    record = simulation.record
+    for _ in range(2):  # The first tick launches kernels one by one and captures graphs; the second launches the graphs.
+        simulation.tick()
+    if simulation.perception is not None:
+        simulation.perception.load_kernels(record.snapshot)
+    report = read_tick(record)
+    if stream is not None:
+        report.status[:, Status.LIVE] = 1
+        for views in stream.render(record.snapshot, report):
+            len(views)
+    wp.synchronize_device(simulation.device)
 
 
 def _add_picks(factory: Factory, progress: Progress) -> Factory:
@@ -153,14 +225,12 @@ def _add_picks(factory: Factory, progress: Progress) -> Factory:
 
 
 @contextlib.contextmanager
-def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progress: Progress, renders: bool = True) -> Iterator[None]:
+def compiling_if_cold(config: Config, device: wp.Device, progress: Progress, online: bool = False) -> Iterator[None]:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, while the body of the context builds worlds.
 
     A dry run of a minimal factory, which is freed again, lists the kernels; all are compiled when the context is left. One process compiles
-    at a time. With a warm cache, kernels are compiled only when they are launched and missing, which is reported.
-
-    Args:
-        smallest: Builds the minimal factory, silently.
+    at a time. With a warm cache, kernels are compiled only when they are launched and missing, which is reported. `online`: as of
+    `build_smallest`.
     """
     if is_cache_warm(device):
         with make_compiler(None, progress):
@@ -173,20 +243,21 @@ def compiling_if_cold(smallest: Callable[[], Factory], device: wp.Device, progre
         progress.stage("compiling kernels, once")
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device)
-            factory = smallest()
-            submit_launches(compiler, factory.simulation, factory.stream if renders else None)
+            factory = build_smallest(config, device, SilentProgress(), online)
+            submit_launches(compiler, factory.simulation, factory.stream if online or Needs.of(config).views else None)
             del factory
             gc.collect()  # Warp's code generation leaves tracebacks, whose frames keep the factory's arrays alive.
             yield
 
 
-def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
-    """Build a factory with as few worlds as the device allows (MIN_GPU_WORLDS) and one view a batch. Arguments, errors: `build_factory`."""
+def build_smallest(config: Config, device: wp.Device, progress: Progress, online: bool = False) -> Factory:
+    """Build a factory with as few worlds as the device allows (MIN_GPU_WORLDS) and one view a batch; `online`: without the physics that
+    formats record, and with all images. Other arguments and errors: `build_factory`."""
     config = config.with_values({"bake.worlds": 1, "render.views_per_batch": 1})
     needs = Needs.of(config)
     config = fit_to_device(config, device, 1, count_writers(config.bake.writers, needs.slot_bytes))
-    stages = build_stages(config, device, progress, [0], records_physics)
-    return _add_stream(stages, device, needs_images, needs.depth_files)
+    stages = build_stages(config, device, progress, [0], needs.physics and not online)
+    return _add_stream(stages, device, needs.images or online, needs.depth_files)
 
 
 def _add_stream(stages: Stages, device: wp.Device, needs_images: bool, depth_files: bool) -> Factory:
@@ -255,11 +326,8 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
 
 def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
     """Resolve settings that depend on objects and bins: whether objects repeat in an episode (if they are too few to fill the bin), and
-    contact capacities.
-
-    Raises:
-        ConfigError: The capacities do not fit into the device's memory, the objects of `arrangement.counts` do not fit into the bins, or no
-            cup of the gripper can lie on any object.
+    contact capacities. Raises ConfigError if the capacities do not fit into the device's memory, the objects of `arrangement.counts` do not
+    fit into the bins, or no cup of the gripper can lie on any object.
     """
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)

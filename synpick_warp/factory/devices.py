@@ -15,7 +15,7 @@ import os
 import pickle
 import select
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import wait
@@ -40,7 +40,7 @@ from synpick_warp.scenes.build import REPEATS, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.looks import Looks, load_looks
-from synpick_warp.scenes.types import Catalog, EnvironmentMap
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.suction_surface import with_suctionable_area
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
@@ -87,15 +87,9 @@ class DeviceProcesses:
     """Processes of a bake, one per device; a context manager at whose end none of them, and none of their writers, runs any more."""
 
     def __init__(self, names: Sequence[str], program: str, lock: int) -> None:
-        """Start the processes, which load their libraries while this one prepares the folder.
-
-        Args:
-            program: Python code that calls `worker.main`.
-            lock: Handle that holds the folder's lock; all processes keep it open.
-
-        Raises:
-            DeviceError: Processes cannot be started.
-        """
+        """Start the processes, which load their libraries while this one prepares the folder. `program` is Python code that calls
+        `worker.main`, `lock` the handle that holds the folder's lock; all processes keep it open. Raises DeviceError if processes cannot be
+        started."""
         open_standard_descriptors()
         self._devices: list[_Device] = []
         self._reported: set[tuple[str, str]] = set()
@@ -119,18 +113,11 @@ class DeviceProcesses:
             getattr(progress, kind)(text)
 
     def run(self, shares: Sequence[Any], summary: BakeSummary, progress: Progress) -> str:
-        """Hand out the shares, and wait until all processes have ended; if a device is lost, the others go on.
+        """Hand out the shares, a `DeviceShare` each or what their program takes, and wait until all processes have ended; if a device is
+        lost, the others go on.
 
-        Args:
-            shares: What each device's process is sent: its `DeviceShare`, or what its program takes.
-            summary: Receives the processes' summaries; its `resumed` episodes count as done.
-
-        Returns:
-            Which devices were lost, and why; empty: none.
-
-        Raises:
-            SynpickError: The error of a process; the others are ended.
-        """
+        `summary` receives the processes' summaries; its `resumed` episodes count as done. Returns which devices were lost, and why; empty:
+        none. Raises the SynpickError of a process; the others are ended."""
         for device, share in zip(self._devices, shares, strict=True):
             with contextlib.suppress(OSError):  # It has died; its link says so below.
                 send(device.worker.link, share)
@@ -229,16 +216,40 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
             left -= 1
 
 
+def load_assets(config: Config, note: Callable[[str], None]) -> tuple[Catalog, tuple[EnvironmentMap, ...], Looks | None]:
+    """Objects, lights, and what appearance is drawn from; `note` receives remarks about them."""
+    catalog, strict = load_catalog(config, report=note), config.objects.strict
+    lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, note, strict)
+    return catalog, lights, load_looks(config.randomize, note, strict)
+
+
+@contextlib.contextmanager
+def open_exporters(
+    out: Path,
+    config: Config,
+    needs: Needs,
+    pool: WriterPool,
+    catalog: Catalog,
+    cameras: tuple[Camera, ...],
+    lights: tuple[EnvironmentMap, ...],
+    looks: Looks | None,
+) -> Iterator[Exporters]:
+    """Exporters of a bake, which are closed at the end; an error in between aborts them and their writers."""
+    exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), catalog, cameras, lights, pool, looks))
+    with aborting(pool, exporters):
+        yield exporters
+        exporters.close()
+
+
 def prepare_folder(output: OutputFolder, needs: Needs, catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None) -> None:
     """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     known = with_suctionable_area(catalog, config.suction.radius) if config.bop.graph else catalog
-    with WriterPool(1, needs.slot_bytes, output.lock) as pool:
-        context = ExportContext(output.out, ExportSettings.of(config), known, make_cameras(config.rig), lights, pool, looks)
-        exporters = Exporters(needs.classes, context)
-        with aborting(pool, exporters):
-            output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)
-            exporters.close()
+    with (
+        WriterPool(1, needs.slot_bytes, output.lock) as pool,
+        open_exporters(output.out, config, needs, pool, known, make_cameras(config.rig), lights, looks) as exporters,
+    ):
+        output.prepare(exporters, digest_inputs(catalog, lights, looks), pool)
 
 
 def bake_on_devices(
@@ -250,24 +261,16 @@ def bake_on_devices(
     summary: BakeSummary,
     progress: Progress,
 ) -> None:
-    """Generate the remaining episodes of a data set by one process per device.
-
-    Args:
-        config: All settings; `bake.writers` are shared out among the devices.
-        program: Python code that calls `worker.main`.
-
-    Raises:
-        SynpickError: A device was lost, or an error that the user can correct. Committed episodes stay.
-    """
+    """Generate the remaining episodes of a data set by one process per device, among which `bake.writers` are shared out; `program` is
+    Python code that calls `worker.main`. Raises SynpickError if a device was lost, or for what the user can correct. Committed episodes
+    stay."""
     differ = describe_kinds(names)
     if differ:
         progress.note(f"{differ}: devices of different kinds compute other last bits, so an episode depends on its device")
     with DeviceProcesses(names, program, output.lock) as processes:
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
-        catalog = load_catalog(config, report=partial(report, "note"))
-        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, partial(report, "note"), config.objects.strict)
-        looks = load_looks(config.randomize, partial(report, "note"), config.objects.strict)
+        catalog, lights, looks = load_assets(config, partial(report, "note"))
         check_disk(forecast_bake(config, catalog, output.remaining), output.out, progress)
         prepare_folder(output, needs, catalog, lights, looks)
         labelled = without_distractors(config.arrangement, config.randomize.most_distractors)

@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from synpick_warp.codes import Ending, Outcome
-from synpick_warp.configs.dataset.splits import DataLayout
-from synpick_warp.configs.episodes.manipulation import Perception
-from synpick_warp.configs.schema import Arrangement, Physics, Settle
-from synpick_warp.factory.attempts import EpisodeRecord
-from synpick_warp.stages.stream import TickReport
+from synpick_warp.configs.schema import Config
+from synpick_warp.factory.attempts import EpisodeRecord, encode_line
 from synpick_warp.system.progress import Progress
-from synpick_warp.views.bins import bin_record, name_bin
+from synpick_warp.views.bins import name_bin
 from synpick_warp.views.frames import EpisodeEnd
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
-
-
-SampledFields = Callable[[int, int, Mapping[int, str]], Mapping[str, Any]]
-"""Type of `Stages.sampled_fields`."""
 
 
 class EpisodeOutcome(NamedTuple):
@@ -93,7 +86,7 @@ class BakeSummary:
     """Time from the first tick to the last file [s]."""
     resampled: int = 0
     """Arrangements that ended without delivery and were resampled."""
-    resampled_by_ending: dict[Ending, int] = field(default_factory=dict)
+    resampled_by_ending: Counter[Ending] = field(default_factory=Counter)
     """These arrangements, by ending."""
     remedies: dict[Ending, str] = field(default_factory=dict)
     """Advice against these endings, where a setting cures them; see `remedy`."""
@@ -116,56 +109,24 @@ class BakeSummary:
         self.episodes.sort()
         self.views += other.views
         self.resampled += other.resampled
-        for ending, count in other.resampled_by_ending.items():
-            self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + count
+        self.resampled_by_ending.update(other.resampled_by_ending)
         self.remedies |= other.remedies
         self.outcomes.update(other.outcomes)
         self.stopped = self.stopped or other.stopped
         self.wall_seconds = max(self.wall_seconds, other.wall_seconds)
 
-    def take_resample(self, ending: Ending) -> None:
-        """Add an arrangement that ended without delivery and will be resampled."""
-        self.resampled += 1
-        self.resampled_by_ending[ending] = self.resampled_by_ending.get(ending, 0) + 1
-
-    def take_episode(self, row: EpisodeOutcome, record: EpisodeRecord) -> None:
-        """Count an episode that has ended in this run."""
-        self.episodes.append(row)
-        self.episodes.sort()
-        self.outcomes.update(attempt.outcome for attempt in record.attempts)
-
-
-def episode_row(
-    layout: DataLayout,
-    bins: Sequence[str],
-    tick_time: float,
-    sampled: SampledFields,
-    report: TickReport,
-    world: int,
-    record: EpisodeRecord,
-) -> EpisodeOutcome:
-    """Build the row of the episode that ended in a world.
-
-    `bins`: `Cell.recorded`; `tick_time`: time between two frames [s]; `sampled`: see `Stages.sampled_fields`.
-    """
-    episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
-    split = layout.split_of(episode)
-    return EpisodeOutcome(
-        episode,
-        arrangement,
-        Ending(ending),
-        frame + 1,
-        round(max(0, frame) * tick_time, PLACES),
-        record.mode,
-        record.objects,
-        len(record.attempts),
-        record.picked,
-        record.lost,
-        record.left,
-        "" if split is None else split.name,
-        bin=bin_record(bins[int(report.snapshot.bin[world])], report.snapshot.fixture_pose[world, 0]) if bins else None,
-        **sampled(episode, record.objects, dict(record.distractors)),
-    )
+    def take_end(self, row: EpisodeOutcome, record: EpisodeRecord, config: Config) -> str:
+        """Count an episode that has ended in this run, or an arrangement that will be resampled; returns `remedy` against its ending."""
+        if is_resampled(row, config.settle.tries):
+            self.resampled += 1
+            self.resampled_by_ending[row.ending] += 1
+        else:
+            self.episodes.append(row)
+            self.episodes.sort()
+            self.outcomes.update(Outcome[attempt.outcome.upper()] for attempt in record.attempts)
+        if advice := remedy(row.ending, config):
+            self.remedies[row.ending] = advice
+        return advice
 
 
 def is_resampled(row: EpisodeOutcome, tries: int) -> bool:
@@ -173,33 +134,30 @@ def is_resampled(row: EpisodeOutcome, tries: int) -> bool:
     return not row.ending.delivers and row.arrangement + 1 < tries
 
 
-_CAPACITIES = {
-    Ending.SOLVER_OVERFLOW: ("rows_per_world", "gripper_rows_per_world"),
-    Ending.CONTACT_OVERFLOW: ("contacts_per_world",),
-    Ending.PAIR_OVERFLOW: ("pairs_per_world",),
+_REMEDIES = {
+    Ending.SOLVER_OVERFLOW: ("raise", "physics.rows_per_world", "physics.gripper_rows_per_world"),
+    Ending.CONTACT_OVERFLOW: ("raise", "physics.contacts_per_world"),
+    Ending.PAIR_OVERFLOW: ("raise", "physics.pairs_per_world"),
+    Ending.PERCEPTION_OVERFLOW: ("raise", "perception.contour_points"),
+    Ending.ARRANGEMENT_OVERFLOW: ("lower", "arrangement.slot_shortfall"),
+    Ending.UNSETTLED: ("raise", "settle.max_time", "settle.max_redrops"),
 }
-"""Settings of physics to raise after an ending."""
+"""What to do after an ending, and with which settings."""
 
 
-def remedy(ending: Ending, physics: Physics, perception: Perception, arrangement: Arrangement, settle: Settle) -> str:
+def remedy(ending: Ending, config: Config) -> str:
     """Advice against an ending that is caused by a setting, with the current values; empty: no setting cures it."""
-    capacities = _CAPACITIES.get(ending, ())
-    if capacities:
-        return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
-    if ending is Ending.PERCEPTION_OVERFLOW:
-        return f"raise perception.contour_points ({perception.contour_points})"
-    if ending is Ending.ARRANGEMENT_OVERFLOW:
-        return f"lower arrangement.slot_shortfall ({arrangement.slot_shortfall:g})"
-    if ending is Ending.UNSETTLED:
-        return f"raise settle.max_time ({settle.max_time:g}) or settle.max_redrops ({settle.max_redrops})"
-    return ""
+    verb, *keys = _REMEDIES.get(ending, ("",))
+    values = {key: config.value(key) for key in keys}
+    named = (f"{key} ({value:g})" if isinstance(value, float) else f"{key} ({value})" for key, value in values.items())
+    return f"{verb} {' or '.join(named)}" if keys else ""
 
 
 def episode_end(row: EpisodeOutcome, record: EpisodeRecord, tries: int) -> EpisodeEnd:
     """Build the end-of-episode message for exporters; a resampled episode (`is_resampled`) has neither row nor attempts."""
     if is_resampled(row, tries):
         return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending))
-    lines = tuple(attempt.line(row.bin) for attempt in record.attempts)
+    lines = tuple(encode_line(attempt, row.bin) for attempt in record.attempts)
     return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending), row.as_json(), lines)
 
 

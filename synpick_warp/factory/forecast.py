@@ -80,11 +80,8 @@ def forecast_settings(config: Config, episodes: Sequence[int], progress: Progres
 
 
 def check_disk(forecast: Forecast, folder: Path, progress: Progress) -> None:
-    """Compare the forecast size with the free space of a folder's file system, and report if it may not suffice.
-
-    Raises:
-        OutputError: It certainly does not.
-    """
+    """Compare the forecast size with the free space of a folder's file system, and report if it may not suffice; raises OutputError if it
+    certainly does not."""
     free = shutil.disk_usage(folder).free
     if forecast.size <= free:
         return

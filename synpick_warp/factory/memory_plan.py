@@ -88,15 +88,11 @@ class Term:
 
 
 def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int = 1) -> list[Term]:
-    """Work out what a bake takes on a device by a dry run of its stages: nothing is allocated.
+    """Work out what a bake takes on a device by a dry run of its stages: nothing is allocated. On a GPU the plan is for
+    `with_enough_worlds`.
 
-    Body slots are counted at their maximum: the object capacity for each slot type.
-
-    Args:
-        device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
-        writers: Writer processes; 0: nothing is written, views stay on the device.
-        pieces: Convex pieces of each object, as far as they are known.
-    """
+    Body slots are counted at their maximum: the object capacity for each slot type. Without `writers` (0) views stay on the device;
+    `pieces` are the convex pieces of each object, as far as they are known."""
     config, needs = with_enough_worlds(config, device), Needs.of(config)
     worlds, objects, rig = config.bake.worlds, config.arrangement.max_objects, config.rig
     bodies = build.GRIPPER_BODIES + 2 * objects
@@ -152,14 +148,8 @@ def split_memories(terms: Sequence[Term], device: wp.Device, processes: int) -> 
 
 
 def check_memory(terms: Sequence[Term], device: wp.Device, processes: int = 1) -> None:
-    """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
-
-    Args:
-        processes: As of `split_memories`.
-
-    Raises:
-        ConfigError: One line with the largest term, its size, what is available, and the setting to lower.
-    """
+    """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels: raises ConfigError in one line
+    with the largest term, its size, what is available, and the setting to lower. `processes`: as of `split_memories`."""
     shared = "this machine" if processes == 1 else f"each of {processes} processes"
     for part, free in split_memories(terms, device, processes):
         needed, largest = sum(term.size for term in part), max(part, key=lambda term: term.size)
@@ -180,15 +170,8 @@ def check_memory(terms: Sequence[Term], device: wp.Device, processes: int = 1) -
 
 
 def check_episodes(count: int, planned: int) -> None:
-    """Refuse more episodes than this machine can list, before they are listed.
-
-    Args:
-        count: Episodes of this bake, or of its shard.
-        planned: `bake.episodes`.
-
-    Raises:
-        ConfigError: The lists alone exceed the free memory.
-    """
+    """Raise ConfigError for more episodes than this machine can list, before they are listed: `count` are those of this bake, or of its
+    shard, and `planned` is `bake.episodes`."""
     needed, free = count * EPISODE_BYTES, free_host_memory()
     if needed > free:
         raise ConfigError(
@@ -204,11 +187,7 @@ def is_shortage(error: BaseException) -> bool:
 
 @contextlib.contextmanager
 def explain_shortage(config: Config) -> Iterator[None]:
-    """Replace an out-of-memory error of the enclosed code by one that names the setting to lower.
-
-    Raises:
-        ConfigError: Memory ran out.
-    """
+    """Replace an out-of-memory error of the enclosed code by a ConfigError that names the setting to lower."""
     try:
         yield
     except Exception as error:  # Warp raises plain exceptions, too.
@@ -229,12 +208,8 @@ def _term(
 
 
 def _simulation(sizes: dict[str, int], stores_steps: bool | None, supports: bool, device: wp.Device) -> Iterator[Term]:
-    """State and record of the worlds, and the queue of ticks as `TickLoop` chooses it.
-
-    Args:
-        sizes: Extents by `record_sizes`.
-        stores_steps: Whether each step is recorded, not only each tick; None: no physics is.
-    """
+    """State and record of the worlds, with extents by `record_sizes`, and the queue of ticks as `TickLoop` chooses it. `stores_steps`:
+    whether each step is recorded, not only each tick; None: no physics is."""
     with dry_run() as state:
         *_, record = allocate_worlds(sizes, device)
     yield _term(f"the state of {sizes['world']:,} worlds", state, _WORLDS)
@@ -268,12 +243,8 @@ def _trials(sizes: dict[str, int], rows: int, physics: Physics, device: wp.Devic
 def _images(
     arrays: list[DryArray], sizes: dict[str, int], cameras: int, layers: tuple[str, ...], host: TransferSettings | None, device: wp.Device
 ) -> Iterator[Term]:
-    """Scratch of the renderer, and images of a batch of views.
-
-    Args:
-        sizes: Extents by `view_sizes`.
-        host: What is copied to the host; None: nothing is written.
-    """
+    """Scratch of the renderer, and images of a batch of views, with extents by `view_sizes`; `host`: what is copied to the host, None:
+    nothing is written."""
     views, size = sizes["view"], f"{sizes['column']:,}x{sizes['row']:,} px"
     copied: list[Any] = []
     with dry_run() as images:
@@ -351,13 +322,8 @@ def newton_rows(
     """Rows of Newton's arrays, each with the full keys of the settings by which it grows.
 
     Where `arrangement.counts` sets the number of bodies, they are counted, and rows are within 10 % of what is allocated. A volume budget
-    may need few of them, and rows are a lower bound.
-
-    Args:
-        own_bins: Whether they are the user's own, which have shapes of their own.
-        is_cuda: Whether the arrays lie in a GPU's memory.
-        pieces: Convex pieces of each object, as far as they are known.
-    """
+    may need few of them, and rows are a lower bound. `own_bins`: whether bins are the user's own, which have shapes of their own;
+    `is_cuda`: whether the arrays lie in a GPU's memory; `pieces`: as of `plan_memory`."""
     bodies = most_objects(arrangement.counts)
     # The capacities of many objects follow from their number.
     many = ("bake.worlds", "arrangement.max_objects") if arrangement.max_objects > FEW else ()

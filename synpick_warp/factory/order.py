@@ -49,11 +49,7 @@ def predict_frames(modes: np.ndarray, objects: np.ndarray, deviations: float = 0
 
 
 def order_longest_first(config: Config, catalog: Catalog, episodes: Sequence[int], device: wp.Device) -> list[int]:
-    """Sort the last SORTED_EPISODES episodes by `predict_frames`, the longest first, and then by index.
-
-    Args:
-        device: Device that samples modes and objects.
-    """
+    """Sort the last SORTED_EPISODES episodes by `predict_frames`, the longest first, then by index; `device` samples modes and objects."""
     indices = np.sort(np.asarray(episodes, np.int32))
     if not len(indices):
         return []

@@ -19,14 +19,12 @@ from synpick_warp.dataset.commit.manifest import committed_episodes, episode_ent
 from synpick_warp.dataset.commit.plausibility import describe_strays
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, digest_inputs, finalize_data_set
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.registry import Exporters, Needs, aborting
+from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.assembly import Factory, build_factory
+from synpick_warp.factory.assembly import Factory, build_factory, make_compiler
 from synpick_warp.factory.attempts import EpisodeRecord
-from synpick_warp.factory.compilation import make_compiler
-from synpick_warp.factory.devices import DeviceShare, bake_on_devices, prepare_folder
-from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, episode_row, is_resampled, remedy
+from synpick_warp.factory.devices import DeviceShare, bake_on_devices, load_assets, open_exporters, prepare_folder
+from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, is_resampled
 from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
 from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
 from synpick_warp.factory.order import EpisodeSource
@@ -34,11 +32,8 @@ from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.bin_meshes.loading import measure_meshes
-from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.looks import load_looks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
-from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.suction_surface import with_suctionable_area
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
@@ -66,17 +61,12 @@ def run_bake(
     splits: Sequence[str] = (),
     devices: Sequence[str] = (),
 ) -> BakeSummary:
-    """Simulate, render and write a data set, or the remaining episodes of one.
+    """Simulate, render and write a data set, or the remaining episodes of one, in a folder: new, empty, or of an earlier bake with the same
+    settings.
 
-    Args:
-        out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
-        shard: (i, n): only episodes with index % n == i.
-        splits: Only episodes of these splits; empty: all.
-        devices: Devices with a process each, see `pick_processes`; empty: `bake.device` alone.
-
-    Raises:
-        SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
-    """
+    `shard` (i, n): only episodes with index % n == i; `splits`: only their episodes, empty: all; `devices` have a process each, see
+    `pick_processes`, empty: `bake.device` alone. Raises SynpickError for what the user can correct; committed episodes stay, and the same
+    bake resumes."""
     config = with_measures(config, devices)
     planned = DataLayout.of(config).plan_shard(splits, shard)
     check_episodes(sum(map(len, planned)), config.bake.episodes)
@@ -100,18 +90,12 @@ def bake_episodes(
     processes: int = 1,
     stop: BakeLink | None = None,
 ) -> BakeSummary:
-    """Generate these episodes of a data set in a folder, or the remaining ones of them. Other arguments as of `run_bake`.
+    """Generate these episodes of a data set, sorted, in a folder, or the remaining ones of them; of an `EpisodeSource` one device takes
+    further ones, too. Other arguments and errors as of `run_bake`.
 
-    Args:
-        config: All settings, with measures (`with_measures`).
-        episodes: Indices, sorted; of an `EpisodeSource` one device takes further ones, too.
-        deliver: Called at the end, also after a stop, in place of writing the indices: takes the episodes elsewhere. None: writes them.
-        processes: Processes that bake on this host, which share its memory.
-        stop: Requests to stop one device; None: signals do.
-
-    Raises:
-        SynpickError: As `run_bake`.
-    """
+    `config` has measures (`with_measures`). `deliver` is called at the end, also after a stop, in place of writing the indices: it takes
+    the episodes elsewhere; None: they are written. `processes` bake on this host, and share its memory; `stop` requests to stop one device,
+    None: signals do."""
     needs, source = Needs.of(config), episodes if isinstance(episodes, EpisodeSource) else EpisodeSource(episodes)
     with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
@@ -154,25 +138,21 @@ def _fill(
     elif output.remaining:
         with scope("build"):
             own = {"processes": processes, "longest_first": True, "expected": source.expected}
-            factory = build_factory(config, progress, output.remaining, needs.physics, needs.images, **own)
+            factory = build_factory(config, progress, output.remaining, **own)
         if deliver is None:
             check_disk(forecast_bake(factory.config, factory.catalog, output.remaining), output.out, progress)
     else:
-        catalog = load_catalog(config, report=progress.note)
-        lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, progress.note, config.objects.strict)
-        prepare_folder(output, needs, catalog, lights, load_looks(config.randomize, progress.note, config.objects.strict))
+        prepare_folder(output, needs, *load_assets(config, progress.note))
     with WriterPool(count_writers(config.bake.writers, needs.slot_bytes), needs.slot_bytes, output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             catalog = with_suctionable_area(factory.catalog, config.suction.radius) if config.bop.graph else factory.catalog
-            context = ExportContext(output.out, settings, catalog, factory.cameras, factory.lights, pool, factory.randomized)
-            exporters = Exporters(needs.classes, context)
-            with aborting(pool, exporters):
+            assets = catalog, factory.cameras, factory.lights, factory.randomized
+            with open_exporters(output.out, config, needs, pool, *assets) as exporters:
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
                 _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, stop, source.more).run()
                 with scope("wait for writers"):
                     pool.wait()
-                exporters.close()
         if deliver is not None:
             deliver()
         elif not summary.stopped:
@@ -185,28 +165,21 @@ def _fill(
 
 
 def generate_share(share: DeviceShare, handles: Sequence[int], link: BakeLink) -> BakeSummary:
-    """Generate and commit the episodes of one device, in its process; the folder is prepared already.
-
-    Args:
-        handles: Handles that the writers keep open.
-        link: Receives reports, and requests to stop.
-    """
+    """Generate and commit the episodes of one device, in its process; the folder is prepared already. Writers keep the `handles` open; the
+    link receives reports, and requests to stop."""
     config, summary = share.config, BakeSummary(len(share.episodes))
     if config.bake.device == "cpu":
         limit_threads(max(1, count_cores() // share.processes))
     needs = Needs.of(config)
     with explain_shortage(config):
-        factory = build_factory(config, link, share.episodes, needs.physics, needs.images, processes=share.processes)
+        factory = build_factory(config, link, share.episodes, processes=share.processes)
         with WriterPool(config.bake.writers, needs.slot_bytes, *handles) as pool:
             link.writers = pool.pids()
             started = time.perf_counter()
-            settings = ExportSettings.of(config)
-            context = ExportContext(share.out, settings, factory.catalog, factory.cameras, factory.lights, pool, factory.randomized)
-            exporters = Exporters(needs.classes, context)
-            with aborting(pool, exporters):
+            assets = factory.catalog, factory.cameras, factory.lights, factory.randomized
+            with open_exporters(share.out, config, needs, pool, *assets) as exporters:
                 _Run(factory, exporters, needs.views, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
                 pool.wait()
-                exporters.close()
             summary.wall_seconds = time.perf_counter() - started
     return summary
 
@@ -230,7 +203,7 @@ class _Run:
         self.commit, self.summary, self.progress = commit, summary, progress
         expected = predict_length(factory.config, factory.catalog, factory.simulation.episodes.numpy()[:SAMPLED].tolist())
         self.meter = ThroughputMeter(len(factory.cameras), expected, summary, progress)
-        self.layout, self.picks = DataLayout.of(factory.config), factory.picks
+        self.picks = factory.picks
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
@@ -305,22 +278,16 @@ class _Run:
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         """End an episode: count it, and commit it, or resample its arrangement, by its ending."""
-        config, tries = self.factory.config, self.factory.config.settle.tries
-        bins, factory = config.cell.recorded, self.factory
-        row = episode_row(self.layout, bins, factory.tick_time, factory.sampled_fields, report, world, record)
-        end = episode_end(row, record, tries)
-        advice = remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle)
-        if advice:
-            self.summary.remedies[row.ending] = advice
+        tries = self.factory.config.settle.tries
+        row = self.factory.episode_row(report, world, record)
+        end, advice = episode_end(row, record, tries), self.summary.take_end(row, record, self.factory.config)
         if is_resampled(row, tries):
-            self.summary.take_resample(row.ending)
             note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))
             if self.picks is not None:
                 self.picks.drop(row.episode, row.arrangement)
             self.exporters.end_episode(end, lambda: None)
             return
-        self.summary.take_episode(row, record)
         commit = partial(self.exporters.end_episode, end, partial(self.commit, end))
         if self.picks is None:
             commit()

@@ -43,13 +43,8 @@ def without_pictures(config: Config) -> Config:
 
 
 def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int = 1, processes: int = 1) -> Config:
-    """Choose worlds and batches that the settings leave open. What they name stays, whether it fits or not.
-
-    Args:
-        episodes: Episodes that the device simulates.
-        writers: Writer processes of the device.
-        processes: Processes that share the host's memory.
-    """
+    """Choose worlds and batches that the settings leave open, for a device that simulates `episodes` and has `writers`; `processes` share
+    the host's memory. What settings name stays, whether it fits or not."""
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
     while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
@@ -84,14 +79,10 @@ def count_writers(writers: int, slot_bytes: int) -> int:
 
 
 def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple[str, ...]:
-    """Devices of a bake's processes: those named, by `pick_devices`, but no more than there are episodes.
+    """Devices of a bake's processes: those named, by `pick_devices`, whose errors are raised, but no more than there are episodes.
 
     For `ALL` without a GPU the CPU is repeated: once per usable core, since a process simulates on one, as far as the host's free memory
-    has room for each process with the fewest worlds and the smallest batches.
-
-    Raises:
-        DeviceError: As `pick_devices`.
-    """
+    has room for each process with the fewest worlds and the smallest batches."""
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
         least = config.with_values({key: 1 for key in _OPEN_SIZES if not config.value(key)})

@@ -12,8 +12,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory.assembly import build_smallest
-from synpick_warp.factory.compilation import launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
+from synpick_warp.factory.assembly import build_smallest, launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
@@ -33,11 +32,8 @@ class WarmUp:
 
 
 def check_caches() -> None:
-    """Check that kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost at its end.
-
-    Raises:
-        CacheError: A cache cannot be written.
-    """
+    """Raise CacheError unless kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost
+    at its end."""
     caches = (
         ("kernel", kernel_cache(wp.config.version), KERNEL_VARIABLE),
         ("shape", default_cache_dir() if user_cache() else None, USER_VARIABLE),
@@ -52,16 +48,10 @@ def check_caches() -> None:
 
 
 def warm_up(config: Config, progress: Progress) -> WarmUp:
-    """Compile the kernels of a bake or stream with these settings, then run two ticks and one rendering in the fewest worlds of the device.
+    """Compile the kernels of a bake or stream with these settings, then run two ticks and one rendering in the fewest worlds of the device;
+    errors as of `synpick_warp.bake`.
 
-    Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats).
-
-    Args:
-        progress: Receives the stages and the progress of the compilation.
-
-    Raises:
-        SynpickError: As `synpick_warp.bake`.
-    """
+    Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats)."""
     started = time.perf_counter()
     needs = Needs.of(config)
     device = pick_device(config.bake.device)
@@ -70,7 +60,7 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device)
             compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
-            factory = build_smallest(config, device, progress, needs.physics, needs.images)
+            factory = build_smallest(config, device, progress)
             stream = factory.stream if needs.views else None
             submit_launches(compiler, factory.simulation, stream)
         launch_all(factory.simulation, stream)

@@ -77,12 +77,8 @@ class BakeLink(SilentProgress):
 
 
 def main(generate: Callable[[Any, Sequence[int], BakeLink], BakeSummary]) -> None:
-    """Serve one share from the socket with handle argv[1]; the other handles are for the writers to keep open.
-
-    Args:
-        generate: Generates the episodes of a share (`devices.DeviceShare`, or what `cloud.workers` sends); its other arguments are these
-            handles and the link.
-    """
+    """Serve one share from the socket with handle argv[1]: `generate` generates its episodes from the share (`devices.DeviceShare`, or what
+    `cloud.workers` sends), the other handles, which are for the writers to keep open, and the link."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection, *handles = map(int, sys.argv[1:])
     link = Connection(connection)

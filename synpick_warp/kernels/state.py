@@ -109,7 +109,7 @@ class Observations:
     """Perception result of each instance, when its world was last observed: visible pixels and fraction, grasp point candidates [px], depth
     [m], votes[i, j] for j lying above i, clutter graph as bit sets of the instances above.
 
-    `factory.attempts.InstanceObservation` maps it to JSON.
+    `dataset.records.InstanceObservation` has it as JSON.
     """
 
     visible: wp.array2d[int]

@@ -23,8 +23,7 @@ from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError
-from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.online.settings import ARGUMENTS, resolve_settings
+from synpick_warp.online.settings import ARGUMENTS, Selection, choose_episodes, resolve_settings
 from synpick_warp.online.stream import open_stream
 from synpick_warp.stages.online.batches import ViewBatch
 from synpick_warp.system.hardware.device import pick_device
@@ -153,11 +152,7 @@ class StreamDataset(IterableDataset):
         self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[Any]:
-        """One epoch; in a worker, its part.
-
-        Raises:
-            ConfigError: A worker would use a GPU.
-        """
+        """One epoch; in a worker, its part. Raises ConfigError if a worker would use a GPU."""
         info, (index, count) = get_worker_info(), self.shard
         if info is not None:
             index, count = index + count * info.id, count * info.num_workers

@@ -11,7 +11,6 @@ from __future__ import annotations
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
-from functools import partial
 from types import TracebackType
 from typing import Self
 
@@ -22,21 +21,16 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.factory.assembly import Stages, build_smallest, build_stages, compiling_if_cold, group_layers
-from synpick_warp.factory.episodes import BakeSummary, episode_row, is_resampled, remedy
-from synpick_warp.factory.memory_plan import check_episodes, check_memory, explain_shortage, plan_memory
-from synpick_warp.factory.sizes import fit_to_device
-from synpick_warp.online.selection import Selection, choose_episodes
+from synpick_warp.factory.assembly import Stages, build_online, group_layers
+from synpick_warp.factory.episodes import BakeSummary, is_resampled
+from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
+from synpick_warp.online.settings import Selection, choose_episodes
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.stream import TickReport, describe_batches
 from synpick_warp.stages.ticks import TickLoop
-from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import Progress, SilentProgress
-
-DEVICE_ONLY = 0
-"""Writer processes in the memory plan of a stream: none, as views stay on the device."""
+from synpick_warp.system.progress import Progress
 
 
 class ViewStream:
@@ -165,17 +159,12 @@ class Producer:
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
         config, records = self.stages.config, self.log.update(report)
-        layout = DataLayout.of(config)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             record = records[int(report.column("episode")[world])]
-            row = episode_row(layout, config.cell.recorded, self.stages.tick_time, self.stages.sampled_fields, report, world, record)
+            row = self.stages.episode_row(report, world, record)
+            self.summary.take_end(row, record, config)
             if is_resampled(row, config.settle.tries):
-                self.summary.take_resample(row.ending)
                 self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.sentence}")
-            else:
-                self.summary.take_episode(row, record)
-            if advice := remedy(row.ending, config.physics, config.perception, config.arrangement, config.settle):
-                self.summary.remedies[row.ending] = advice
 
 
 def open_stream(
@@ -192,18 +181,13 @@ def open_stream(
     config = config.with_values({"bake.episodes": planned})
     if not indices:
         raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
-    device = pick_device(config.bake.device)
     check_episodes(len(indices), config.bake.episodes)
     selection = selection.resolve(len(config.rig))
     if selection.stride > 1:
         # A history holds the frame before, which is not rendered.
         config = config.with_values({"render.history": 0})
-    config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
-    check_memory(plan_memory(config, device, DEVICE_ONLY), device)
-    with explain_shortage(config):
-        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
-        with compiling_if_cold(smallest, device, progress):
-            stages = build_stages(config, device, progress, indices)
+    stages = build_online(config, progress, indices)
+    with explain_shortage(stages.config):
         scale = config.bop.depth_scale
         rings = tuple(BatchRing(group, group_layers(config.rig, config.render, index), scale) for index, group in enumerate(stages.groups))
     return ViewStream(Producer(stages, rings, selection, BakeSummary(len(indices)), progress))

@@ -4,7 +4,6 @@ them."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 import subprocess
@@ -19,12 +18,12 @@ import synpick_warp.exporters
 from synpick_warp.codes import Effect, Outcome, names
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
+from synpick_warp.dataset.records import Attempt, InstanceObservation
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.picks import FOLDER, STATES_FOLDER, PicksExporter
 from synpick_warp.exporters.registry import Exporters, Needs, load_exporter_classes
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GROUPS
-from synpick_warp.factory.attempts import AttemptRecord, ObservedInstance
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.testing.box_views import config
 from synpick_warp.testing.exporters import ExporterContract, export
@@ -124,7 +123,7 @@ def test_all_that_writers_produce_is_described():
     for package in ("bop/", "usd/", "trajectory/", "writing/"):
         assert f"`{package}`" in README.read_text(encoding="utf-8")
     assert set(LAYER_TABLE) <= described("Layers")
-    keys = {field.name for record in (AttemptRecord, ObservedInstance) for field in dataclasses.fields(record)}
+    keys = {*Attempt.__struct_fields__, *InstanceObservation.__struct_fields__}
     keys |= {*EpisodeOutcome._fields, "sentence", "checksum", *names(Outcome)} - {"none"}
     assert keys <= described("Episode and attempt lists")
     assert {"light", "effects", "instance_id", *names(Effect)} <= described("BOP scenes")

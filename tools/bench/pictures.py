@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from synpick_warp.codes import Phase
-from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
 from synpick_warp.stages.buffers import Snapshot
@@ -70,7 +69,7 @@ def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
     """
     started = time.perf_counter()
     config = bench.config.with_values({"bake.episodes": SPARE_EPISODES * bench.config.bake.worlds})
-    factory = build_factory(config, SilentProgress(), needs_images=Needs.of(config).images)
+    factory = build_factory(config, SilentProgress())
     stream, ring = factory.stream, factory.stream.rings[0]
     simulate_until_live(factory)
     for _ in range(bench.after):

@@ -14,7 +14,6 @@ import warp as wp
 
 from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.codes import Phase, Status, Task
-from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.stages import timing
@@ -51,7 +50,7 @@ CPU_VIEWS = 6
 def measure_worlds(bench: Bench, parts: tuple[str, ...]) -> Iterator[MeasuredRow]:
     """Measure the parts physics, perception, render, encode and stream of these, in this order."""
     started = time.perf_counter()
-    factory = build_factory(bench.config, SilentProgress(), needs_images=Needs.of(bench.config).images)
+    factory = build_factory(bench.config, SilentProgress())
     simulation, device = factory.simulation, factory.simulation.device
     wp.synchronize_device(device)
     yield MeasuredRow("load and build", time.perf_counter() - started, "s", part="setup")

@@ -7,7 +7,6 @@ import colorsys
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,7 +21,7 @@ from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import FAST, Config
-from synpick_warp.factory.assembly import build_smallest, compiling_if_cold, make_renderer
+from synpick_warp.factory.assembly import compiling_if_cold, make_renderer
 from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import read_objects
@@ -34,7 +33,7 @@ from synpick_warp.stages.constants import GRIPPER_HOME
 from synpick_warp.stages.render.scene import build_render_scene, with_cameras
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.progress import Progress, SilentProgress
+from synpick_warp.system.progress import Progress
 
 OVER_RIM = 0.15
 """Height of the gripper's cup over the rim of the bin [m]."""
@@ -89,8 +88,7 @@ class CellScene:
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
         catalog = Catalog(tuple(map(_entry, self.objects)))
         light = next(sky for sky in skies() if sky.name == _SKY)
-        smallest = partial(build_smallest, config, device, SilentProgress(), False, True)
-        with compiling_if_cold(smallest, device, progress):
+        with compiling_if_cold(config, device, progress, online=True):
             fixtures = make_fixtures(bins, config.gripper)
             any_camera = Camera(1, 1, np.eye(3), np.eye(3), np.zeros(3))
             self.scene = build_render_scene(self.config.render, bins[0].sizes.ground, catalog, fixtures, (any_camera,), (light,), device)
