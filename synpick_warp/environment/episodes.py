@@ -14,6 +14,7 @@ import numpy as np
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.errors import ConfigError, format_value
+from synpick_warp.system.random_numbers import GAMMA, mix
 
 OPTIONS = ("reset_mask", "env_idx", "episode")
 """Options of `reset`."""
@@ -70,29 +71,13 @@ class Episodes:
 
     def draw(self, environments: np.ndarray, piles: int, ahead: int = 0) -> np.ndarray:
         """Hash seed and counter to the index of each environment's next episode, 0 to `piles` - 1, or of the one `ahead` episodes later."""
-        counts = self.count[environments] + ahead
-        with np.errstate(over="ignore"):
-            key = _mix(self.seed[environments] * _GAMMA + counts.astype(np.uint64) + np.uint64(1))
-        return (key % np.uint64(piles)).astype(np.int64)
-
-
-_GAMMA = np.uint64(0x9E3779B97F4A7C15)
-"""Increment of SplitMix64 (Steele et al., 2014): 2^64 over the golden ratio."""
-
-
-def _mix(x: np.ndarray) -> np.ndarray:
-    """Output function (finalizer) of SplitMix64 for an array of uint64, as in `system.random_numbers`."""
-    y = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    y = (y ^ (y >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return y ^ (y >> np.uint64(31))
+        pairs = zip(self.seed[environments].tolist(), self.count[environments].tolist(), strict=True)
+        return np.array([mix(seed * GAMMA + count + ahead + 1) % piles for seed, count in pairs], np.int64)
 
 
 def make_seeds(seed: int | Sequence[int | None] | np.ndarray, count: int) -> dict[int, int]:
-    """Seeds by environment: `seed`, `seed` + 1 and so on, or one for each, of which None are left out.
-
-    Raises:
-        ConfigError: They are not whole numbers, or not one for each environment.
-    """
+    """Seeds by environment: `seed`, `seed` + 1 and so on, or one for each, of which None are left out. Raises ConfigError if they are not
+    whole numbers, or not one for each environment."""
     given = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str) else []
     if (first := to_index(seed)) is not None:
         given = [first + index for index in range(count)]
@@ -104,32 +89,26 @@ def make_seeds(seed: int | Sequence[int | None] | np.ndarray, count: int) -> dic
 
 
 def choose_environments(options: Mapping[str, Any], count: int) -> np.ndarray:
-    """Indices of the environments that `reset` begins anew (chosen) int64: those of `reset_mask`, else of `env_idx`, else all.
-
-    Raises:
-        ConfigError: An option is unknown or not allowed.
-    """
+    """Indices of the environments that `reset` begins anew (chosen) int64: those of `reset_mask`, else of `env_idx`, else all. Raises
+    ConfigError if an option is unknown or not allowed."""
     if unknown := sorted(set(options) - set(OPTIONS)):
         raise ConfigError(f"reset has no option {unknown[0]}; options: {', '.join(OPTIONS)}")
     if (mask := options.get("reset_mask")) is not None:
         return np.flatnonzero(check_mask("reset_mask", mask, count))
     if (given := options.get("env_idx")) is None:
         return np.arange(count)
-    chosen = np.atleast_1d(_host(given))
+    chosen = np.atleast_1d(host_array(given))
     if chosen.dtype.kind not in "iu" or chosen.ndim != 1 or ((chosen < 0) | (chosen >= count)).any() or len(set(chosen)) < len(chosen):
         raise ConfigError(f"env_idx is {given!r}; allowed: different environments of 0 to {count - 1}")
     return chosen.astype(np.int64)
 
 
 def choose_indices(options: Mapping[str, Any], count: int) -> np.ndarray | None:
-    """Episode indices that option `episode` asks for, for `count` environments, int64; None: they are drawn.
-
-    Raises:
-        ConfigError: They are not indices, or not one for each environment.
-    """
+    """Episode indices that option `episode` asks for, for `count` environments, int64; None: they are drawn. Raises ConfigError if they are
+    not indices, or not one for each environment."""
     if (given := options.get("episode")) is None:
         return None
-    chosen = _host(given)
+    chosen = host_array(given)
     if chosen.dtype.kind not in "iu" or chosen.shape not in ((), (count,)) or (chosen < 0).any() or (chosen >= INT32_MAX).any():
         raise ConfigError(f"episode is {given!r}; allowed: an index from 0 on, or one for each of {count} environments")
     return np.broadcast_to(chosen, count).astype(np.int64)
@@ -137,13 +116,13 @@ def choose_indices(options: Mapping[str, Any], count: int) -> np.ndarray | None:
 
 def check_mask(name: str, mask: Any, count: int) -> np.ndarray:
     """Check a mask of environments (environment) bool and return it on the host; raises ConfigError on another type or shape."""
-    given = _host(mask)
+    given = host_array(mask)
     if given.shape != (count,) or given.dtype != bool:
         raise ConfigError(f"{name} has the type {given.dtype} and the shape {given.shape}; allowed: bool, ({count},)")
     return given
 
 
-def _host(values: Any) -> np.ndarray:
+def host_array(values: Any) -> np.ndarray:
     """Copy an array of NumPy, PyTorch or Warp, or a list, to the host."""
     if hasattr(values, "detach"):
         values = values.detach().cpu()

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Ending, Outcome, Phase
-from synpick_warp.environment.episodes import Episodes, check_mask, choose_environments, choose_indices, make_seeds
+from synpick_warp.environment.episodes import Episodes, check_mask, choose_environments, choose_indices, host_array, make_seeds
 from synpick_warp.environment.settings import (
     MOVE,
     NEXT_STEP,
@@ -59,12 +59,7 @@ class EnvironmentStep(NamedTuple):
 class PickingEnvironment:
     """Vector environment whose actions are whole picks, or twists of the gripper for a tick; see the README of this package.
 
-    Attributes:
-        choice: Checked arguments of `make_env`.
-        worlds: The simulated worlds and their observations.
-        episodes: Episode counters.
-        bounds: Lowest and highest point that an action may name, each (3) float32 [m].
-    """
+    `bounds` are the lowest and highest point that an action may name, each (3) float32 [m]."""
 
     def __init__(self, choice: EnvironmentChoice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
         self.choice, self.worlds, self.bounds = choice, worlds, bounds
@@ -78,21 +73,13 @@ class PickingEnvironment:
     def reset(
         self, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes in all environments, or after the first reset in those that `options` choose.
+        """Begin episodes in all environments, or after the first reset in those that `options` choose; returns the observation of all, and
+        info.
 
-        Args:
-            seed: Seed of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each, of
-                which None continue with their next episodes, as all do by default.
-            options: "reset_mask" (environment) bool or "env_idx": environments to reset; "episode": episode index, or one for
-                each environment that is reset.
-
-        Returns:
-            Observation of all environments, and info.
-
-        Raises:
-            ConfigError: A seed or an option is not allowed.
-            StateError: A pile does not come to rest.
-        """
+        `seed` is that of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each, of which None continue with
+        their next episodes, as all do by default. Options: "reset_mask" (environment) bool or "env_idx", the environments to reset;
+        "episode", an episode index, or one for each environment that is reset. Raises ConfigError if a seed or an option is not allowed,
+        and StateError if a pile does not come to rest."""
         options = options or {}
         chosen = choose_environments(options, self.count)
         if self._is_new:
@@ -104,12 +91,9 @@ class PickingEnvironment:
         return self.observe(), self._describe()
 
     def step(self, actions: Any) -> EnvironmentStep:
-        """Carry out an action in each environment, a whole pick or a tick, and reset episodes that have ended, as `autoreset` says.
-
-        Raises:
-            ActionError: Actions have another shape, are not finite, or lie outside of the image or `bounds`.
-            StateError: The environment has not been reset.
-        """
+        """Carry out an action in each environment, a whole pick or a tick, and reset episodes that have ended, as `autoreset` says. Raises
+        ActionError if actions have another shape, are not finite, or lie outside of the image or `bounds`, and StateError if the
+        environment has not been reset."""
         if self._is_new:
             raise StateError("an environment is reset before its first step")
         episodes, autoreset = self.episodes, self.choice.autoreset
@@ -144,24 +128,24 @@ class PickingEnvironment:
 
     def get_state(self) -> EnvironmentState:
         """Save a checkpoint of all environments, from which they continue bit by bit; raises StateError if memory is too short."""
-        return EnvironmentState(self.worlds.get_state(), self.episodes.copy())
+        return EnvironmentState(self.worlds.simulation.get_state(range(self.count)), self.episodes.copy())
 
     def set_state(self, state: EnvironmentState, mask: Any = None) -> dict[str, Any]:
-        """Load a checkpoint into the environments of a mask (environment) bool; None: into all. Returns the observation.
-
-        Raises:
-            ConfigError: The mask has another type or shape.
-            StateError: The state has another number of environments, or is of other worlds.
-        """
+        """Load a checkpoint into the environments of a mask (environment) bool; None: into all. Returns the observation. Raises ConfigError
+        if the mask has another type or shape, and StateError if the state has another number of environments, or is of other worlds."""
         chosen = np.arange(self.count) if mask is None else np.flatnonzero(check_mask("mask", mask, self.count))
-        self.worlds.set_state(state.worlds, chosen.tolist())
+        if len(state.worlds) != self.count:
+            raise StateError(f"the state is of {len(state.worlds)} environments, not of {self.count}")
+        self.worlds.simulation.set_state(state.worlds, chosen.tolist(), chosen.tolist())
         self.episodes.assign(state.episodes, chosen)
         self._is_new = False
         return self.observe()
 
     def branch(self, environment: int, into: Sequence[int]) -> dict[str, Any]:
         """Copy the state of an environment to those of `into`; returns the observation. Raises StateError if one does not exist."""
-        self.worlds.branch(environment, into)
+        if wrong := [index for index in (environment, *into) if not 0 <= index < self.count]:
+            raise StateError(f"there is no environment {wrong[0]}; there are 0 to {self.count - 1}")
+        self.worlds.simulation.branch(environment, into)
         self.episodes.assign(self.episodes.copy(), list(into), environment)
         return self.observe()
 
@@ -171,22 +155,15 @@ class PickingEnvironment:
         return self.worlds.simulation.states.to_host(state.worlds) | counters
 
     def state_from_host(self, arrays: Mapping[str, np.ndarray]) -> EnvironmentState:
-        """Copy a checkpoint from the host to the device: the inverse of `state_to_host`.
-
-        Raises:
-            StateError: It is of another version, other objects, cell or capacities, or an array is missing, has another shape or
-                type, or is not finite.
-        """
+        """Copy a checkpoint from the host to the device: the inverse of `state_to_host`. Raises StateError if it is of another version,
+        other objects, cell or capacities, or an array is missing, has another shape or type, or is not finite."""
         likes = vars(self.episodes)
         counters = {name: check_array(f"episodes.{name}", arrays, like.dtype, like.shape) for name, like in likes.items()}
         return EnvironmentState(self.worlds.simulation.states.from_host(arrays), Episodes(**counters))
 
     def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:
-        """Check actions and copy them to the host (environment, value); those of inactive environments are replaced by 0.
-
-        Raises:
-            ActionError: See `step`.
-        """
+        """Check actions and copy them to the host (environment, value); those of inactive environments are replaced by 0. Errors as of
+        `step`."""
         given, action = to_host(actions), self.choice.action
         shape = (self.count, ACTION_SIZES.get(action, COMMAND))
         if given.shape != shape:
@@ -269,12 +246,8 @@ VECTORS = (wp.vec3, wp.vec3ub)
 
 def to_host(values: Any) -> np.ndarray:
     """Copy actions (array of NumPy, PyTorch or Warp, or nested lists) to the host; raises ActionError if they are not numbers."""
-    if isinstance(values, wp.array):
-        return values.numpy()
-    if hasattr(values, "detach"):
-        values = values.detach().cpu().numpy()
     try:
-        array = np.asarray(values)
+        array = host_array(values)
     except ValueError as error:
         raise ActionError(f"actions have no common shape: {error}") from error
     if array.dtype.kind not in "biuf":

@@ -72,11 +72,7 @@ def make_choice(
     piles: int | None,
     course: str,
 ) -> EnvironmentChoice:
-    """Check arguments of `make_env`.
-
-    Raises:
-        ConfigError: A value is not allowed.
-    """
+    """Check arguments of `make_env`; raises ConfigError if a value is not allowed."""
     _check_choice("task", task, TASKS)
     action = action or (TWIST if task == MOVE else PIXEL)
     _check_choice("action", action, ACTIONS)
@@ -107,7 +103,8 @@ def make_choice(
     if number is None or number < 0:
         raise ConfigError(f"seed is {format_value(seed)}; allowed: a whole number from 0 on")
     images = tuple(dict.fromkeys(names)), (sides[0], sides[1])
-    return EnvironmentChoice(task, int(num_envs), *images, action, autoreset, backend, number, *_rest(limits), course)
+    rest = int(limits["max_steps"]), min(int(limits["piles"]), INT32_MAX)
+    return EnvironmentChoice(task, int(num_envs), *images, action, autoreset, backend, number, *rest, course)
 
 
 def fixed_settings(choice: EnvironmentChoice) -> dict[str, object]:
@@ -140,11 +137,6 @@ def action_bounds(sizes: Sequence[BinSizes], bins: Bins) -> tuple[np.ndarray, np
     ground = min(one.origin[2] for one in sizes)
     height = max(one.origin[2] + one.height for one in sizes)
     return np.array([*-across, ground], np.float32), np.array([*across, height + HEADROOM], np.float32)
-
-
-def _rest(limits: Mapping[str, int]) -> tuple[int, int]:
-    """`max_steps`, and `piles` limited to the range of episode indices."""
-    return int(limits["max_steps"]), min(int(limits["piles"]), INT32_MAX)
 
 
 def _check_choice(name: str, value: object, allowed: Sequence[str]) -> None:

@@ -21,10 +21,8 @@ Box = gymnasium.spaces.Box
 class PickingVectorEnv(VectorEnv):
     """Vector environment of suction picking; see `synpick_warp.make_env` and the README of this package.
 
-    Attributes:
-        environment: The environment without Gymnasium, which does the work.
-        device: Name of the device of the worlds; results are there unless backend is "numpy".
-    """
+    `environment` is the one without Gymnasium, which does the work, and `device` the name of the device of the worlds, on which results are
+    unless backend is "numpy"."""
 
     def __init__(self, environment: PickingEnvironment) -> None:
         choice = environment.choice

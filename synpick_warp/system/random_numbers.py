@@ -9,24 +9,24 @@ from __future__ import annotations
 
 import numpy as np
 
-_GAMMA, _MIX_A, _MIX_B = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+GAMMA, _MIX_A, _MIX_B = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 _MASK = 2**64 - 1
 
 
 def stream_key(seed: int, *parts: int) -> int:
     """Key of a stream of random numbers: of the seed, then of episode, arrangement and `Stream`, and within it of further whole numbers."""
-    key = _mix(seed + _GAMMA)
+    key = mix(seed + GAMMA)
     for part in parts:
-        key = _mix((key ^ (part & _MASK)) + _GAMMA)
+        key = mix((key ^ (part & _MASK)) + GAMMA)
     return key
 
 
 def uniform(key: int, index: int) -> float:
     """Sample `index` of a stream, uniform in [0, 1): the upper 24 bits."""
-    return (_mix(key + (index + 1) * _GAMMA) >> 40) * 2.0**-24
+    return (mix(key + (index + 1) * GAMMA) >> 40) * 2.0**-24
 
 
-def _mix(x: int) -> int:
+def mix(x: int) -> int:
     """Output function of SplitMix64: a bijective 64-bit hash."""
     x &= _MASK
     y = (x ^ (x >> 30)) * _MIX_A & _MASK

@@ -17,7 +17,7 @@ from synpick_warp.environment.settings import make_choice
 from synpick_warp.errors import ActionError, ConfigError, StateError
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.trials import Trials, own_grasps
-from synpick_warp.system.random_numbers import _mix
+from synpick_warp.system.random_numbers import mix
 from tests.builders import PICKING, boxes
 from tests.environment.conftest import build, centers, same
 from tests.worlds.small_worlds import QUICK
@@ -69,7 +69,7 @@ def test_episodes_are_a_hash_of_seed_and_count():
     episodes.reseed({0: 3, 1: 4}, np.arange(2))
     drawn = [episodes.draw(np.arange(2), 2**31 - 1, ahead).tolist() for ahead in range(3)]
     gamma = 0x9E3779B97F4A7C15
-    assert drawn == [[_mix(seed * gamma + count + 1) % (2**31 - 1) for seed in (3, 4)] for count in range(3)]
+    assert drawn == [[mix(seed * gamma + count + 1) % (2**31 - 1) for seed in (3, 4)] for count in range(3)]
     assert len({index for row in drawn for index in row}) == 6
     assert (episodes.draw(np.arange(2), 5) < 5).all()
 
@@ -246,7 +246,10 @@ BAD_OPTIONS = [
 BAD_STATES = [
     (lambda one: one.branch(0, [2]), "there is no environment 2; there are 0 to 1"),
     (lambda one: one.worlds.bank.fetch(range(99)), "99 piles are asked for at once, but the bank keeps [48]"),
-    (lambda one: one.worlds.set_state(one.worlds.simulation.get_state([0]), [0]), "the state is of 1 environments, not of 2"),
+    (
+        lambda one: one.set_state(replace(one.get_state(), worlds=one.worlds.simulation.get_state([0]))),
+        "the state is of 1 environments, not of 2",
+    ),
 ]
 
 

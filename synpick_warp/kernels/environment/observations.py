@@ -6,6 +6,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
+from synpick_warp.kernels.state import Motion, Plans, Seals, Worlds
 from synpick_warp.kernels.structs import TILT, LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -95,14 +96,12 @@ def write_states_kernel(
     layout: LayoutData,
     object_id: wp.array[int],  # (entry)
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    body_slot: wp.array2d[int],  # (world, instance)
-    attached: wp.array2d[int],  # (world, instance)
-    yaw: wp.array[float],  # (world) [rad]
-    joint_q: wp.array[float],  # (coord) [m, rad]
-    body_q: wp.array[wp.transform],  # (body) [m]
+    state: Worlds,
+    seals: Seals,
+    plan: Plans,
+    motion: Motion,
     # Out:
-    state_out: wp.array2d[float],  # (world, value)
+    values_out: wp.array2d[float],  # (world, value)
 ):
     """Write each world's state vector: wrist, yaw, tilt, number of objects held; then by instance 1 (present), obj_id, held, pose.
 
@@ -111,22 +110,22 @@ def write_states_kernel(
     world = wp.tid()
     q = world * layout.coords
     for axis in range(3):
-        state_out[world, axis] = joint_q[q + axis]
-    state_out[world, 3] = yaw[world]
-    state_out[world, 4] = joint_q[q + TILT]
+        values_out[world, axis] = motion.joint_q[q + axis]
+    values_out[world, 3] = plan.yaw[world]
+    values_out[world, 4] = motion.joint_q[q + TILT]
     held = float(0.0)
     for instance in range(layout.instances):
         first = int(GRIPPER_VALUES) + instance * int(INSTANCE_VALUES)
-        index = catalog_index[world, instance]
+        index = state.catalog_index[world, instance]
         for value in range(int(INSTANCE_VALUES)):
-            state_out[world, first + value] = 0.0
+            values_out[world, first + value] = 0.0
         if index >= 0:
-            state_out[world, first] = 1.0
-            state_out[world, first + 1] = float(object_id[index])
-            if attached[world, instance] != 0:
-                state_out[world, first + 2] = 1.0
+            values_out[world, first] = 1.0
+            values_out[world, first + 1] = float(object_id[index])
+            if seals.attached[world, instance] != 0:
+                values_out[world, first + 2] = 1.0
                 held += 1.0
-            pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+            pose = motion.body_q[world * layout.bodies + layout.gripper_bodies + state.body_slot[world, instance]]
             for value in range(7):
-                state_out[world, first + 3 + value] = pose[value]
-    state_out[world, 5] = held
+                values_out[world, first + 3 + value] = pose[value]
+    values_out[world, 5] = held

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.errors import StateError
-from synpick_warp.kernels.environment import episodes as kernels
+from synpick_warp.kernels.environment import attempts as kernels
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.simulate import Simulation
 
@@ -19,21 +19,10 @@ POLL = 8
 class PileBank:
     """Checkpoint bank of settled piles. Settling takes all worlds; a pile depends on its episode alone, not on world or bank.
 
-    Attributes:
-        rows: Episode index -> row of `state`.
-        state: The checkpoints, one a row.
-    """
+    `rows` has the row of `state`, the checkpoints, by episode index."""
 
     def __init__(self, simulation: Simulation, capacity: int) -> None:
-        """Allocate the bank.
-
-        Args:
-            simulation: The worlds, after their first tick.
-            capacity: Most piles that are kept.
-
-        Raises:
-            StateError: Memory is too short.
-        """
+        """Allocate the bank for at most `capacity` piles of worlds after their first tick; raises StateError if memory is too short."""
         self.simulation, self.device = simulation, simulation.device
         self.state = simulation.states.allocate(capacity)
         self.rows: dict[int, int] = {}
@@ -44,15 +33,9 @@ class PileBank:
         self._done = wp.zeros(2, dtype=wp.int32, device=self.device)
 
     def fetch(self, episodes: Sequence[int], ahead: Sequence[int] = ()) -> list[int]:
-        """Look up the rows of episodes; settles the piles that the bank lacks, whereby the worlds' current states are lost.
-
-        Args:
-            episodes: Episode indices.
-            ahead: Episodes to prefetch: settled by worlds that would otherwise be idle.
-
-        Raises:
-            StateError: The bank is too small, or a pile does not come to rest.
-        """
+        """Look up the rows of episodes; settles the piles that the bank lacks, whereby the worlds' current states are lost. Those of
+        `ahead` are prefetched: settled by worlds that would otherwise be idle. Raises StateError if the bank is too small, or a pile does
+        not come to rest."""
         missing = [episode for episode in dict.fromkeys(episodes) if episode not in self.rows]
         if missing:
             worlds = self.simulation.layout.worlds

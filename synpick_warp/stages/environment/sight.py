@@ -10,7 +10,7 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.kernels.environment import grasps, observations
+from synpick_warp.kernels.environment import attempts, observations
 from synpick_warp.stages.arrays import allocate, device_array
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.launch import launch, launch_pixels
@@ -57,17 +57,8 @@ class Sight:
         wanted: Collection[str],
         shows_gripper: bool,
     ) -> None:
-        """Allocate images and vectors.
-
-        Args:
-            settings: Settings of perception.
-            rig: The cameras; `perception.camera`, or the first, is observed.
-            simulation: The worlds.
-            group: The group of the observed camera, with its renderer.
-            resolution: Width and height of the images [px].
-            wanted: Fields of `SightArrays` to be observed.
-            shows_gripper: Whether images other than `color` show the gripper.
-        """
+        """Allocate images and vectors: `wanted` fields of `SightArrays`, of `perception.camera` or the first, whose group has the renderer,
+        at a resolution (width, height) [px]. `shows_gripper`: whether images other than `color` show the gripper."""
         self.simulation, self.group, self.renderer, self.device = simulation, group, group.renderer, simulation.device
         self.camera = rig.index(settings.camera)
         width, height = resolution
@@ -103,22 +94,19 @@ class Sight:
             plan = simulation.plan
             launch(observations.write_target_points_kernel, len(worlds), target=plan.target, planned=plan.point, point_out=arrays.point)
         if arrays.state is not None:
-            sources = (simulation.scene, simulation.state, simulation.seals, simulation.physics.state)
-            given = {"yaw": simulation.plan.yaw, "object_id": self.renderer.scene.obj_id, "state_out": arrays.state}
+            sources = (simulation.scene, simulation.state, simulation.seals, simulation.plan, simulation.physics.state)
+            given = {"object_id": self.renderer.scene.obj_id, "values_out": arrays.state}
             launch(observations.write_states_kernel, len(worlds), *sources, **given)
         return arrays
 
     def grasp_pixels(self, pixel: wp.array, point: wp.array, direction: wp.array, instance: wp.array, running: wp.array) -> None:
-        """Back-project pixels (world) of the last images to surface points, with direction and instance; see `grasp_pixels_kernel`.
-
-        Raises:
-            ValueError: There are no images.
-        """
+        """Back-project pixels (world) of the last images to surface points, with direction and instance; see `grasp_pixels_kernel`. Raises
+        ValueError if there are no images."""
         if self.images is None:
             raise ValueError("pixels are no actions without images")
         given = {"window": self._window, "views": self.images.views, "pixel": pixel, "running": running}
         given |= {"point": point, "direction": direction, "instance": instance}
-        launch(grasps.grasp_pixels_kernel, len(pixel), self.arrays, **given)
+        launch(attempts.grasp_pixels_kernel, len(pixel), self.arrays, **given)
 
     def _copy_images(self, snapshot: Snapshot, worlds: np.ndarray) -> None:
         """Render the G-buffer of a batch of worlds, and copy depth, segmentation and normals to their images."""

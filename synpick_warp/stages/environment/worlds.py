@@ -1,4 +1,5 @@
-"""Worlds of the vector environment: attempts of different lengths, ticks of twists, resets from the bank of piles, branches.
+"""Worlds of the vector environment: attempts of different lengths, ticks of twists (Cartesian velocity control), resets from the bank of
+piles.
 
 A world whose attempt has ended is saved in that tick; when all have ended, every world is loaded as it was saved. So what a world does
 depends neither on the others nor on how long these take.
@@ -15,15 +16,17 @@ import warp as wp
 from synpick_warp.codes import Outcome
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.environment import attempts as kernels
-from synpick_warp.kernels.environment.grasps import plan_grasps_kernel
+from synpick_warp.kernels.environment import twist
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.environment.piles import POLL, PileBank
 from synpick_warp.stages.environment.sight import Sight
-from synpick_warp.stages.environment.twist import TwistLaw
 from synpick_warp.stages.launch import launch
+from synpick_warp.stages.perception.arrays import Plan
 from synpick_warp.stages.sim import gripper
+from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.sim.states import State
+from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 from synpick_warp.views.picks import MOVED
 
 RESULTS = struct_arrays(kernels.Results, "world", pose=("world", "instance"), units={"peak_force": "N", "farthest": "m", "pose": "m"})
@@ -33,28 +36,48 @@ LONGEST = 4096
 """Timeout of an attempt [ticks], which is never reached: setpoints arrive long before."""
 
 
-class EnvironmentWorlds:
-    """Simulated worlds that advance by an action at a time. The first `count` are environments; others pad the batch on a GPU, idle.
+COLUMNS = 6
+"""Columns of a command: linear velocity (3) [m/s], rates of yaw and tilt [rad/s], suction (on above 0)."""
 
-    Attributes:
-        simulation: The simulation, whose list of episodes is empty.
-        bank: Checkpoint bank of settled piles.
-        sight: Observations.
-    """
+
+class TwistLaw:
+    """Twist control as a `SetpointLaw`, in all modes. `command`: velocities of each world (world, column) float32; read in every step."""
+
+    def __init__(self, simulation: Simulation, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Allocate the commands; `lower` and `upper` are the corners of the box to which setpoints are clamped, each (3) [m]."""
+        self.simulation = simulation
+        self.lower, self.upper = wp.vec3(*lower.tolist()), wp.vec3(*upper.tolist())
+        self.command = wp.zeros((simulation.layout.worlds, COLUMNS), dtype=wp.float32, device=simulation.device)
+
+    def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+        """Do nothing: `start_tick` begins attempts."""
+
+    def start_tick(self) -> None:
+        """Begin attempts, and apply the commands of the next tick to yaw, tilt and suction. Runs before the tick."""
+        simulation = self.simulation
+        physics, worlds = simulation.physics, simulation.layout.worlds
+        sources = (simulation.scene, simulation.state, simulation.attempts, simulation.plan)
+        given = {"command": self.command, "tick_time": simulation.config.physics.tick_time}
+        launch(twist.begin_twists_kernel, worlds, *sources, simulation.seals, physics.state, physics.control, **given)
+        physics.set_yaw(simulation.plan.yaw)
+
+    def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """Integrate the setpoints over a step of physics."""
+        given = {"command": self.command, "lower": self.lower, "upper": self.upper}
+        launch(twist.follow_twists_kernel, len(state.phase), scene, state, self.simulation.physics.state, **given)
+
+    def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
+        """End attempts whose objects have been lifted to the height at which attempts begin."""
+        launch(twist.end_twists_kernel, len(state.phase), scene, state, attempts, plan, self.simulation.physics.state)
+
+
+class EnvironmentWorlds:
+    """Simulated worlds that advance by an action at a time. The first `count` are environments; others pad the batch on a GPU, idle."""
 
     def __init__(self, simulation: Simulation, sight: Sight, count: int, piles: int, law: TwistLaw | None, targets: bool) -> None:
-        """
-        Args:
-            simulation: The worlds, before their first tick.
-            sight: Observations of them.
-            count: Number of environments.
-            piles: Capacity of the bank; raised to what resets need.
-            law: Twist control, if actions are twists.
-            targets: Whether perception chooses a target before each attempt.
-
-        Raises:
-            StateError: Memory is too short.
-        """
+        """Take over worlds before their first tick, whose list of episodes is empty. `piles` is the capacity of the bank, raised to what
+        resets need, `law` the twist control, if actions are twists, and `targets` whether perception chooses a target before each attempt.
+        Raises StateError if memory is too short."""
         self.simulation, self.sight, self.count, self.law, self.targets = simulation, sight, count, law, targets
         self.device, worlds = simulation.device, simulation.layout.worlds
         simulation.tick(perceives=False)
@@ -68,16 +91,8 @@ class EnvironmentWorlds:
         self._pixel = wp.zeros(worlds, dtype=wp.vec2i, device=self.device)
 
     def reset(self, environments: np.ndarray, episodes: Sequence[int], ahead: Sequence[int] = ()) -> None:
-        """Load the settled piles of episodes into environments; the others keep their states.
-
-        Args:
-            environments: Their indices.
-            episodes: Episode index of each.
-            ahead: Episodes to prefetch; see `PileBank.fetch`.
-
-        Raises:
-            StateError: A pile does not come to rest, or memory is too short.
-        """
+        """Load the settled piles of episodes into environments; the others keep their states. `ahead`: as of `PileBank.fetch`. Raises
+        StateError if a pile does not come to rest, or memory is too short."""
         states, others = self.simulation.states, np.setdiff1d(np.arange(self.count), environments)
         settles = self.bank.misses(episodes)
         if settles:
@@ -127,26 +142,6 @@ class EnvironmentWorlds:
         state = self.simulation.state
         return state.phase.numpy()[: self.count], state.ending.numpy()[: self.count]
 
-    def get_state(self) -> State:
-        """Save a checkpoint of the environments, one a row."""
-        return self.simulation.get_state(range(self.count))
-
-    def set_state(self, state: State, environments: Sequence[int]) -> None:
-        """Load the rows of environments from a checkpoint.
-
-        Raises:
-            StateError: The state has another number of rows, or is of other worlds.
-        """
-        if len(state) != self.count:
-            raise StateError(f"the state is of {len(state)} environments, not of {self.count}")
-        self.simulation.set_state(state, environments, environments)
-
-    def branch(self, environment: int, into: Sequence[int]) -> None:
-        """Copy the state of an environment to those of `into`; raises StateError if one does not exist."""
-        if wrong := [index for index in (environment, *into) if not 0 <= index < self.count]:
-            raise StateError(f"there is no environment {wrong[0]}; there are 0 to {self.count - 1}")
-        self.simulation.branch(environment, into)
-
     def _attempt(self, active: np.ndarray) -> dict[str, np.ndarray]:
         """Simulate until every attempt has ended; returns the results: arrays (environment, ...) by the names of SHOWN.
 
@@ -157,10 +152,9 @@ class EnvironmentWorlds:
         given: dict[str, Any] = {"running": self._running, "grasp_point": self._point, "direction": self._direction}
         given |= {"instance": self._instance, "keeps_target": int(self.targets)}
         running = self._running.numpy().copy()
-        launch(plan_grasps_kernel, len(running), simulation.scene, out=plan, **given)
         states.save(self._held, self._table(np.flatnonzero(running == 0)))
         self._measure()
-        launch(kernels.begin_attempts_kernel, len(running), simulation.attempts, running=self._running)
+        launch(kernels.begin_attempts_kernel, len(running), simulation.scene, simulation.attempts, out=plan, **given)
         gripper.place_grippers(simulation.scene, simulation.state, simulation.attempts, plan, simulation.physics, simulation.behavior.law)
         ticks, count = 0, int(running.sum())
         while int(self._done.numpy()[0]) < count:
