@@ -57,8 +57,8 @@ def aligner(data):
 
 def test_observed_points_lie_on_the_boxes(data):
     (scene,) = read_scenes(data, [PLAN], EstimationOptions(REFINE))
-    for slot, (object_id, pose) in enumerate(zip(scene.object_ids.tolist(), scene.poses[0], strict=True)):
-        points = observed_points(scene, 0, slot, "depth")
+    for at in np.flatnonzero(scene.truth.row == 0):
+        object_id, pose, points = scene.truth.object_id[at], scene.poses[at], observed_points(scene, at, "depth")
         own = (points - pose[:3, 3]) @ pose[:3, :3]
         beyond = np.abs(own) / (np.array(SIZES[object_id]) / 2)
         # On a side: its coordinate is half the box's. Depth has steps of 0.1 mm.
@@ -81,7 +81,8 @@ def test_disturbed_boxes_come_back(data, aligner):
     (scene,) = scenes = read_scenes(data, [PLAN], options)
     poses = run_estimation(scenes, aligner, options).poses
     assert len(poses) == 6
-    true = {(frame, instance): scene.poses[frame, slot] for frame in (0, 1) for slot, instance in enumerate((0, 2, 3))}
+    keys = zip(scene.truth.images[scene.truth.row].tolist(), scene.truth.instance.tolist(), strict=True)
+    true = dict(zip(keys, scene.poses, strict=True))
     off = np.array([true[image, instance] for image, instance in zip(poses.image.tolist(), poses.instance.tolist(), strict=True)])
     # Two visible sides of a box leave a sliding direction open; the offset of 2 cm and the turn of 15° are mostly undone.
     assert np.median(np.linalg.norm(poses.translation - off[:, :3, 3], axis=1)) < 0.007
@@ -96,10 +97,10 @@ def test_a_search_finds_the_surface_without_a_start(data, aligner):
     options = EstimationOptions(SINGLE, threads=2)
     (scene,) = scenes = read_scenes(data, [PLAN], options)
     poses = run_estimation(scenes, aligner, options).poses
-    slots = {int(instance): slot for slot, instance in enumerate(scene.instances)}
+    rows = {key: at for at, key in enumerate(zip(scene.truth.row.tolist(), scene.truth.instance.tolist(), strict=True))}
     off = []
     for row in range(len(poses)):
-        points = observed_points(scene, scene.plan.frames.index(int(poses.image[row])), slots[int(poses.instance[row])], "depth")
+        points = observed_points(scene, rows[scene.plan.frames.index(int(poses.image[row])), int(poses.instance[row])], "depth")
         own = np.abs((points - poses.translation[row]) @ poses.rotation[row]) - np.array(SIZES[int(poses.object_id[row])]) / 2
         off.append(np.abs(own.max(axis=1)).mean())
     assert np.median(off) < 2e-3

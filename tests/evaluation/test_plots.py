@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.apps.evaluation.figures import (
-    plot_error_by_speed,
-    plot_error_by_visibility,
+    plot_error,
     plot_recall,
     plot_sweep,
     plot_trajectory,
@@ -119,7 +118,7 @@ def test_a_trajectory_is_of_one_track_whatever_the_order_of_its_rows():
 def test_bins_show_medians_with_misses_as_the_largest_error():
     speed = np.repeat([0.001, 0.7, 5.0], 10)
     errors = np.repeat([0.03, np.inf, np.inf], 10)
-    picture = picture_of(plot_error_by_speed(speed, {"method": errors}, "ADD"))
+    picture = picture_of(plot_error("speed", speed, {"method": errors}, "ADD"))
     dots = near(picture, PALETTE[0])
     for middle, share in ((0.5 / 8, 1 / 3), (7.5 / 8, 2 / 3)):
         column = round(LEFT + middle * (RIGHT - LEFT))
@@ -152,7 +151,7 @@ def test_long_and_strange_names_are_shortened_stay_distinct_and_stand_in_values_
             return {key: drop(value) for key, value in part.items() if key not in ("values", "domain", "datum")}
         return [drop(each) for each in part] if isinstance(part, list) else part
 
-    spec = plot_error_by_speed(np.ones(2), {evil: np.zeros(2)}, "ADD")
+    spec = plot_error("speed", np.ones(2), {evil: np.zeros(2)}, "ADD")
     assert evil in str(spec)
     assert evil not in str(drop(spec))
 
@@ -193,7 +192,7 @@ def test_fuzz_no_data_and_no_name_breaks_a_drawing(data):
     numbers = st.one_of(st.floats(0.0, 0.2), st.floats(0.0, 1e300), st.just(float("inf")))
     errors = {name: np.array(data.draw(st.lists(numbers, min_size=count, max_size=count))) for name in names}
     values = np.array(data.draw(st.lists(st.floats(-1e6, 1e6), min_size=count, max_size=count)))
-    pictures = [plot_recall(errors, "ADD"), plot_error_by_visibility(values, errors, "ADD")]
+    pictures = [plot_recall(errors, "ADD"), plot_error("visibility", values, errors, "ADD")]
     motion = Motion(images=count, velocity=tuple(data.draw(st.floats(-1e5, 1e5)) for _ in range(3)))
     truth = true_poses(motion)
     table = estimates(truth, data.draw(st.integers(0, 99)), noise=data.draw(st.floats(0.0, 10.0)))

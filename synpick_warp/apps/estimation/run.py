@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.estimation.scenes import ABSENT, EstimationScene, ScenePlan, read_scene
+from synpick_warp.apps.estimation.scenes import EstimationScene, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.results import TargetList, TargetRow, count_targets
 from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.dataset.bop.models import find_models
@@ -199,7 +199,7 @@ def read_scenes(
     scenes, layer = [], DEPTHS[options.depth]
     for plan in plans:
         scene = read_scene(data_set, plan)
-        if options.method == TRACK and not scene.tracked:
+        if options.method == TRACK and not scene.truth.tracked:
             place = scene.files.place
             raise DatasetError(f"{place} has no instance_id in its ground truth, by which instances are tracked; use another method")
         if layer != "depth" and layer not in scene.files.layers():
@@ -218,22 +218,23 @@ def ask(scene: EstimationScene, method: str, min_visibility: float, objects: Seq
     Tracks are asked in all frames from the first one on in which the instance is visible enough, as long as the image has it. Other methods
     are asked where it is visible enough, and of an object that counts: `objects` are the obj_ids of each planned frame, None: all.
     """
-    present = scene.index != ABSENT
-    asked = present & ~(scene.visibility < min_visibility) & (scene.boxes[..., 2] >= 0)
+    truth = scene.truth
+    asked = ~(truth.visibility < min_visibility) & (truth.box[:, 2] >= 0)
     if method == TRACK:
-        return replace(scene, asked=present & np.logical_or.accumulate(asked, axis=0))
-    for row, known in enumerate(objects):
-        if known is not None:
-            asked[row] &= np.isin(scene.object_ids, sorted(known))
-    return replace(scene, asked=asked)
+        instances, slot = np.unique(truth.instance, return_inverse=True)
+        begin = np.full(len(instances), len(scene))
+        np.minimum.at(begin, slot[asked], truth.row[asked])
+        return replace(scene, asked=truth.row >= begin[slot])
+    counts = [(known := objects[row]) is None or object_id in known for row, object_id in zip(truth.row, truth.object_id, strict=True)]
+    return replace(scene, asked=asked & np.array(counts, bool))
 
 
 def list_targets(scenes: Sequence[EstimationScene]) -> list[TargetRow]:
     """Target list of the instances that are asked for: scene, frame, object and number of instances."""
     rows = []
     for scene in scenes:
-        for step, slot in zip(*np.nonzero(scene.asked), strict=True):
-            rows.append((scene.plan.scene, scene.plan.frames[step], int(scene.object_ids[slot])))
+        frames, truth = scene.plan.frames, scene.truth
+        rows += [(scene.plan.scene, frames[truth.row[at]], int(truth.object_id[at])) for at in np.flatnonzero(scene.asked)]
     return count_targets(rows)
 
 
@@ -263,22 +264,23 @@ def run_estimation(
 def _estimate(scene: EstimationScene, steps: Sequence[int], aligner: Aligner, options: EstimationOptions) -> Iterator[Estimate]:
     """Estimates in these frames of a scene, in order; tracks go on from one to the next."""
     tracks: dict[int, np.ndarray] = {}
+    truth = scene.truth
     for step in steps:
         began = time.perf_counter()
         found: list[Estimate] = []
-        for slot in np.flatnonzero(scene.asked[step]).tolist():
-            points, truth = observed_points(scene, step, slot, DEPTHS[options.depth]), scene.poses[step, slot]
-            object_id, instance, frame = int(scene.object_ids[slot]), int(scene.instances[slot]), scene.plan.frames[step]
+        for at in np.flatnonzero(scene.asked & (truth.row == step)).tolist():
+            points = observed_points(scene, at, DEPTHS[options.depth])
+            object_id, instance, frame = int(truth.object_id[at]), int(truth.instance[at]), scene.plan.frames[step]
             if options.method == SINGLE:
                 pose, score = aligner.search(object_id, points)
             elif options.method == REFINE:
-                start = disturb_pose(truth, options.seed, scene.plan.scene, frame, instance)
+                start = disturb_pose(scene.poses[at], options.seed, scene.plan.scene, frame, instance)
                 pose, score = aligner.refine(object_id, points, start)
-            elif slot in tracks:
-                pose, score = aligner.refine(object_id, points, tracks[slot])
+            elif instance in tracks:
+                pose, score = aligner.refine(object_id, points, tracks[instance])
             else:
-                pose, score = truth, 1.0
-            tracks[slot] = pose
+                pose, score = scene.poses[at], 1.0
+            tracks[instance] = pose
             # A hidden instance keeps its track; other methods have no estimate of it.
             if score > 0.0 or options.method == TRACK:
                 found.append(Estimate(scene.plan.scene, frame, object_id, instance, pose, score, 0.0))
@@ -286,14 +288,15 @@ def _estimate(scene: EstimationScene, steps: Sequence[int], aligner: Aligner, op
         yield from (row._replace(seconds=seconds) for row in found)
 
 
-def observed_points(scene: EstimationScene, step: int, slot: int, layer: str) -> np.ndarray:
-    """Depth pixels of an instance's visible mask as points in the camera's axes (P, 3) float64 [m]; raises DatasetError if the image or the
-    mask is missing or damaged, or has another size than the data set's."""
+def observed_points(scene: EstimationScene, at: int, layer: str) -> np.ndarray:
+    """Depth pixels of the visible mask of an instance, a row of the ground truth, as points in the camera's axes (P, 3) float64 [m]; raises
+    DatasetError if the image or the mask is missing or damaged, or has another size than the data set's."""
+    truth, step = scene.truth, int(scene.truth.row[at])
     frame = scene.plan.frames[step]
-    if scene.boxes[step, slot, 2] < 0:
+    if truth.box[at, 2] < 0:
         return np.empty((0, 3))
     depth = scene.files.typed_image(layer, frame, None, "uint16")
-    mask = scene.files.mask("mask_visib", frame, int(scene.index[step, slot]))
+    mask = scene.files.mask("mask_visib", frame, at - int(np.searchsorted(truth.row, step)))
     rows, columns = np.nonzero(mask & (depth > 0))
     z = depth[rows, columns] * np.float64(scene.depth_scale[step])
     fx, fy, cx, cy = scene.intrinsics[step].astype(np.float64).tolist()

@@ -23,7 +23,6 @@ _METERS = 1e-3
 """In a millimetre."""
 _ORTHOGONAL = 1e-3
 """Tolerance of R Rᵀ = 1 for a rotation that is read, as in `dataset.view`."""
-ABSENT = -1
 MAX_LISTED = 10
 """Maximum number of values that a message lists."""
 
@@ -102,33 +101,21 @@ def _check(option: str, values: Sequence[object] | None, allowed: Sequence[objec
 
 @dataclass(frozen=True, eq=False)
 class EstimationScene:
-    """Scene to estimate: F planned frames and S instances (slots, by instance index)."""
+    """Scene to estimate: F planned frames, and N instances in all of them together."""
 
     plan: ScenePlan
     files: SceneFiles
     """Where its images are."""
-    size: tuple[int, int]
-    """Width and height of the images [px]."""
-    instances: np.ndarray
-    """Instance index by slot (S,) int64."""
-    object_ids: np.ndarray
-    """obj_id by slot (S,) int64."""
-    index: np.ndarray
-    """Index of the instance in the image's ground truth (F, S) int32; ABSENT: the image does not have it."""
+    truth: SceneArrays
+    """Its ground truth."""
     poses: np.ndarray
-    """Object to camera (F, S, 4, 4) float64 [m]; the identity where absent."""
-    visibility: np.ndarray
-    """Visible fraction (F, S) float64; 0 where absent; NaN: it is not known."""
-    boxes: np.ndarray
-    """Visible box (F, S, 4) int64 [px]: x, y, width, height as BOP has them; -1: nothing is visible."""
+    """Object to camera (N, 4, 4) float64 [m]."""
     intrinsics: np.ndarray
     """fx, fy, cx, cy (F, 4) float32 [px]."""
     depth_scale: np.ndarray
     """Depth of one count (F,) float32 [m]."""
     asked: np.ndarray
-    """Whether the instance is estimated in the frame (F, S) bool."""
-    tracked: bool
-    """Whether the instances can be followed from frame to frame: the annotations have instance ids."""
+    """Whether the instance is estimated (N,) bool."""
 
     def __len__(self) -> int:
         """Number of frames F."""
@@ -137,7 +124,7 @@ class EstimationScene:
 
 def read_scene(data_set: DataSet, plan: ScenePlan) -> EstimationScene:
     """Read the ground truth of a scene's planned frames; images are not read. Raises DatasetError if a file is missing or damaged, or an
-    instance has no index, two object ids, or is one of more than MAX_SLOTS."""
+    instance has no index or two object ids."""
     # Records stay in memory as long as the object that has read them: images get another one.
     source = data_set.scene_files(plan.episode, plan.camera)
     place = source.place
@@ -146,38 +133,29 @@ def read_scene(data_set: DataSet, plan: ScenePlan) -> EstimationScene:
     truth = read_arrays(source, plan.frames)
     truth.require_instances(place)
     instances, first, slot = np.unique(truth.instance, return_index=True, return_inverse=True)
-    object_ids, frames = truth.object_id[first], truth.images[truth.row]
-    other = np.flatnonzero(object_ids[slot] != truth.object_id)
+    frames = truth.images[truth.row]
+    other = np.flatnonzero(truth.object_id[first][slot] != truth.object_id)
     if len(other):
         instance, frame = truth.instance[other[0]], frames[other[0]]
         raise DatasetError(f"{place}: instance {instance} of image {frame} has another obj_id than before; {ADVICE}")
-    counts = truth.counts
-    shape = len(counts), len(instances)
-    index, visibility = np.full(shape, ABSENT, np.int32), np.zeros(shape)
-    poses, boxes = np.tile(np.eye(4), (*shape, 1, 1)), np.full((*shape, 4), -1, np.int64)
-    cells = truth.row, slot
-    twice = np.flatnonzero(np.bincount(np.ravel_multi_index(cells, shape), minlength=1) > 1)
+    twice = np.flatnonzero(np.bincount(truth.row * len(instances) + slot, minlength=1) > 1)
     if len(twice):
-        raise DatasetError(f"{place}: image {plan.frames[twice[0] // shape[1]]} has an instance_id twice; {ADVICE}")
-    index[cells] = np.arange(len(truth)) - np.repeat(np.cumsum(counts) - counts, counts)
-    visibility[cells], boxes[cells] = truth.visibility, truth.box
-    poses[..., :3, :3][cells], poses[..., :3, 3][cells] = truth.rotation, _METERS * truth.translation
-    _check_rotations(poses[..., :3, :3], plan, place)
+        raise DatasetError(f"{place}: image {plan.frames[twice[0] // len(instances)]} has an instance_id twice; {ADVICE}")
+    wrong = np.flatnonzero(~_are_rotations(truth.rotation))
+    if len(wrong):
+        raise DatasetError(f"{place}: a cam_R_m2c of image {frames[wrong[0]]} is no rotation; {ADVICE}")
+    poses = np.tile(np.eye(4), (len(truth), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = truth.rotation, _METERS * truth.translation
     matrices, scales = _read_cameras(truth, place)
+    source.image_size(plan.frames[0])  # Refuses a scene without images.
     return EstimationScene(
         plan=plan,
         files=data_set.scene_files(plan.episode, plan.camera),
-        size=source.image_size(plan.frames[0]),
-        instances=instances,
-        object_ids=object_ids,
-        index=index,
+        truth=truth,
         poses=poses,
-        visibility=visibility,
-        boxes=boxes,
         intrinsics=matrices[:, [0, 4, 2, 5]].astype(np.float32),
         depth_scale=(_METERS * scales).astype(np.float32),
-        asked=index != ABSENT,
-        tracked=truth.tracked,
+        asked=np.ones(len(truth), bool),
     )
 
 
@@ -206,9 +184,7 @@ def _read_cameras(truth: SceneArrays, place: object) -> tuple[np.ndarray, np.nda
     return matrices, np.array([camera.depth_scale for camera in truth.cameras])
 
 
-def _check_rotations(rotations: np.ndarray, plan: ScenePlan, place: object) -> None:
-    """Check that matrices (F, S, 3, 3) are rotations."""
-    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(2, 3), initial=0.0)
-    off = np.where(np.linalg.det(rotations) > 0.0, off, np.inf).max(axis=1, initial=0.0)
-    if (off > _ORTHOGONAL).any():
-        raise DatasetError(f"{place}: a cam_R_m2c of image {plan.frames[int(np.argmax(off > _ORTHOGONAL))]} is no rotation; {ADVICE}")
+def _are_rotations(matrices: np.ndarray) -> np.ndarray:
+    """Whether matrices (N, 3, 3) are rotations (N,) bool."""
+    off = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    return (off <= _ORTHOGONAL) & (np.linalg.det(matrices) > 0.0)

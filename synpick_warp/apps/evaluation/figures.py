@@ -35,10 +35,12 @@ _WHISKER = 4.5
 """Width of the line from the lower to the upper quartile [px]."""
 _CURVE, _DOT = 1.75, 61.0
 """Width of a curve [px], and area of the discs on it [px²]."""
-VISIBILITY_BINS = tuple(round(0.1 * number, 1) for number in range(11))
-"""Bin edges of the visible fraction: finer than the bands of tables."""
-SPEED_BINS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Bin edges of an object's speed [m/s], finer than the bands of tables; values beyond count in the outermost bins."""
+BINS: dict[str, tuple[Sequence[float], float, str]] = {
+    "visibility": (tuple(round(0.1 * number, 1) for number in range(11)), 100.0, "Visible fraction [%]"),
+    "speed": ((0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0), _CENTIMETERS, "Speed of the object [cm/s]"),
+}
+"""Field of `Truth` -> edges of bins, finer than the bands of tables, factor of the edges in the texts of the axis, and its title. Values
+beyond count in the outermost bins."""
 
 
 def plot_trajectory(
@@ -91,17 +93,6 @@ def plot_recall(errors: Mapping[str, np.ndarray], metric: str) -> Spec:
     return chart(x, [panel(axis("y", "Recall [%]", 0.0, 100.0), 300, lines)])
 
 
-def plot_error_by_visibility(visibility: np.ndarray, errors: Mapping[str, np.ndarray], metric: str) -> Spec:
-    """Error against the visible fraction of instances (N,), from 0 to 1: the panels and arguments of `plot_error_by_speed`."""
-    return _plot_bins(visibility, errors, metric, VISIBILITY_BINS, 100.0, "Visible fraction [%]")
-
-
-def plot_error_by_speed(speed: np.ndarray, errors: Mapping[str, np.ndarray], metric: str) -> Spec:
-    """Error against speed (N,) [m/s], in bins: above, median and quartiles of each method [cm]; below, the share of all instances [%].
-    Errors (N,) [m] are infinity for misses, which count as `LIMIT` as larger errors do."""
-    return _plot_bins(speed, errors, metric, SPEED_BINS, _CENTIMETERS, "Speed of the object [cm/s]")
-
-
 def plot_sweep(sweep: AlphaSweep, score: str) -> Spec:
     """Score against the filter's weight for each mode; rings mark the optima, thin lines the unfiltered scores."""
     alphas, colors = np.array(sweep.alphas), _colors(len(sweep.modes))
@@ -124,11 +115,11 @@ def plot_sweep(sweep: AlphaSweep, score: str) -> Spec:
     return chart(x, [panel(axis("y", score, low, high), 300, layers)])
 
 
-def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str, edges: Sequence[float], scale: float, label: str) -> Spec:
-    """Chart of errors by bins, drawn equally wide: median and quartiles of each method above, the share of instances [%] below.
-
-    `scale`: factor of the edges in the texts of the axis.
+def plot_error(kind: str, values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str) -> Spec:
+    """Error against visible fraction or speed (N,), a key of BINS, in bins that are drawn equally wide: above, median and quartiles of each
+    method [cm]; below, the share of all instances [%]. Errors (N,) [m] are infinity for misses, which count as `LIMIT` as larger errors do.
     """
+    edges, scale, label = BINS[kind]
     ticks = [f"{scale * edge:g}" for edge in edges]
     index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
     counts = np.bincount(index, minlength=len(edges) - 1)
@@ -274,18 +265,15 @@ def draw_figures(
 def _draw_errors(truth: Truth, scores: Sequence[Scores]) -> dict[str, Spec]:
     """Specifications of the error figures, of all methods together, by file name."""
     target = scores[0].target
-    visibility, speed = truth.visibility[target], truth.speed[target]
-    known, rated = np.isfinite(speed), np.isfinite(visibility)
     pictures = {}
     for metric in METRICS:
         errors = {each.name: each.errors[metric] for each in scores}
         pictures[f"recall_{_FILES[metric]}.png"] = plot_recall(errors, metric)
-        if rated.any():
-            shown = {name: values[rated] for name, values in errors.items()}
-            pictures[f"error_by_visibility_{_FILES[metric]}.png"] = plot_error_by_visibility(visibility[rated], shown, metric)
-        if known.any():
-            moving = {name: values[known] for name, values in errors.items()}
-            pictures[f"error_by_speed_{_FILES[metric]}.png"] = plot_error_by_speed(speed[known], moving, metric)
+        for kind in BINS:
+            values = getattr(truth, kind)[target]
+            if (known := np.isfinite(values)).any():
+                shown = {name: error[known] for name, error in errors.items()}
+                pictures[f"error_by_{kind}_{_FILES[metric]}.png"] = plot_error(kind, values[known], shown, metric)
     return pictures
 
 

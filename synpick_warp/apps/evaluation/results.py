@@ -59,12 +59,9 @@ class ResultFile:
 
 
 def read_results(path: Path) -> ResultFile:
-    """Read a BOP result file; rows are sorted by scene, image and object, and keep their order where these are equal.
-
-    Raises:
-        ResultError: In one line with the line's number: wrong columns, a number that is none, not finite or out of range, a matrix that is
-            no rotation, a row that is there twice; or the file is empty, too large or cannot be read.
-    """
+    """Read a BOP result file; rows are sorted by scene, image and object, and keep their order where these are equal. Raises ResultError in
+    one line with the line's number: wrong columns, a number that is none, not finite or out of range, a matrix that is no rotation, a row
+    that is there twice; or the file is empty, too large or cannot be read."""
     lines = read_file(path, MAX_RESULTS, ResultError).removeprefix(b"\xef\xbb\xbf").split(b"\n")
     while lines and not lines[-1].strip():
         lines.pop()

@@ -133,12 +133,8 @@ class Pairs:
 def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: int = PER_INSTANCE) -> Pairs:
     """Pair the best estimates with the instances of the same image and object; equal scores keep the order of the file, as in the toolkit.
 
-    Args:
-        truth: True poses.
-        target: Whether an instance is to be found (N,) bool; others are no partners, yet images without targets have no estimates to count.
-        estimates: Estimated poses.
-        top: Maximum number of estimates per image and object; PER_INSTANCE: as many as targets; ALL.
-    """
+    `target`: whether an instance is to be found (N,) bool; others are no partners, yet images without targets have no estimates to count.
+    `top`: maximum number of estimates per image and object; PER_INSTANCE: as many as targets; ALL."""
     truth_rows = np.flatnonzero(target)
     keys = [np.concatenate((getattr(truth, name)[truth_rows], getattr(estimates, name))) for name in ("scene", "image", "object_id")]
     group = _group_indices(keys)
@@ -152,7 +148,12 @@ def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: 
     rows, rank = rows[rank < limit], rank[rank < limit]
     partners = counts[estimate_group[rows]]
     first = np.repeat(starts[estimate_group[rows]], partners)
-    return Pairs(np.repeat(rows, partners), truth_rows[first + _ranks_of_runs(partners)], np.repeat(estimate_group[rows], partners))
+    place = _ranks(np.repeat(np.arange(len(partners)), partners))
+    return Pairs(
+        np.repeat(rows, partners),
+        truth_rows[first + place],
+        np.repeat(estimate_group[rows], partners),
+    )
 
 
 def match(pairs: Pairs, errors: np.ndarray, threshold: float, instances: int) -> np.ndarray:
@@ -188,9 +189,3 @@ def _ranks(groups: np.ndarray) -> np.ndarray:
     """Position of each entry in its run of equal values (N,)."""
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     return np.arange(len(groups)) - np.repeat(starts, np.diff(starts, append=len(groups)))
-
-
-def _ranks_of_runs(lengths: np.ndarray) -> np.ndarray:
-    """0, 1, ... for every run (sum of lengths)."""
-    ends = np.cumsum(lengths)
-    return np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - lengths, lengths)

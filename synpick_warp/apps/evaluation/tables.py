@@ -22,10 +22,8 @@ from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, t
 
 FORMATS = ("text", "latex", "csv", "json")
 GROUPS = ("object", "mode", "camera", "visibility", "speed")
-VISIBILITY_EDGES = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0)
-"""Limits of the bands of the visible fraction."""
-SPEED_EDGES = (0.0, 0.01, 0.05, 0.1, 0.25, 0.5, math.inf)
-"""Limits of the bands of the object's speed [m/s]; the first holds what rests."""
+BANDS = {"visibility": ((0.0, 0.1, 0.25, 0.5, 0.75, 1.0), "visible"), "speed": ((0.0, 0.01, 0.05, 0.1, 0.25, 0.5, math.inf), "m/s")}
+"""Field of `Truth` -> limits of its bands, and their unit; the first band of speed holds what rests."""
 THRESHOLDS = np.linspace(0.0, LIMIT, 51)
 """Thresholds of the recall curves [m]."""
 COLUMNS = tuple(f"{metric} {convention}" for metric in METRICS for convention in CONVENTIONS)
@@ -66,16 +64,11 @@ def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], 
 
 def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, str]) -> list[tuple[str, np.ndarray]]:
     """(name, mask (T,)) of each group of instances."""
-    if group == "object":
-        values = truth.poses.object_id[target]
-        return [(names.get(int(value), f"obj_{value:06d}"), values == value) for value in np.unique(values)]
-    if group == "mode":
-        return [(str(value), truth.mode[target] == value) for value in np.unique(truth.mode[target])]
-    if group == "camera":
-        return [(f"camera {value}", truth.camera[target] == value) for value in np.unique(truth.camera[target])]
-    edges, values, unit = (
-        (VISIBILITY_EDGES, truth.visibility[target], "visible") if group == "visibility" else (SPEED_EDGES, truth.speed[target], "m/s")
-    )
+    values = (truth.poses.object_id if group == "object" else getattr(truth, group))[target]
+    if group not in BANDS:
+        name = {"object": lambda value: names.get(int(value), f"obj_{value:06d}"), "mode": str, "camera": "camera {}".format}[group]
+        return [(name(value), values == value) for value in np.unique(values)]
+    edges, unit = BANDS[group]
     index = band_indices(values, edges)
     names_of_bands = (f"over {low:g} {unit}" if math.isinf(high) else f"{low:g} to {high:g} {unit}" for low, high in pairwise(edges))
     return [(name, index == band) for band, name in enumerate(names_of_bands)]
@@ -156,9 +149,10 @@ def _json(rows: Sequence[ScoreRow], truth: Truth, scores: Sequence[Scores]) -> s
         curves = {metric: recall_curve(errors, THRESHOLDS).tolist() for metric, errors in each.errors.items()}
         bands = {
             name: {
-                metric: [vars(band) for band in error_bands(errors, values[each.target], edges)] for metric, errors in each.errors.items()
+                metric: [vars(band) for band in error_bands(errors, getattr(truth, name)[each.target], edges)]
+                for metric, errors in each.errors.items()
             }
-            for name, values, edges in (("visibility", truth.visibility, VISIBILITY_EDGES), ("speed", truth.speed, SPEED_EDGES))
+            for name, (edges, _) in BANDS.items()
         }
         methods.append({"method": each.name, "seconds_per_image": each.seconds, "rows": table, "recall": curves, "bands": bands})
     content = {"limit": LIMIT, "thresholds": THRESHOLDS.tolist(), "methods": methods}

@@ -110,11 +110,8 @@ def track_of_instance(truth: PoseTable, table: PoseTable, tracks: np.ndarray) ->
     """Rows (n,) int64 of the track of a true instance, sorted by image: in each image the nearest estimate votes for its track; ties go to
     the lower index.
 
-    Args:
-        truth: True poses of one instance: one scene, one object, one row an image.
-        table: N estimates; the result is empty if the instance was never estimated.
-        tracks: Track of each row (N,), as `find_tracks` gives them.
-    """
+    `truth` has the true poses of one instance: one scene, one object, one row an image; `tracks` is the track of each of N estimates (N,),
+    as `find_tracks` gives them. The result is empty if the instance was never estimated."""
     images = np.sort(truth.image)
     rows = np.flatnonzero((table.scene == truth.scene[0]) & (table.object_id == truth.object_id[0]) & np.isin(table.image, images))
     if not len(rows):

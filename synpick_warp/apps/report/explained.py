@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -250,5 +249,5 @@ def _state_maps(data_set: DataSet) -> Iterator[Html]:
         for caption, picture in draw_pick_maps(view, episode.picks[episode.picks["state"] == state["state"]], _MAP_WIDTH):
             photo = encode_photo(picture)
             text = f"Episode {episode.index}, frame {view.frame}: {caption}."
-            shown = image(photo.kind, base64.b64encode(photo.data).decode("ascii"), text)
+            shown = image(photo.kind, photo.text, text)
             yield element("figure", shown, element("figcaption", text))

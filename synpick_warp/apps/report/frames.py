@@ -127,16 +127,12 @@ class Section(enum.Enum):
 
 
 class EncodedPicture(NamedTuple):
-    """Encoded image (WebP or PNG) of a report."""
+    """Encoded image of a report."""
 
     kind: str
     """webp or png."""
-    data: bytes
-
-    @property
-    def size(self) -> int:
-        """Bytes that the image takes in Base64."""
-        return 4 * -(-len(self.data) // 3)
+    text: str
+    """The file in Base64."""
 
 
 @dataclass
@@ -154,17 +150,13 @@ class Album:
 
     def add(self, section: Section, pictures: Sequence[EncodedPicture]) -> list[int] | None:
         """Add pictures that belong together; returns their indices, or None, and adds none, if the section's share is too small."""
-        size = sum(picture.size for picture in pictures)
+        size = sum(len(picture.text) for picture in pictures)
         if size > self.left(section):
             return None
         self.spent[section] += size
         first = len(self.pictures)
         self.pictures += pictures
         return list(range(first, len(self.pictures)))
-
-    def encoded(self) -> list[tuple[str, str]]:
-        """(kind, Base64 text) of each picture, in order."""
-        return [(picture.kind, base64.b64encode(picture.data).decode("ascii")) for picture in self.pictures]
 
 
 def shrink(image: np.ndarray, width: int, *, smooth: bool = True) -> np.ndarray:
@@ -177,23 +169,23 @@ def shrink(image: np.ndarray, width: int, *, smooth: bool = True) -> np.ndarray:
 
 def encode_photo(image: np.ndarray, quality: int = PHOTO_QUALITY) -> EncodedPicture:
     """Encode an image (H, W, 3) uint8, blue first, as WebP."""
-    return EncodedPicture("webp", _encode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality]))
+    return _encode("webp", image, [cv2.IMWRITE_WEBP_QUALITY, quality])
 
 
 def encode_ids(image: np.ndarray) -> EncodedPicture:
     """Encode an id image (H, W) uint8 as a lossless PNG."""
-    return EncodedPicture("png", _encode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
+    return _encode("png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
-def _encode(suffix: str, image: np.ndarray, options: list[int]) -> bytes:
+def _encode(kind: str, image: np.ndarray, options: list[int]) -> EncodedPicture:
     """Encode an image by OpenCV; raises OutputError if it cannot."""
     try:
-        encoded, data = cv2.imencode(suffix, image, options)
+        encoded, data = cv2.imencode(f".{kind}", image, options)
     except cv2.error:
         encoded, data = False, np.empty(0, np.uint8)
     if not encoded:
-        raise OutputError(f"OpenCV cannot encode {image.shape[1]} x {image.shape[0]} pixels as {suffix}; use another build of OpenCV")
-    return data.tobytes()
+        raise OutputError(f"OpenCV cannot encode {image.shape[1]} x {image.shape[0]} pixels as .{kind}; use another build of OpenCV")
+    return EncodedPicture(kind, base64.b64encode(data.tobytes()).decode("ascii"))
 
 
 WIDTH = 960
@@ -211,6 +203,8 @@ STRIP_WIDTH = 420
 """Largest width of a picture of a film strip [px]: three stand side by side."""
 STRIP_QUALITY = 74
 """WebP quality: pictures in motion."""
+SUCCESSES = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
+"""Names of the outcomes of attempts that picked."""
 _PROBES = 3
 """Frames that are encoded first, to learn how many fit the budget."""
 _MARGIN = 1.15
@@ -340,7 +334,7 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
         return cache[frame, camera]
 
     every = range(len(episode))
-    probes = [sum(encode(frame, camera).size for camera in cameras) for frame in spread(every, _PROBES)]
+    probes = [sum(len(encode(frame, camera).text) for camera in cameras) for frame in spread(every, _PROBES)]
     fitting = int(album.left(Section.EPISODES) / max(1, strips) / (_MARGIN * max(probes)))
     count = min(MAX_FRAMES, len(episode), fitting)
     if count < min(2, len(episode)):
@@ -363,14 +357,13 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
 
 def _spans(episode: Episode) -> list[dict[str, Any]]:
     """First and last frame of each attempt, and how it ended."""
-    succeeded = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
     return [
         {
             "attempt": attempt["attempt"],
             "first": attempt["frame"],
             "last": attempt["end_frame"],
             "sentence": attempt["sentence"],
-            "success": attempt["outcome"] in succeeded,
+            "success": attempt["outcome"] in SUCCESSES,
         }
         for attempt in episode.attempts
     ]

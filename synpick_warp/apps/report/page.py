@@ -18,10 +18,9 @@ from typing import Any
 
 from synpick_warp.apps.report.charts import Chart
 from synpick_warp.apps.report.findings import NOTE, WARNING, Remark, count_levels
-from synpick_warp.apps.report.frames import Album
+from synpick_warp.apps.report.frames import SUCCESSES, Album
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
-from synpick_warp.codes import Outcome
 from synpick_warp.configs.files.load import load_config, sections, settings_of
 from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Config
@@ -89,7 +88,7 @@ def tiles(statistics: Statistics) -> Html:
     total = statistics.total
     episodes, counted = total.episodes, total.annotations
     drawn = sum(1 for each in statistics.objects if each.instances)
-    picked = sum(count for name, count in episodes.outcomes.items() if name in _SUCCESSES)
+    picked = sum(count for name, count in episodes.outcomes.items() if name in SUCCESSES)
     figures = [
         ("episodes", f"{episodes.episodes:,}"),
         ("cameras", f"{statistics.cameras}"),
@@ -101,9 +100,6 @@ def tiles(statistics: Statistics) -> Html:
         ("attempts that picked", f"{picked:,} of {episodes.attempts:,}" if episodes.attempts else UNKNOWN),
     ]
     return join(element("div", element("dt", term), element("dd", value)) for term, value in figures)
-
-
-_SUCCESSES = {outcome.name.lower() for outcome in Outcome if outcome.succeeded}
 
 
 def statistics_tables(statistics: Statistics) -> Html:
@@ -234,7 +230,7 @@ def render(page: Page) -> Iterator[str]:
         sections=join(element("section", element("h2", one.title), element("p", one.lead), one.body, id=one.name) for one in page.parts),
         footer=join([page.footer]),
     )
-    for index, (kind, data) in enumerate(page.album.encoded()):
+    for index, (kind, data) in enumerate(page.album.pictures):
         yield f'<script type="text/plain" id="picture-{index}" data-kind="{kind}">{data}</script>\n'
     yield Template(tail).substitute(content=embed_json(content), vega=vega, script=script)
 

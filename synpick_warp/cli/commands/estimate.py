@@ -104,7 +104,7 @@ def run_method(
     plans, complete = plan_scenes(data_set, selection)
     with CountProgress(make_console()) as counter:
         scenes = read_scenes(data_set, plans, options, selection.targets, counter.report)
-        wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
+        wanted = sorted({int(object_id) for scene in scenes for object_id in scene.truth.object_id[scene.asked]})
         run = run_estimation(scenes, Aligner(read_object_models(data_set.folder, wanted)), options, counter.report)
     listed = None if complete and not part else targets_file(out)
     if listed is not None:
