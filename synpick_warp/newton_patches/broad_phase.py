@@ -28,10 +28,8 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
     once, to find which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical
     worlds; see `replace_broad_phase`.
 
-    Attributes:
-        overlap_count: Number of pairs whose bounding boxes overlap (one) int32; those beyond the capacity for pairs are dropped.
-        choose: Lists those of these pairs (overlap) vec2i, and their number (one) int32, that may have contacts; None: all may.
-    """
+    `overlap_count` is the number of pairs whose bounding boxes overlap (one) int32; those beyond the capacity for pairs are dropped.
+    `choose` lists those of these pairs (overlap) vec2i, and their number (one) int32, that may have contacts; None: all may."""
 
     def __init__(self, pipeline: newton.CollisionPipeline) -> None:
         # The pipeline itself is not kept: a cycle of references would keep its arrays until a garbage collection.
@@ -62,14 +60,9 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         candidate_pair_count: wp.array,
         **options: Any,
     ) -> None:
-        """Launch the broad phase: write the candidate pairs of shapes for the narrow phase.
-
-        Args:
-            shape_lower, shape_upper: Bounding boxes, already enlarged by the shapes' gaps and margins (shape) [m].
-            shape_gap, shape_collision_group, shape_world, shape_count, options: Ignored; arguments of Newton's `launch`.
-            candidate_pair: Receives the indices of the two shapes of each pair (pair) vec2i.
-            candidate_pair_count: Receives their number; must be zero (one) int32.
-        """
+        """Launch the broad phase: write the candidate pairs of shapes (pair) vec2i for the narrow phase, and their number, which must be
+        zero before (one) int32. Bounding boxes (shape) [m] are enlarged by the shapes' gaps and margins already; other arguments of
+        Newton's `launch` are ignored."""
         shapes, device, worlds = self._shapes, candidate_pair.device, self._occupied.shape[0]
         self.overlap_count.zero_()
         boxes, lists = [shapes, shape_lower, shape_upper], [self._occupied, self._occupied_count]
@@ -122,14 +115,10 @@ def has_identical_worlds(model: newton.Model) -> bool:
 
 
 def find_colliding(pipeline: newton.CollisionPipeline, count: int) -> np.ndarray:
-    """Collision filter of a world, for a lower and a higher index of its shapes (shape, shape) bool: True if the pair may collide.
+    """Collision filter of a world, for a lower and a higher index of its `count` shapes (shape, shape) bool: True if the pair may collide.
 
-    Found by a run of Newton's broad phase on bounding boxes that all overlap in the first world, and are empty in the others.
-
-    Args:
-        pipeline: The pipeline, with Newton's broad phase.
-        count: Shapes of a world.
-    """
+    Found by a run of Newton's broad phase, which the pipeline has, on bounding boxes that all overlap in the first world, and are empty in
+    the others."""
     model, newtons = pipeline.model, cast(newton.geometry.BroadPhaseAllPairs, pipeline.broad_phase)
     corner = np.full((model.shape_count, 3), EMPTY, np.float32)
     corner[:count] = -EMPTY

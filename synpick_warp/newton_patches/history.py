@@ -60,14 +60,11 @@ class SavedContacts:
 
 
 class History:
-    """Persistent solver state of all worlds: world-major arrays of fixed size (`rows`), and the contact history, a list of variable length.
+    """Persistent solver state of all worlds: world-major arrays of fixed size by name (`rows`), and the contact history, a list of variable
+    length.
 
-    Attributes:
-        rows: Arrays by name.
-        families: Those of `ROW_FAMILIES` that the solver has.
-        live: The struct `ContactHistory` of Newton's own arrays.
-        counters: Step counters, shared by all worlds.
-    """
+    `families` are those of `ROW_FAMILIES` that the solver has, `live` is the struct `ContactHistory` of Newton's own arrays, and `counters`
+    are step counters, shared by all worlds."""
 
     def __init__(
         self,
@@ -78,11 +75,8 @@ class History:
         contacts: newton.Contacts,
         solver: newton.solvers.SolverSteel,
     ) -> None:
-        """Find the arrays, which must have been allocated: after the first step.
-
-        Raises:
-            StateError: Another version of Newton is installed, whose history is unknown.
-        """
+        """Find the arrays, which must have been allocated: after the first step. Raises StateError if another version of Newton is
+        installed, whose history is unknown."""
         if newton.__version__ != KNOWN_NEWTON:
             raise StateError(
                 f"states need Newton {KNOWN_NEWTON}; what {newton.__version__}, which is installed, keeps of a step is unknown"
@@ -139,14 +133,8 @@ class History:
         self._copy(world, source, (self._saved_numbers, saved.start, saved.history), saved.count, saved.capacity)
 
     def load_contacts(self, row: wp.array, saved: SavedContacts, lost: wp.array, contacts_lost: int) -> None:
-        """Replace the contacts of worlds by those of the row of each (world) int32; -1: the world keeps its own.
-
-        Args:
-            row: Row of each world.
-            saved: The rows.
-            lost: Flags of each world (world) int32; those that lose contacts, as there are too many, get `contacts_lost`.
-            contacts_lost: The flag.
-        """
+        """Replace the contacts of worlds by those of the row of each (world) int32; -1: the world keeps its own. Worlds that lose contacts,
+        as there are too many, get the flag `contacts_lost` in `lost` (world) int32."""
         self._find_contacts()
         wp.launch(
             kernels.place_contacts_kernel,

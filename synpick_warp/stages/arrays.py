@@ -55,17 +55,11 @@ class StructArrays:
 
 
 def struct_arrays(struct: Any, *shape: str, units: Mapping[str, str] | None = None, **shapes: tuple[str, ...]) -> StructArrays:
-    """Declare the arrays of a Warp struct; `allocate_struct` allocates them.
+    """Declare the arrays of a Warp struct, whose array annotations give types and numbers of dimensions; other members stay 0.
+    `allocate_struct` allocates them.
 
-    Args:
-        struct: Class decorated by `wp.struct`. Its array annotations give types and numbers of dimensions; other members stay 0.
-        shape: Names of the dimensions of all its arrays that `shapes` does not name.
-        shapes: Names of the dimensions of single arrays, by the name of the member.
-        units: Unit by the name of the member.
-
-    Raises:
-        TypeError: A member has another number of dimensions than the names given for it, or a name belongs to no array.
-    """
+    `shape` are the names of the dimensions of all its arrays but those that `shapes` names by member; `units` are by member, too. Raises
+    TypeError if a member has another number of dimensions than the names given for it, or a name belongs to no array."""
     types = {name: member.type for name, member in struct.vars.items() if hasattr(member.type, "ndim")}
     if unknown := (set(shapes) | set(units or {})) - set(types):
         raise TypeError(f"{struct.cls.__name__} has no array {sorted(unknown)[0]}")
@@ -91,11 +85,8 @@ class ArrayGroup:
 
 
 def bundle(struct: Any, *sources: object) -> Any:
-    """Instance of a Warp struct whose members are the sources' attributes of these names, each of the first that has one.
-
-    Raises:
-        TypeError: No source has a member.
-    """
+    """Instance of a Warp struct whose members are the sources' attributes of these names, each of the first that has one; raises TypeError
+    if no source has a member."""
     result = struct()
     for name in struct.vars:
         owner = next((source for source in sources if hasattr(source, name)), None)
@@ -165,14 +156,8 @@ def _zeros(name: str, spec: ArraySpec, shape: tuple[int, ...], device: wp.Device
 
 
 def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device, only: Collection[str] | None = None) -> Arrays:
-    """Instance of the dataclass `kind` with zeroed arrays on `device`.
-
-    Args:
-        kind: A dataclass all of whose fields were declared by `device_array`.
-        sizes: Extent of every named dimension.
-        device: Where to allocate.
-        only: Fields to allocate, the others become None; None: all.
-    """
+    """Instance of the dataclass `kind`, all of whose fields were declared by `device_array`, with zeroed arrays on `device`. `sizes`:
+    extent of every named dimension; `only`: fields to allocate, the others become None; None: all."""
     specs = {item.name: item.metadata["array"] for item in fields(kind)}  # type: ignore[arg-type]
     made = _allocate(kind.__name__, {name: spec for name, spec in specs.items() if only is None or name in only}, sizes, device)
     return kind(**{name: made.get(name) for name in specs})

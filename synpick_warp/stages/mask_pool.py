@@ -61,13 +61,8 @@ class MaskBounds:
         return cls(np.append(np.linalg.norm(corner, axis=1), -1.0), placed, cameras[0].resolution)
 
     def count_words(self, index: np.ndarray, pose: np.ndarray, cameras: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Upper bound of the words of each view's masks (B) int64.
-
-        Args:
-            index: Object of each instance; -1: none (B, I) int32.
-            pose: Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7).
-            cameras: Matrix and pose of each view's camera, by CAMERA_KEYS (B, ...).
-        """
+        """Upper bound of the words of each view's masks (B) int64, from the object of each instance, -1: none (B, I) int32, its pose to the
+        world: x, y, z [m], quaternion x, y, z, w (B, I, 7), and matrix and pose of each view's camera, by CAMERA_KEYS (B, ...)."""
         matrix, rotation, translation = (cameras[key] for key in CAMERA_KEYS)
         x, y, z = np.moveaxis(matmul(pose[..., :3], rotation.swapaxes(1, 2)) + translation[:, None], -1, 0)
         radius = self.radius[index]
@@ -89,11 +84,8 @@ class MaskBounds:
 def split_batches(words: np.ndarray, share: int, views: int, wide: int) -> Iterator[tuple[slice, bool]]:
     """Split views into batches, in their order: a slice of each, and whether it is one of few views with room for all of their masks.
 
-    Args:
-        words: Upper bound of the words of each view (B).
-        share: A view's share of the pool [words].
-        views, wide: Most views of a batch, and of one with room for all masks.
-    """
+    `words` are upper bounds of the words of each view (B), `share` is a view's share of the pool [words], and `views` and `wide` are the
+    most views of a batch, and of one with room for all masks."""
     large, first = words > share, 0
     while first < len(words):
         most = wide if large[first] else views

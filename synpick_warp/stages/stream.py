@@ -98,11 +98,8 @@ class TickReader:
     """Copies the results of a tick to the host, except images: some kilobytes a world."""
 
     def __init__(self, record: TickRecord, target: list[wp.array] | None = None) -> None:
-        """
-        Args:
-            record: Record of each tick.
-            target: Arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a CPU the record's.
-        """
+        """Read the record of each tick into `target`, arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a
+        CPU the record's."""
         self.parts = _reported_parts(record)
         self.physics, self.arrays = record.physics, record_arrays(record.physics) if record.physics is not None else []
         self.copy = HostCopy(self.reported(record), target)
@@ -158,12 +155,7 @@ def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
     """Select the frames of a tick, in order of worlds; without live worlds the batch is empty. It is valid as long as the report.
-
-    Args:
-        report: Report of the tick.
-        object_ids: obj_id of each catalog entry (entry) int32.
-        tick_time: Time between two frames [s].
-    """
+    `object_ids` has the obj_id of each catalog entry (entry) int32; `tick_time` is the time between two frames [s]."""
     live = np.flatnonzero(report.column("live"))
     frame = report.column("frame")[live]
     return TickBatch(
@@ -191,15 +183,8 @@ def describe_views(
     """Fields of `FrameBatch` for B views, without images: episode, camera, frame, time [s], object ids, poses; name, yaw, exposure and
     direction of the light.
 
-    Args:
-        report: Report of the tick.
-        world: World of each view (B) int32.
-        camera: Camera of each view (B) int32.
-        tick_time: Time between two frames [s].
-        object_ids: obj_id of each catalog entry, and behind them -1 for none (entry + 1) int32.
-        lights: Table of the environment maps.
-        bins: Names of the bins, `Cell.recorded`; empty: without those of the views.
-        cameras: Cameras of episodes and views; None: without those of the views.
+    `world` and `camera` of each view are (B) int32; `tick_time` is as of `tick_batch`; `object_ids`, too, but behind them -1 for none
+    (entry + 1). `bins` are `Cell.recorded`, empty: without those of the views; `cameras` those of episodes and views, None: without them.
     """
     own = {"bin_name": np.array(bins)[report.snapshot.bin[world]], "bin_pose": report.snapshot.fixture_pose[world, 0]} if bins else {}
     episode, frame = report.column("episode")[world], report.column("frame")[world]
@@ -278,15 +263,7 @@ class FrameStream:
         bins: Sequence[str] = (),
         cameras: EpisodeCameras | None = None,
     ) -> None:
-        """
-        Args:
-            rings: Rings of batches, one for each group of cameras.
-            tick_time: Time between two frames [s].
-            object_ids: obj_id of each catalog entry (entry) int32.
-            lights: Table of the environment maps.
-            device: Device of rendering.
-            bins, cameras: As of `describe_views`.
-        """
+        """Take rings of batches, one for each group of cameras; other arguments as of `tick_batch` and `describe_views`."""
         self.rings = tuple(rings)
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
         self.lights, self.bins, self.cameras = lights, bins, cameras
@@ -311,13 +288,8 @@ class FrameStream:
         last launch all of earlier ticks.
 
         On a GPU the tick's last batches stay in flight, so that the device has work between ticks; `drain` yields them. A batch is valid
-        until the next one is requested.
-
-        Args:
-            snapshot: State of the worlds; reused after the rendering in the order of the device's stream.
-            report: Report of the tick.
-            finished: Called once the consumer is done with the tick's last batch (it requests the next one); ticks finish in order.
-        """
+        until the next one is requested. The snapshot may be reused after the rendering in the order of the device's stream. `finished` is
+        called once the consumer is done with the tick's last batch (it requests the next one); ticks finish in order."""
         launched, ahead = 0, 0
         for ring in self.rings:
             shown = report.column("live").astype(bool) & (report.column("frame") % ring.group.every == 0)

@@ -51,12 +51,9 @@ class TickLoop:
     def __init__(self, simulation: Simulation, max_lead: int | None = None, more: Callable[[bool], Sequence[int]] = lambda _: ()) -> None:
         """Allocate the queue.
 
-        Args:
-            simulation: The worlds.
-            max_lead: Maximum number of ticks by which physics may ever be ahead; None: by `queue_lead`.
-            more: Called before a tick begins while worlds are idle: further episodes, or none at present. True: all worlds are idle in the
-                tick last taken, and it may wait.
-        """
+        `max_lead` is the maximum number of ticks by which physics may ever be ahead; None: by `queue_lead`. `more` is called before a tick
+        begins while worlds are idle: further episodes, or none at present. True: all worlds are idle in the tick last taken, and it may
+        wait."""
         self.simulation, self.device = simulation, simulation.device
         self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if max_lead is None else max_lead
         self.lead = min(1, self.max_lead)
@@ -133,12 +130,8 @@ class TickLoop:
         return PHYSICS_SHARE if self._has_waited or is_short else 0.0
 
     def confine_solver(self, stream: wp.Stream | None) -> None:
-        """Set the SMs of the solver, from the next tick on: the reserved ones, or all.
-
-        Args:
-            stream: CUDA stream on the reserved SMs; None: all SMs. These are also used while more than
-                SOLVER_WORLDS worlds per reserved SM are busy.
-        """
+        """Set the SMs of the solver, from the next tick on: the reserved ones, which the CUDA stream is on, or None: all. All are also used
+        while more than SOLVER_WORLDS worlds per reserved SM are busy."""
         if stream is not None and self._busy_worlds > SOLVER_WORLDS * count_reserved(self.device, PHYSICS_SHARE):
             stream = None
         self.simulation.physics.solver_stream = stream

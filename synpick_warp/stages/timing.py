@@ -121,11 +121,8 @@ class Recorder:
         self.wall = time.perf_counter() - self._started
 
     def write_trace(self, path: Path) -> None:
-        """Write the spans in Chrome's trace event format (JSON), host and device as two tracks.
-
-        Raises:
-            OSError: The file cannot be written.
-        """
+        """Write the spans in Chrome's trace event format (JSON), host and device as two tracks; raises OSError if the file cannot be
+        written."""
         events = [
             {"name": "thread_name", "ph": "M", "pid": 0, "tid": track, "args": {"name": ("host", "device")[track]}}
             for track in (HOST, DEVICE)
@@ -152,22 +149,14 @@ _recorder: Recorder | None = None
 
 
 def scope(name: str, device: wp.Device | None = None) -> contextlib.AbstractContextManager[None]:
-    """Measure a block of code, if a recorder is active.
-
-    Args:
-        name: Name of the stage.
-        device: Where its work is enqueued: device time is measured, too; None: host time only.
-    """
+    """Measure a block of code by the name of its stage, if a recorder is active; with the device where its work is enqueued, device time,
+    too."""
     return _NULL_SCOPE if _recorder is None else _recorder.scope(name, device)
 
 
 @contextlib.contextmanager
 def record() -> Iterator[Recorder]:
-    """Context manager: record all scopes in this block; blocks do not nest.
-
-    Raises:
-        RuntimeError: A recorder is active already.
-    """
+    """Context manager: record all scopes in this block; blocks do not nest. Raises RuntimeError if a recorder is active already."""
     global _recorder
     if _recorder is not None:
         raise RuntimeError("a profile is already being recorded")

@@ -65,27 +65,13 @@ def count_views(settings: schema.Perception, worlds: int, instances: int, device
 class PerceptionImages:
     """Renders the G-buffers of a batch of worlds. Owns its scratch; `render` only launches kernels, so a CUDA graph can capture it.
 
-    Attributes:
-        scene: The renderer's scene with the camera of perception alone, at the resolution of perception.
-        views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
-        bodies: The struct `ViewBodies` of the batch.
-        gbuffer: The struct `GBuffer` of the batch.
-        arrays, scratch: Arrays of `Segmenter`.
-    """
+    `scene` is the renderer's with the camera of perception alone, at the resolution of perception; `views`, `bodies` and `gbuffer` are the
+    structs `Views`, `ViewBodies` and `GBuffer` of the batch. The caller fills `views.world` (view): each world once; -1: the view is
+    unused. `arrays` and `scratch` are those of `Segmenter`."""
 
     def __init__(self, settings: schema.Perception, rig: Rig, render_scene: RenderScene, worlds: int, instances: int) -> None:
-        """Allocate scratch and render the static background.
-
-        Args:
-            settings: Settings of perception.
-            rig: The cameras; the resolution is that of `settings`.
-            render_scene: Meshes, materials and table of the renderer; its cameras are not used.
-            worlds: Number of worlds.
-            instances: Instance capacity of a world.
-
-        Raises:
-            ConfigError: A batch has more pixels than 31 bits can count.
-        """
+        """Allocate scratch and render the static background, by meshes, materials and table of the renderer's scene, whose cameras are not
+        used, at the resolution of `settings`. Raises ConfigError if a batch has more pixels than 31 bits can count."""
         device = render_scene.device
         count = count_views(settings, worlds, instances, device)
         width, height = settings.resolution

@@ -38,18 +38,9 @@ class Perception:
     ) -> None:
         """Allocate scratch.
 
-        Args:
-            settings: Settings of perception.
-            rig: The cameras; perception uses that of `perception.camera`, or the first.
-            seed: Seed of the random choices of targets.
-            render_scene: Meshes, materials and table.
-            scene: Constants of the simulation.
-            state: State of the worlds.
-            attempts: State of their attempts; `task` selects the worlds.
-            observation: Written: perception results of the worlds processed.
-            plan: Written: their targets and grasps.
-            choose_grasps: The gripper's choice among other grasps of the target; None: it takes the first.
-        """
+        Perception uses the camera `perception.camera`, or the first, with meshes, materials and table of `render_scene`, in worlds that
+        `attempts.task` selects. It writes their perception results to `observation`, and targets and grasps to `plan`; `seed` is that of
+        the random choices of targets, `choose_grasps` the gripper's choice among other grasps of the target, None: it takes the first."""
         self.scene, self.state, self.attempts, self.observation, self.plan = scene, state, attempts, observation, plan
         self.seed, self.choose_grasps = seed, choose_grasps
         self.device = state.phase.device

@@ -19,11 +19,8 @@ from synpick_warp.stages.perception.images import PerceptionImages
 
 
 class Segmenter:
-    """Segments a batch of images and finds grasp points. Owns its scratch; `find_grasp_points` only launches kernels.
-
-    Attributes:
-        arrays: Components, distance transforms and contours of the batch.
-    """
+    """Segments a batch of images and finds grasp points. Owns its scratch; `find_grasp_points` only launches kernels. `arrays`: components,
+    distance transforms and contours of the batch."""
 
     def __init__(self, images: PerceptionImages) -> None:
         """Take the scratch of `images`, whose G-buffers it reads."""
@@ -38,13 +35,9 @@ class Segmenter:
         self.segments = bundle(Segments, SimpleNamespace(**flat), images.arrays, images.scratch)
 
     def find_grasp_points(self, scene: SceneData, catalog_index: wp.array, observation: Observation) -> None:
-        """Compute components, distance transforms, contours and grasp points of the rendered views.
-
-        Args:
-            scene: Constants; mass and area of `catalog` are read.
-            catalog_index: Catalog index of each instance (world, instance) int32.
-            observation: Written for the worlds of the batch, except votes and clutter graph.
-        """
+        """Compute components, distance transforms, contours and grasp points of the rendered views, by mass and area of the `catalog` of
+        `scene` and the catalog index of each instance (world, instance) int32. `observation` is written for the worlds of the batch, except
+        votes and clutter graph."""
         images, views, sources = self.images, self.images.views.count, (self, self.images, scene, observation)
         instances, strips = (views, self.instances), (views, self.height, self.strips)
         objects = {"catalog_index": catalog_index}

@@ -39,17 +39,8 @@ def sample_episodes(scene: SceneData, state: WorldState, seed: int) -> None:
 
 
 def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
-    """Sample modes and objects of episodes ahead of their start. Waits for the device.
-
-    Args:
-        config: All settings.
-        catalog: The objects.
-        episodes: Indices (episode) int32.
-        device: Device that samples.
-
-    Returns:
-        `Mode` (episode) int32, and number of objects in the first arrangement (episode) int64. A world's slots may suffice for fewer.
-    """
+    """Sample modes and objects of episodes (episode) int32 ahead of their start, on a device, for which it waits. Returns `Mode` (episode)
+    int32, and number of objects in the first arrangement (episode) int64. A world's slots may suffice for fewer."""
     count, seed = len(episodes), wp.uint64(config.bake.seed)
     state, room = Worlds(), config.arrangement.max_objects
     state.arrangement_id = wp.array(np.stack([episodes, np.zeros_like(episodes)], axis=1), dtype=wp.vec2i, device=device)

@@ -30,14 +30,10 @@ class Choice:
 
 
 class ChoiceRecorder:
-    """Writer of the ring buffer: saves the states of worlds at a moment of choice at the end of each tick of a simulation.
+    """Writer of the ring buffer: saves the states of worlds at a moment of choice at the end of each tick of a simulation, up to `states`
+    of an episode, in `rows` rows; a row is overwritten `rows` saved states later.
 
-    Does not report to the host which states it saved: `ChoiceReader` applies the same rule to the reports of ticks.
-
-    Attributes:
-        states: Maximum number of saved states of an episode.
-        rows: Rows of the ring buffer; a row is overwritten `rows` saved states later.
-    """
+    Does not report to the host which states it saved: `ChoiceReader` applies the same rule to the reports of ticks."""
 
     def __init__(self, simulation: Simulation, states: int, rows: int) -> None:
         """Record a simulation from its next tick on."""

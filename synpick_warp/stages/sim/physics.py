@@ -47,15 +47,11 @@ def balance_worlds(episodes: int, limit: int) -> int:
 
 
 def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None = None) -> Config:
-    """Resolve `bake.worlds`: as set, or if 0 from the number of episodes; on a GPU at least MIN_GPU_WORLDS.
+    """Resolve `bake.worlds`: as set, or if 0 from the number of episodes that the device simulates, None: all of the settings; on a GPU at
+    least MIN_GPU_WORLDS.
 
     Automatic: balanced rounds (`balance_worlds`). If all episodes fit, they run at once: physics ends with the longest of them, and may be
     ahead of the renderer from the start (`TickLoop`). The minimum keeps episodes independent of the number of worlds; surplus worlds idle.
-
-    Args:
-        config: All settings.
-        device: Device of the simulation.
-        episodes: Episodes that the device simulates; None: all of the settings.
     """
     worlds = config.bake.worlds
     if not worlds:
@@ -122,23 +118,16 @@ class Physics:
         )
 
     def set_yaw(self, yaw: wp.array) -> None:
-        """Set the yaw of each gripper shaft and its cup about the vertical through the wrist; x, y and z stay the world's axes.
+        """Set the yaw of each gripper shaft and its cup about the vertical through the wrist, counter-clockwise from above (world) float32
+        [rad]; x, y and z stay the world's axes.
 
-        Takes effect in the next step, and in body poses after `refresh_poses`. Nothing is read back from the device.
-
-        Args:
-            yaw: Counter-clockwise from above (world) float32 [rad].
-        """
+        Takes effect in the next step, and in body poses after `refresh_poses`. Nothing is read back from the device."""
         launch(gripper.set_yaw_kernel, self.layout.worlds, finger_joint=self._finger_joint, yaw=yaw, joint_child_out=self.model.joint_X_c)
         self.solver.notify_model_changed(newton.ModelFlags.JOINT_PROPERTIES)
 
     def load(self, variant: wp.array, restarted: wp.array) -> None:
-        """Select body variants and reset solver history and contact matching of restarted worlds, after joint coordinates were written.
-
-        Args:
-            variant: Variant of each body; -1: no change (body) int32.
-            restarted: Worlds with new objects (world + 1) bool.
-        """
+        """Select body variants (body) int32, -1: no change, and reset solver history and contact matching of restarted worlds (world + 1)
+        bool, after joint coordinates were written."""
         self.select(variant, restarted)
         self.pipeline.reset_contact_matching(restarted)
         self.refresh_poses()
@@ -176,14 +165,10 @@ class Physics:
         Newton's late allocations. Then a period is captured and replayed: a CUDA graph per substep, or on the CPU one list of launches that
         Warp replays in C++, which saves the 30 us of each launch in Python. Each `solver_stream` has graphs of its own.
 
-        Replays skip hooks and watcher, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
-        On the CPU, Warp finds a captured kernel by its key: closures and overloads of one name in a module would replace each other.
-
-        Args:
-            before_step: Launches kernels that write the control's forces from a state; runs before each step.
-            after_collide: Launches kernels that edit `contacts` before the solver reads them.
-            watcher: Launches kernels that record the steps.
-        """
+        `before_step` launches kernels that write the control's forces from a state, before each step; `after_collide` kernels that edit
+        `contacts` before the solver reads them; `watcher` kernels that record the steps. Replays skip hooks and watcher, so they must
+        launch the same kernels on the same arrays in every tick, hooks in every step. On the CPU, Warp finds a captured kernel by its key:
+        closures and overloads of one name in a module would replace each other."""
         stream, period = self.solver_stream, self._period(watcher)
         periods = self.settings.steps_per_tick * self.settings.substeps // period
         eager = self._run_substeps(before_step, after_collide, watcher)
@@ -246,11 +231,7 @@ class Physics:
         solver_stream: wp.Stream | None = None,
     ) -> Iterator[None]:
         """Enqueue a tick; yields after each substep. The last one of a step leaves its result in `state`, so that all steps are the same.
-
-        Args:
-            before_step, after_collide, watcher: As in `tick_parts`.
-            solver_stream: As the attribute.
-        """
+        Hooks and watcher as in `tick_parts`, `solver_stream` as the attribute."""
         current, following = self.state, self._other
         physics, observables = self.settings, self._observables if watcher is not None else None
         for step, substep in itertools.product(range(physics.steps_per_tick), range(physics.substeps)):

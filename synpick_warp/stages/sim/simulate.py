@@ -72,18 +72,10 @@ class Simulation:
     ) -> None:
         """Build the model and allocate all state.
 
-        Args:
-            config: Settings.
-            catalog: The objects.
-            lights: Count of environment maps to sample from.
-            device: Device of all arrays.
-            render_scene: Scene that perception renders; not needed if all episodes have mode MOVE.
-            episodes: Indices of the episodes to simulate, in order; None: all.
-            records_physics: True if records contain `physics`, with steps if `trajectory.steps`; with `bop.graph` they contain support.
-
-        Raises:
-            ValueError: An episode may pick, but there is no `render_scene`.
-        """
+        `lights` is the count of environment maps to sample from, `render_scene` what perception renders, not needed if all episodes have
+        mode MOVE, and `episodes` the indices to simulate, in order; None: all. `records_physics`: whether records contain `physics`, with
+        steps if `trajectory.steps`; with `bop.graph` they contain support. Raises ValueError if an episode may pick, but there is no
+        `render_scene`."""
         self.config, self.catalog, self.device = config, catalog, device
         built = build_model(config, catalog, device)
         self.layout = built.layout
@@ -165,11 +157,8 @@ class Simulation:
 
     @property
     def states(self) -> WorldStates:
-        """Checkpoints of the worlds (`WorldStates`), to be used between two ticks and on the stream of the ticks.
-
-        Raises:
-            StateError: The worlds have not ticked yet, or are in a tick.
-        """
+        """Checkpoints of the worlds (`WorldStates`), to be used between two ticks and on the stream of the ticks. Raises StateError if the
+        worlds have not ticked yet, or are in a tick."""
         if not self._is_between_ticks:
             raise StateError("the state of a world is complete between two ticks alone, after the first one")
         return self._states

@@ -75,11 +75,8 @@ class Field:
 class WorldStates:
     """Saves, loads and branches the states of a simulation's worlds. Runs on the device; only copies to the host wait for it.
 
-    Attributes:
-        fields: Layout of a row.
-        history: State that Newton keeps between steps.
-        origin: Checksums of what the worlds are made of, by the keys of ORIGINS.
-    """
+    `fields` is the layout of a row, `history` the state that Newton keeps between steps, and `origin` has checksums of what the worlds are
+    made of, by the keys of ORIGINS."""
 
     def __init__(
         self,
@@ -90,16 +87,12 @@ class WorldStates:
         restarted: wp.array,
         fresh: Mapping[str, np.ndarray],
     ) -> None:
-        """Find all arrays of the state, after the first tick.
+        """Find all arrays of the state, after the first tick: those of `groups`, dataclasses by the name of their part of a row, whose
+        first dimension is `world`.
 
-        Args:
-            groups: Dataclasses whose arrays are state where `world` is their first dimension, by the name of their part of a row.
-            physics: The physics.
-            origin: Checksums by the keys of ORIGINS (`checksum`, `cell_checksum`).
-            variant: Written: body variants to select (body) int32 ...
-            restarted: ... in these worlds (world + 1) bool.
-            fresh: Content of a world before the first tick (`copy_fresh`).
-        """
+        `origin` has checksums by the keys of ORIGINS (`checksum`, `cell_checksum`). Body variants to select (body) int32 are written to
+        `variant`, in worlds that are written to `restarted` (world + 1) bool. `fresh` is the content of a world before the first tick
+        (`copy_fresh`)."""
         self.physics, self.origin = physics, origin
         self.device, self.worlds = physics.device, physics.layout.worlds
         self._variant, self._restarted = variant, restarted
@@ -133,11 +126,7 @@ class WorldStates:
         return self.physics.settings.contacts_per_world
 
     def allocate(self, rows: int) -> State:
-        """Allocate an empty state of `rows` rows.
-
-        Raises:
-            StateError: Memory is too short.
-        """
+        """Allocate an empty state of `rows` rows; raises StateError if memory is too short."""
         each = WORD * self.words + self.contact_capacity * CONTACT_BYTES
         free = free_device_memory(self.device) if self.device.is_cuda else free_host_memory()
         if rows * each > free:
@@ -189,21 +178,14 @@ class WorldStates:
         wp.launch(world_rows.reset_rows_kernel, dim=dim, inputs=[self._table, self._fresh, phase, self._resets], device=self.device)
 
     def get(self, worlds: Sequence[int]) -> State:
-        """State of worlds, a row each.
-
-        Raises:
-            StateError: A world does not exist, or memory is too short.
-        """
+        """State of worlds, a row each; raises StateError if a world does not exist, or memory is too short."""
         state = self.allocate(len(self._checked(worlds)))
         self.save(state, wp.array(worlds, dtype=wp.int32, device=self.device))
         return state
 
     def set(self, state: State, worlds: Sequence[int], rows: Sequence[int] | None = None) -> None:
-        """Load rows into worlds; `rows` names the row of each, None: all in order, or the only one into every world.
-
-        Raises:
-            StateError: A world or a row does not exist, there is not a row for each world, or the state is of other worlds.
-        """
+        """Load rows into worlds; `rows` names the row of each, None: all in order, or the only one into every world. Raises StateError if a
+        world or a row does not exist, there is not a row for each world, or the state is of other worlds."""
         self._check_origin(state.origin)
         if rows is None:
             rows = [0] * len(worlds) if len(state) == 1 else range(len(state))
@@ -235,11 +217,8 @@ class WorldStates:
         return {"version": np.array(VERSION)} | {key: np.array(value) for key, value in state.origin.items()} | arrays
 
     def from_host(self, arrays: Mapping[str, np.ndarray]) -> State:
-        """Copy a state of `to_host` to the device.
-
-        Raises:
-            StateError: It is of another version, of other objects, cell or capacities, or as of `check_array`.
-        """
+        """Copy a state of `to_host` to the device; raises StateError if it is of another version, of other objects, cell or capacities, or
+        as of `check_array`."""
         given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", *ORIGINS)}
         if given["version"] != str(VERSION):
             raise StateError(f"the state has version {given['version']}, but this release reads version {VERSION}")
@@ -276,11 +255,7 @@ class WorldStates:
 
 
 def check_array(name: str, arrays: Mapping[str, np.ndarray], dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """Array of a state on the host, copied.
-
-    Raises:
-        StateError: It is missing, has another type or shape, or a number that is not finite.
-    """
+    """Array of a state on the host, copied; raises StateError if it is missing, has another type or shape, or a number that is not finite."""
     if name not in arrays:
         raise StateError(f"the state lacks {name}; allowed: all arrays of `state_to_host`")
     values = np.array(arrays[name])

@@ -72,11 +72,7 @@ def allocate_record(sizes: dict[str, int], device: wp.Device, *, steps: bool, su
 
 class StepRecorder:
     """Watcher that records the steps of a tick, or its support graph, or both. Its launches never change, because `Physics.tick` captures
-    them in a graph.
-
-    Attributes:
-        record: Physics of the last tick, once `end_tick` was called; the next tick overwrites it.
-    """
+    them in a graph. `record`: physics of the last tick, once `end_tick` was called; the next tick overwrites it."""
 
     def __init__(
         self,
@@ -91,18 +87,8 @@ class StepRecorder:
         steps: bool,
         supports: bool,
     ) -> None:
-        """Allocate the record and scratch.
-
-        Args:
-            gripper: Settings of the gripper; its weight is subtracted from joint forces.
-            scene: Constants of the simulation.
-            state: State of the worlds.
-            attempts: State of their attempts.
-            seals: State of their seals.
-            physics: Source of poses, contact forces and joint forces.
-            sizes: Extents by `world_sizes`.
-            steps, supports: Whether steps and support are recorded.
-        """
+        """Allocate the record and scratch: `steps` and `supports`: whether steps and support are recorded, with extents by `world_sizes`.
+        Poses, contact forces and joint forces are those of `physics`; the gripper's weight is subtracted from joint forces."""
         self._scene, self._state, self._attempts, self._seals, self._physics = scene, state, attempts, seals, physics
         self._device = state.phase.device
         self._sizes = record_sizes(sizes, physics.settings.steps_per_tick)
@@ -173,15 +159,10 @@ def record_arrays(record: PhysicsRecord) -> list[wp.array]:
 
 
 def host_record(record: PhysicsRecord, arrays: list[np.ndarray], instances: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Convert a record to the arrays of `TickBatch.tick` and `TickBatch.steps`, by their names in data sets.
+    """Convert a record, by its `record_arrays`, copied to the host, to the arrays of `TickBatch.tick` and `TickBatch.steps`, by their names
+    in data sets; `instances`: capacity of a world.
 
-    Args:
-        record: The record.
-        arrays: Its `record_arrays`, copied to the host.
-        instances: Capacity for instances of a world.
-
-    Forces of cups are left out for a gripper of one cup, whose forces are those of the instances' seals.
-    """
+    Forces of cups are left out for a gripper of one cup, whose forces are those of the instances' seals."""
     parts = (record.steps, record.drops, record.supports)
     values = dict(zip((item.name for part in parts if part is not None for item in fields(part)), arrays, strict=True))
     tick = {"drop_pose": values["drop_pose"], "redrops": values["progress"][:, 2]}
@@ -210,12 +191,7 @@ def _split_places(arrays: Mapping[str, np.ndarray], instances: int) -> dict[str,
 
 
 def tick_measures(columns: Mapping[str, np.ndarray], sets: Mapping[str, np.ndarray], instances: int) -> dict[str, np.ndarray]:
-    """Select the columns of physics and attempts for `TickBatch.tick`; bit sets are unpacked to (world, instance) uint8.
-
-    Args:
-        columns: Columns (world) of status and measures, by `codes.column_names`.
-        sets: Bit sets of instances (world, word) uint32, by name.
-        instances: Capacity for instances of a world.
-    """
+    """Select the columns of physics and attempts for `TickBatch.tick` from those (world) of status and measures, by `codes.column_names`;
+    bit sets of instances (world, word) uint32 are unpacked to (world, instance) uint8, for `instances` instances of a world."""
     result = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "peak_force")}
     return result | {name: unpack_words(words, instances) for name, words in sets.items()}

@@ -83,12 +83,8 @@ class WatchedHold:
 
 
 class Trials:
-    """Executor of grasp trials in the worlds of a simulation, which runs nothing else afterwards.
-
-    Attributes:
-        course: The struct `TrialData`.
-        spread: The struct `PerturbationData`.
-    """
+    """Executor of grasp trials in the worlds of a simulation, which runs nothing else afterwards. `course` and `spread` are the structs
+    `TrialData` and `PerturbationData`."""
 
     def __init__(self, simulation: Simulation, settings: Picks) -> None:
         """Take over a simulation that has ticked once, with the settings of `trial_values`; its perception is not used."""
@@ -108,15 +104,8 @@ class Trials:
         simulation.clear_graphs()
 
     def upload(self, grasps: Mapping[str, np.ndarray], rows: int) -> Any:
-        """Copy grasps to the device; returns the struct `Grasps`.
-
-        Args:
-            grasps: Fields of `Grasps` by name, each (grasp[, 3]).
-            rows: Number of rows of the state.
-
-        Raises:
-            StateError: An array is missing or has another shape, a row or target is out of range, or a number is not finite.
-        """
+        """Copy grasps to the device: fields of `Grasps` by name, each (grasp[, 3]), for a state of `rows` rows; returns the struct. Raises
+        StateError if an array is missing or has another shape, a row or target is out of range, or a number is not finite."""
         count = check_grasps(grasps, rows, self.simulation.layout.instances)
         result = allocate_struct(GRASPS, {"grasp": count}, self.device)
         for name in Grasps.vars:
@@ -124,15 +113,10 @@ class Trials:
         return result
 
     def run(self, state: State, grasps: Any) -> dict[str, np.ndarray]:
-        """Run all trials of grasps. Waits for the device.
+        """Run all trials of grasps (the struct `Grasps`). Waits for the device.
 
-        Args:
-            state: States at moments of choice: an attempt is planned and has made no step (`find_choices`); also of other simulations
-                of the same objects.
-            grasps: The struct `Grasps`.
-
-        Returns:
-            Fields of `Labels` and `Perturbations` by name (trial, ...), with `repeats` consecutive trials of each grasp.
+        States are at moments of choice: an attempt is planned and has made no step (`find_choices`); also of other simulations of the same
+        objects. Returns the fields of `Labels` and `Perturbations` by name (trial, ...), with `repeats` consecutive trials of each grasp.
         """
         sizes = {"trial": len(grasps.row) * self.course.repeats}
         labels, perturbations = (allocate_struct(kind, sizes, self.device) for kind in (LABELS, PERTURBATIONS))
