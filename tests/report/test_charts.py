@@ -12,7 +12,7 @@ import pytest
 import vl_convert
 
 import synpick_warp
-from synpick_warp.apps.report.charts import ChartData, make_charts, object_labels
+from synpick_warp.apps.report.charts import make_charts, object_labels
 from synpick_warp.apps.report.findings import NOTE, WARNING, Figures, find
 from synpick_warp.apps.report.frames import (
     Brightness,
@@ -39,8 +39,13 @@ def charts(statistics):
     """Plots of the set as if it had two modes."""
     group = statistics.groups[0]
     other = replace(group, mode="move", objects_over_time=(TimePoint(0.0, 2, 5.0),))
-    source = ChartData(replace(statistics, groups=(group, other)), [Brightness(0, 0, 0, 0.31), Brightness(0, 0, 1, 1.0)], load_config())
-    return {chart.name: chart for chart in make_charts(source)}
+    return charts_of(replace(statistics, groups=(group, other)), [Brightness(0, 0, 0, 0.31), Brightness(0, 0, 1, 1.0)])
+
+
+def charts_of(statistics, brightness=(), rows=None, period=None):
+    """Plots by name."""
+    figures = Figures(statistics, SampledEpisodes(rows or {}, {}, 0), brightness, 0, load_config(), period)
+    return {chart.name: chart for chart in make_charts(figures)}
 
 
 def total(chart, key: str) -> int:
@@ -72,13 +77,13 @@ def test_the_last_tick_of_an_axis_is_where_its_bars_or_rules_end(charts, statist
 
 def _exposed(statistics):
     lights = replace(statistics.lights, exposure={-0.3: 2, 0.1: 1})
-    return next(each for each in make_charts(ChartData(replace(statistics, lights=lights), [], load_config())) if each.name == "exposure")
+    return charts_of(replace(statistics, lights=lights))["exposure"]
 
 
 def test_objects_over_time_last_as_long_as_the_longest_episode(statistics):
     group = replace(statistics.groups[0], objects_over_time=(TimePoint(0.0, 30, 5.0), TimePoint(2.0, 9, 3.0)))
-    source = ChartData(replace(statistics, groups=(group,)), [], load_config(), {group.mode: 3.4})
-    spec = next(chart for chart in make_charts(source) if chart.name == "timeline").spec
+    rows = {number: EpisodeFacts(group.mode, frames, "emptied") for number, frames in enumerate((34, 20))}
+    spec = charts_of(replace(statistics, groups=(group,)), (), rows, 0.1)["timeline"].spec
     assert [(row["time"], row["objects"]) for row in spec["data"]["values"]] == [(0.0, 5.0), (2.0, 3.0), (3.4, 3.0)]
     assert spec["encoding"]["x"]["scale"]["domain"] == [0, 3.4]
 
@@ -92,7 +97,7 @@ def test_every_plot_compiles(charts):
 def test_names_stand_in_values_only(statistics):
     evil = "datum['x'] + signal"
     objects = tuple(replace(each, name=evil) for each in statistics.objects)
-    for chart in make_charts(ChartData(replace(statistics, objects=objects), [], load_config())):
+    for chart in charts_of(replace(statistics, objects=objects)).values():
         rest = {key: value for key, value in chart.spec.items() if key not in ("data", "params")}
         for key in ("sort", "scale"):
             rest.get("encoding", {}).get("y", {}).pop(key, None)

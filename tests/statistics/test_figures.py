@@ -462,10 +462,11 @@ def test_auc_is_the_share_of_pairs_in_order():
 def test_calibration_of_a_hand_made_table():
     """Two bins: 0.25 succeeds in 1 of 4, so it is calibrated; 0.95 in 1 of 2, an error of 0.45 for a third of the samples."""
     found = calibrate(scored([0.25] * 4 + [0.95] * 2, [1, 0, 0, 0, 1, 0]), draws=50)
-    assert found.count.tolist() == [0, 0, 4, 0, 0, 0, 0, 0, 0, 2]
-    np.testing.assert_allclose(found.predicted[[2, 9]], (0.25, 0.95))
-    np.testing.assert_allclose(found.observed[[2, 9]], (0.25, 0.5))
-    assert np.isnan(found.observed[[0, 5]]).all()
+    count, predicted, observed = found.bins.T[:3]
+    assert count.tolist() == [0, 0, 4, 0, 0, 0, 0, 0, 0, 2]
+    np.testing.assert_allclose(predicted[[2, 9]], (0.25, 0.95))
+    np.testing.assert_allclose(observed[[2, 9]], (0.25, 0.5))
+    assert np.isnan(observed[[0, 5]]).all()
     assert found.error.value == pytest.approx(0.45 / 3)
 
 
@@ -474,10 +475,9 @@ def test_weights_of_calibration_are_repetitions():
     score, outcome, weight = generator.random(60), generator.random(60) < 0.5, generator.integers(1, 4, 60)
     once = calibrate(scored(score, outcome, weight, np.zeros(60)))
     many = calibrate(scored(*(np.repeat(each, weight) for each in (score, outcome)), cluster=np.zeros(weight.sum())))
-    np.testing.assert_allclose(once.observed, many.observed)
-    np.testing.assert_allclose(once.predicted, many.predicted)
+    np.testing.assert_allclose(once.bins[:, 1:3], many.bins[:, 1:3])
     assert once.error.value == pytest.approx(many.error.value)
-    assert len(once.count) == BINS
+    assert len(once.bins) == BINS
     assert np.isnan(once.error.low), "one cluster has no interval"
 
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
-from synpick_warp.apps.report.frames import Brightness
+from synpick_warp.apps.report.findings import Figures
 from synpick_warp.apps.statistics import GroupStatistics, ObjectStatistics, Statistics
 from synpick_warp.apps.statistics.columns import BANDS, EXPOSURE_BIN, FORCE_BIN, MIN_VISIBILITY, SECTORS, TIME_BIN, VISIBILITY_BINS
-from synpick_warp.configs.schema import Config
 from synpick_warp.system.codecs.charts import Spec, limit
 from synpick_warp.system.codecs.charts import field as _field
 
@@ -48,22 +47,10 @@ class Chart:
     """Whether it takes the page's whole width."""
 
 
-@dataclass(frozen=True)
-class ChartData:
-    """Data that the charts show."""
-
-    statistics: Statistics
-    brightness: Sequence[Brightness]
-    config: Config | None
-    """None: the data set is from another source."""
-    durations: Mapping[str, float] = field(default_factory=dict)
-    """Mode -> time from the first frame to the end of the last, of its longest episode [s]."""
-
-
-def make_charts(source: ChartData) -> list[Chart]:
+def make_charts(figures: Figures) -> list[Chart]:
     """Make all charts of the report that have data."""
     makers = (_objects, _visibility, _timeline, _forces, _coverage, _outcomes, _endings, _exposure, _luma, _lights, _bins)
-    return [chart for make in makers for chart in make(source)]
+    return [chart for make in makers for chart in make(figures)]
 
 
 def object_labels(objects: Sequence[ObjectStatistics]) -> dict[int, str]:
@@ -198,12 +185,12 @@ def _edges(rows: Rows, width: float, top: float) -> list[float]:
 # ---- charts: each yields itself, or nothing without data ----
 
 
-def _objects(source: ChartData) -> Iterator[Chart]:
-    names = object_labels(source.statistics.objects)
+def _objects(figures: Figures) -> Iterator[Chart]:
+    names = object_labels(figures.statistics.objects)
     counts = _by_mode(
-        source.statistics, lambda group: {names.get(key, str(key)): count for key, count in group.annotations.objects.items()}
+        figures.statistics, lambda group: {names.get(key, str(key)): count for key, count in group.annotations.objects.items()}
     )
-    order = [*_ranked(counts), *(names[each.object_id] for each in source.statistics.objects if not each.instances)]
+    order = [*_ranked(counts), *(names[each.object_id] for each in figures.statistics.objects if not each.instances)]
     if any(counts.values()):
         shown, more = order[:MAX_LINES], len(order) - MAX_LINES
         rows = [row for row in _stacked(counts, "object", "instances") if row["object"] in shown]
@@ -214,25 +201,25 @@ def _objects(source: ChartData) -> Iterator[Chart]:
         yield Chart("objects", "Annotations per object", caption, spec, wide=True)
 
 
-def _visibility(source: ChartData) -> Iterator[Chart]:
-    rows = _binned_by_mode(source.statistics, lambda group: group.annotations.histogram, 1 / VISIBILITY_BINS)
-    mean = source.statistics.total.annotations.visibility
+def _visibility(figures: Figures) -> Iterator[Chart]:
+    rows = _binned_by_mode(figures.statistics, lambda group: group.annotations.histogram, 1 / VISIBILITY_BINS)
+    mean = figures.statistics.total.annotations.visibility
     if rows and mean is not None:
         caption = f"Visible fraction of each instance's silhouette; the mean is {mean:.3f}. Invisible instances are in the first bar."
         spec = _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%", top=1.0)
         yield Chart("visibility", "Visibility", caption, spec)
 
 
-def _outcomes(source: ChartData) -> Iterator[Chart]:
-    episodes = source.statistics.total.episodes
+def _outcomes(figures: Figures) -> Iterator[Chart]:
+    episodes = figures.statistics.total.episodes
     caption = f"How {episodes.attempts:,} attempts to pick ended; {episodes.good_seals:,} had a good seal."
-    counts = _by_mode(source.statistics, lambda group: group.episodes.outcomes)
+    counts = _by_mode(figures.statistics, lambda group: group.episodes.outcomes)
     yield from _in_words("outcomes", "Attempts by outcome", caption, counts, ("outcome", "attempts"))
 
 
-def _endings(source: ChartData) -> Iterator[Chart]:
+def _endings(figures: Figures) -> Iterator[Chart]:
     caption = "Why the episodes ended: bin empty, corners visited, or too many failures."
-    counts = _by_mode(source.statistics, lambda group: group.episodes.endings)
+    counts = _by_mode(figures.statistics, lambda group: group.episodes.endings)
     yield from _in_words("endings", "Episodes by ending", caption, counts, ("ending", "episodes"))
 
 
@@ -243,17 +230,17 @@ def _in_words(name: str, title: str, caption: str, counts: Mapping[str, Counter[
         yield Chart(name, title, caption, _bars(rows, _ranked(readable), "what", titles[1], titles))
 
 
-def _forces(source: ChartData) -> Iterator[Chart]:
+def _forces(figures: Figures) -> Iterator[Chart]:
     """Histogram of the largest seal force of attempts [N], with the break forces of the settings."""
-    rows = _binned_by_mode(source.statistics, lambda group: group.episodes.force_histogram, FORCE_BIN)
-    if not rows or source.config is None:
+    rows = _binned_by_mode(figures.statistics, lambda group: group.episodes.force_histogram, FORCE_BIN)
+    if not rows or figures.config is None:
         return
-    suction = source.config.suction
+    suction = figures.config.suction
     rules = [_limit(suction.good_force, "good seal breaks" if suction.vacuum is None else "tight seal breaks", "right")]
     if suction.vacuum is None:
         rules.insert(0, _limit(suction.poor_force, "poor seal breaks", "left"))
     bars = _histogram(rows, FORCE_BIN, (_FORCE, "attempts"), "~g", top=-(-suction.good_force // FORCE_BIN) * FORCE_BIN)
-    caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."
+    caption = f"Largest force on a seal during each of {figures.statistics.total.episodes.seals:,} lifts that engaged an object."
     yield Chart("forces", "Seal forces", caption, {"height": bars.pop("height"), "layer": [bars, *rules]})
 
 
@@ -267,9 +254,9 @@ def _limit(force: float, text: str, side: str) -> Spec:
     return limit({"x": _field("limit", "quantitative", _FORCE)}, force, text, {"strokeDash": [4, 3], "color": "gray"}, label)
 
 
-def _timeline(source: ChartData) -> Iterator[Chart]:
+def _timeline(figures: Figures) -> Iterator[Chart]:
     sums: dict[tuple[str, float], tuple[int, float]] = {}
-    for group in source.statistics.groups:
+    for group in figures.statistics.groups:
         for point in group.objects_over_time:
             frames, total = sums.get((group.mode, point.time), (0, 0.0))
             sums[group.mode, point.time] = frames + point.frames, total + point.frames * point.objects
@@ -281,7 +268,8 @@ def _timeline(source: ChartData) -> Iterator[Chart]:
     ]
     # A bin's mean holds from its begin to the next one's, and the last one's to the end of the longest episode.
     last = {row["mode"]: row for row in rows}
-    rows += [{**row, "time": max(row["time"], round(source.durations.get(mode, 0.0), 3))} for mode, row in last.items()]
+    frames = {mode: max((each.frames for each in figures.episodes.rows.values() if each.mode == mode), default=0) for mode in last}
+    rows += [{**row, "time": max(row["time"], round(frames[mode] * (figures.period or 0.0), 3))} for mode, row in last.items()]
     most, longest = max(row["objects"] for row in rows), max(row["time"] for row in rows)
     high = {"domain": [0, round(HEADROOM * most, 3) or 1], "nice": False}
     spec: Spec = {
@@ -303,11 +291,11 @@ def _timeline(source: ChartData) -> Iterator[Chart]:
     yield Chart("timeline", "Objects over time", caption, _colored(spec))
 
 
-def _coverage(source: ChartData) -> Iterator[Chart]:
-    seen = sorted((each for each in source.statistics.objects if each.coverage.views), key=lambda each: -each.coverage.views)[:MAX_LINES]
+def _coverage(figures: Figures) -> Iterator[Chart]:
+    seen = sorted((each for each in figures.statistics.objects if each.coverage.views), key=lambda each: -each.coverage.views)[:MAX_LINES]
     if not seen:
         return
-    names = object_labels(source.statistics.objects)
+    names = object_labels(figures.statistics.objects)
     rows = [
         {"object": names[each.object_id], "bin": index, "views": count}
         for each in seen
@@ -342,16 +330,16 @@ def _coverage(source: ChartData) -> Iterator[Chart]:
     yield Chart("coverage", "Pose coverage", caption, spec)
 
 
-def _lights(source: ChartData) -> Iterator[Chart]:
-    if lights := source.statistics.lights:
+def _lights(figures: Figures) -> Iterator[Chart]:
+    if lights := figures.statistics.lights:
         plural = "" if len(lights.maps) == 1 else "s"
         caption = f"{len(lights.maps):,} environment map{plural} in {lights.episodes:,} episodes."
         yield Chart("lights", "Light maps", caption, _episodes_by_name(lights.maps, "map"))
 
 
-def _bins(source: ChartData) -> Iterator[Chart]:
+def _bins(figures: Figures) -> Iterator[Chart]:
     """Episodes by bin, the most frequent bins, if there are several."""
-    uses = {name: use.episodes for name, use in source.statistics.bins.items()}
+    uses = {name: use.episodes for name, use in figures.statistics.bins.items()}
     if len(uses) > 1:
         yield Chart("bins", "Bins", f"{len(uses):,} bins in {sum(uses.values()):,} episodes.", _episodes_by_name(uses, "bin"))
 
@@ -363,18 +351,18 @@ def _episodes_by_name(counts: Mapping[str, int], noun: str) -> Spec:
     return _bars(rows, list(shown), "what", "count", (noun, "episodes"))
 
 
-def _exposure(source: ChartData) -> Iterator[Chart]:
+def _exposure(figures: Figures) -> Iterator[Chart]:
     """Histogram of the episodes' exposure compensation [EV], if at least two bins have episodes."""
-    lights = source.statistics.lights
+    lights = figures.statistics.lights
     if lights is not None and len(lights.exposure) > 1:
         rows = [{"low": low, "high": round(low + EXPOSURE_BIN, 6), "count": count} for low, count in lights.exposure.items()]
         spec = _histogram(rows, EXPOSURE_BIN, ("exposure compensation [EV]", "episodes"), ".1f", colored=False)
         yield Chart("exposure", "Exposure", "Exposure compensation of the episodes' light.", spec)
 
 
-def _luma(source: ChartData) -> Iterator[Chart]:
-    bins = Counter(min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1) for view in source.brightness)
+def _luma(figures: Figures) -> Iterator[Chart]:
+    bins = Counter(min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1) for view in figures.brightness)
     if bins:
         rows = _binned([bins[index] for index in range(BRIGHTNESS_BINS)], 1 / BRIGHTNESS_BINS)
         spec = _histogram(rows, 1 / BRIGHTNESS_BINS, ("mean brightness (sRGB)", "views"), ".0%", colored=False, top=1.0)
-        yield Chart("brightness", "Brightness", f"Mean luma of {len(source.brightness)} views, spread over the data set.", spec)
+        yield Chart("brightness", "Brightness", f"Mean luma of {len(figures.brightness)} views, spread over the data set.", spec)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp._version import __version__
-from synpick_warp.apps.report.charts import ChartData, make_charts
+from synpick_warp.apps.report.charts import make_charts
 from synpick_warp.apps.report.explained import DRAWS, PICKS_LEAD, calibration_chart, choose_attempts, make_attempt, picks_section
 from synpick_warp.apps.report.findings import WARNING, Figures, Remark, find
 from synpick_warp.apps.report.frames import (
@@ -92,10 +92,11 @@ def write_report(
     album = Album()
     samples = take_samples(data_set, statistics, episodes, album, frames, report or ignore_progress)
     versions, remarks = _versions(data_set)
-    findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
+    config = data_set.config if data_set.found is None else None
+    figures = Figures(statistics, episodes, samples.brightness, data_set.planned, config, data_set.period)
+    findings = [*remarks, *find(figures)]
     findings.sort(key=lambda finding: finding.level != WARNING)
     shown = statistics if (statistics.has_paper_objects if paper is None else paper) else replace(statistics, paper=())
-    config = data_set.config if data_set.found is None else None
     picks = find_picks(data_set, DRAWS)
     tried = [] if picks is None else [PageSection("picks", "Picks", PICKS_LEAD, picks_section(data_set, picks))]
     parts = _parts(data_set, shown, samples, findings, versions)
@@ -107,7 +108,7 @@ def write_report(
         parts=[*parts[:3], *tried, *parts[3:]],
         findings=findings,
         data=samples.data,
-        charts=[*calibration, *make_charts(ChartData(statistics, samples.brightness, config, _durations(data_set, episodes)))],
+        charts=[*calibration, *make_charts(figures)],
         album=album,
         footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
     )
@@ -143,14 +144,6 @@ def take_samples(
         brightness.append(measure_brightness(view))
     fitting = {name: [each for each in items if each is not None] for name, items in made.items()}
     return Samples(fitting, brightness, {name: len(items) for name, items in made.items()})
-
-
-def _durations(data_set: DataSet, episodes: SampledEpisodes) -> dict[str, float]:
-    """Time of the longest episode of each mode [s]."""
-    longest = dict[str, int]()
-    for row in episodes.rows.values():
-        longest[row.mode] = max(longest.get(row.mode, 0), row.frames)
-    return {} if data_set.period is None else {mode: frames * data_set.period for mode, frames in longest.items()}
 
 
 def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Remark]]:

@@ -179,7 +179,7 @@ def calibration_spec(figures: PickFigures) -> Spec:
         | ({} if low != low else {"low": float(low), "high": float(high)})
         for each in figures.scores
         if each.score == SCORES[0]
-        for count, predicted, observed, low, high in each.calibration.bins()
+        for count, predicted, observed, low, high in each.calibration.bins
         if predicted == predicted
     ]
     share = {"domain": [0, 1], "nice": False}

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from synpick_warp.apps.report.frames import Brightness, SampledEpisodes
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.codes import Ending, Outcome
+from synpick_warp.configs.schema import Config
 
 WARNING, NOTE = "warning", "note"
 FAILURE_SHARE = 0.3
@@ -56,13 +57,17 @@ class Remark(NamedTuple):
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures that remarks are derived from."""
+    """Figures that remarks and charts are derived from."""
 
     statistics: Statistics
     episodes: SampledEpisodes
     brightness: Sequence[Brightness]
     planned: int
     """Episodes that the settings plan."""
+    config: Config | None = None
+    """None: the data set is from another source."""
+    period: float | None = None
+    """Time between two frames [s]; None: not known."""
 
 
 def find(figures: Figures) -> list[Remark]:

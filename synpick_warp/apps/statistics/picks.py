@@ -85,22 +85,10 @@ def success_rate(scored: Scored, weight: np.ndarray | None = None) -> float:
 class CalibrationCurve:
     """Calibration curve (reliability diagram) by bin of the score."""
 
-    count: np.ndarray
-    """(bin) int."""
-    predicted: np.ndarray
-    """Weighted mean score (bin); NaN here and below: the bin is empty."""
-    observed: np.ndarray
-    """Weighted success rate (bin)."""
-    low: np.ndarray
-    """Lower end of the 95 % interval of `observed` (bin)."""
-    high: np.ndarray
-    """Upper end of that interval (bin)."""
+    bins: np.ndarray
+    """Count, weighted mean score, weighted success rate, and the ends of its 95 % interval (bin, 5); NaN in an empty bin."""
     error: Interval
-    """Expected calibration error: weighted mean of |observed - predicted| over bins."""
-
-    def bins(self) -> Iterator[tuple[float, ...]]:
-        """Count, mean score, success rate, and the ends of its interval, of each bin."""
-        yield from zip(self.count, self.predicted, self.observed, self.low, self.high, strict=True)
+    """Expected calibration error: weighted mean of |success rate - mean score| over bins."""
 
 
 def calibrate(scored: Scored, draws: int = DRAWS) -> CalibrationCurve:
@@ -120,7 +108,7 @@ def calibrate(scored: Scored, draws: int = DRAWS) -> CalibrationCurve:
         mean = predicted / total
     value, low, high = bootstrap(scored, curve, draws)
     error = Interval(float(value[-1]), float(low[-1]), float(high[-1]))
-    return CalibrationCurve(np.bincount(place, minlength=BINS), mean, value[:-1], low[:-1], high[:-1], error)
+    return CalibrationCurve(np.column_stack((np.bincount(place, minlength=BINS), mean, value[:-1], low[:-1], high[:-1])), error)
 
 
 def estimate(scored: Scored, statistic: Callable[[Scored, np.ndarray], float], draws: int = DRAWS) -> Interval:
@@ -288,7 +276,7 @@ def picks_tables(figures: PickFigures) -> tuple[Table, ...]:
         (each.population, f"{number / BINS:.1f} to {(number + 1) / BINS:.1f}", int(count), *map(_known, shares))
         for each in figures.scores
         if each.score == SCORES[0]
-        for number, (count, *shares) in enumerate(each.calibration.bins())
+        for number, (count, *shares) in enumerate(each.calibration.bins)
     ]
     objects = [
         (each.obj_id, each.name, each.trials, *_values(each.success), *(_values(each.auc) if each.auc else (None,) * 3))

@@ -255,7 +255,7 @@ class WorldStates:
 
 
 def check_array(name: str, arrays: Mapping[str, np.ndarray], dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
-    """Array of a state on the host, copied; raises StateError if it is missing, has another type or shape, or a number that is not finite."""
+    """Array of a state on the host, copied; raises StateError if it is missing, has another type or shape, or is not finite."""
     if name not in arrays:
         raise StateError(f"the state lacks {name}; allowed: all arrays of `state_to_host`")
     values = np.array(arrays[name])
