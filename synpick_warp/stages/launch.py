@@ -109,8 +109,8 @@ def _arrays(arguments: Sequence[Any]) -> Iterator[wp.array]:
     """Yield the arrays of arguments: those of structs last."""
     yield from (argument for argument in arguments if isinstance(argument, wp.array))
     for argument in arguments:
-        members = argument._cls.vars if hasattr(argument, "_cls") else ()
-        yield from (value for value in (getattr(argument, name) for name in members) if isinstance(value, wp.array))
+        if hasattr(argument, "_cls"):
+            yield from _arrays([getattr(argument, name) for name in argument._cls.vars])
 
 
 @functools.cache

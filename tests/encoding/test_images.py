@@ -19,7 +19,8 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.kernels.encoding import huffman, stuffing
 from synpick_warp.kernels.encoding import png as kernels
-from synpick_warp.kernels.encoding.dct import ZIGZAG, quantize, transform_block
+from synpick_warp.kernels.encoding.dct import ZIGZAG, JpegData, quantize, transform_block
+from synpick_warp.kernels.encoding.stuffing import JpegFiles
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.encoding import png
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes, upload_huffman
@@ -160,17 +161,15 @@ def code(blocks: np.ndarray, interval_blocks: int, device, slot_words: int = 409
     intervals = -(-count // interval_blocks)
     quads = np.ascontiguousarray(blocks.astype("<i2")).view(np.uint64).transpose(0, 2, 1)
     masks = ((blocks != 0) << np.arange(64, dtype=np.uint64)).sum(axis=2, dtype=np.uint64)
-    coefficient, nonzero = wp.array(quads, dtype=wp.uint64, device=device), wp.array(masks, dtype=wp.uint64, device=device)
-    tables = upload_huffman(device)
-    bits, begin = (wp.empty((views, count), dtype=int, device=device) for _ in range(2))
-    coded, size = (wp.empty((views, intervals), dtype=int, device=device) for _ in range(2))
-    slot = wp.full((views, intervals, slot_words), 0xFFFFFFFF, dtype=wp.uint32, device=device)
-    wp.launch(huffman.measure_blocks_kernel, (views, count), [tables, coefficient, nonzero, interval_blocks], [bits], device=device)
-    outputs = [begin, slot, coded, size]
-    wp.launch(huffman.place_blocks_kernel, (views, intervals), [bits, interval_blocks, 2], outputs, device=device)
-    inputs = [tables, coefficient, nonzero, begin, interval_blocks]
-    wp.launch(huffman.write_blocks_kernel, (views, count), inputs, [slot], device=device)
-    arrays = {"bits": bits, "begin": begin, "slot": slot, "coded": coded, "size": size}
+    tables, data = upload_huffman(device), JpegData()
+    data.coefficient, data.nonzero = (wp.array(values, dtype=wp.uint64, device=device) for values in (quads, masks))
+    data.block_bits, data.block_begin = (wp.empty((views, count), dtype=int, device=device) for _ in range(2))
+    data.coded, data.interval_size = (wp.empty((views, intervals), dtype=int, device=device) for _ in range(2))
+    data.slot = wp.full((views, intervals, slot_words), 0xFFFFFFFF, dtype=wp.uint32, device=device)
+    wp.launch(huffman.measure_blocks_kernel, (views, count), [tables, interval_blocks], [data], device=device)
+    wp.launch(huffman.place_blocks_kernel, (views, intervals), [interval_blocks, 2], [data], device=device)
+    wp.launch(huffman.write_blocks_kernel, (views, count), [tables, interval_blocks], [data], device=device)
+    arrays = {"bits": data.block_bits, "begin": data.block_begin, "slot": data.slot, "coded": data.coded, "size": data.interval_size}
     return SimpleNamespace(**{name: array.numpy() for name, array in arrays.items()})
 
 
@@ -242,19 +241,19 @@ def join(strings: list[bytes], lanes: int, capacity: int, device, slot_words: in
     padded = np.zeros((1, len(strings), 4 * slot_words), np.uint8)
     for interval, string in enumerate(strings):
         padded[0, interval, : len(string)] = list(string[: 4 * slot_words])
-    slot = wp.array(padded.view(">u4").astype(np.uint32), dtype=wp.uint32, device=device)
-    coded = wp.array([[len(string) for string in strings]], dtype=int, device=device)
-    size = wp.array([[len(string) + 2 for string in strings]], dtype=int, device=device)
-    counts = wp.empty((1, len(strings), lanes), dtype=int, device=device)
-    begin, total = wp.empty((1, len(strings)), dtype=int, device=device), wp.empty(1, dtype=int, device=device)
-    file = wp.full((2, capacity), SENTINEL, dtype=wp.uint8, device=device)
-    wp.launch(stuffing.count_stuffing_kernel, counts.shape, [slot, coded], [counts, size], device=device)
-    inputs = [coded, size, 4 * slot_words, header.shape[1], capacity]
-    wp.launch(stuffing.place_intervals_kernel, 1, inputs, [begin, total], device=device)
-    inputs = [slot, coded, size, begin, counts, wp.zeros(1, dtype=int, device=device), wp.array(header, device=device)]
-    wp.launch(stuffing.join_intervals_kernel, counts.shape, inputs, [file], device=device)
+    data, files, shape = JpegData(), JpegFiles(), (1, len(strings))
+    data.slot = wp.array(padded.view(">u4").astype(np.uint32), dtype=wp.uint32, device=device)
+    sizes = [[len(string) for string in strings]]
+    data.coded, data.interval_size = (wp.array(np.add(sizes, more), dtype=int, device=device) for more in (0, 2))
+    data.stuffing, data.interval_begin = (wp.empty(extents, dtype=int, device=device) for extents in ((*shape, lanes), shape))
+    files.jpeg_size, files.jpeg = wp.empty(1, dtype=int, device=device), wp.full((2, capacity), SENTINEL, dtype=wp.uint8, device=device)
+    wp.launch(stuffing.count_stuffing_kernel, (*shape, lanes), [], [data], device=device)
+    wp.launch(stuffing.place_intervals_kernel, 1, [header.shape[1]], [data, files], device=device)
+    inputs = [data, wp.zeros(1, dtype=int, device=device), wp.array(header, device=device)]
+    wp.launch(stuffing.join_intervals_kernel, (*shape, lanes), inputs, [files], device=device)
+    file = files.jpeg
     assert (file.numpy()[1] == SENTINEL).all()
-    return file.numpy()[0], int(total.numpy()[0])
+    return file.numpy()[0], int(files.jpeg_size.numpy()[0])
 
 
 def expected_file(strings: list[bytes]) -> bytes:

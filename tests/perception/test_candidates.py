@@ -13,9 +13,12 @@ from scipy.stats import chisquare
 from synpick_warp.codes import Share
 from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.kernels.perception.candidates import POOL
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters
+from synpick_warp.kernels.state import Frames
 from synpick_warp.stages.buffers import LayerBuffers
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.render.layers import LayerRenderer
+from synpick_warp.stages.render.view_setup import make_shot
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.trials import find_choices, own_grasps
 from synpick_warp.views.layers import LAYER_TABLE
@@ -156,8 +159,9 @@ def test_scores_are_those_of_the_layers(sampled):
     shape = images.gbuffer.depth.shape
     buffers = {name: wp.zeros(shape, dtype=wp.float32, device=images.scene.device) if name in names else None for name in LAYER_TABLE}
     out = LayerBuffers(**buffers)
-    layers = LayerRenderer(names, None, images.scene, images.views.instances, images.views.count)
-    layers.render(simulation.record.snapshot, images.bodies, images.gbuffer, images.views, out, images.views)
+    layers = LayerRenderer(names, SensorParameters(), images.scene, images.views.instances, images.views.count)
+    shot = make_shot(images.scene, Frames(), images.bodies, images.gbuffer, images.views)
+    layers.render(simulation.record.snapshot, shot, out, images.views.cameras)
     column, row = sampled.pixel.T
     np.testing.assert_array_equal(sampled.seal, out.suction_seal.numpy()[0, row, column])
     np.testing.assert_array_equal(sampled.wrench, out.suction_wrench.numpy()[0, row, column])

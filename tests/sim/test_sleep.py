@@ -181,9 +181,9 @@ def test_an_object_that_loses_its_support_wakes(twins):
 def test_the_end_of_an_episode_clears_marks_of_islands(twins):
     """Else an island would wake when a state is loaded into the world."""
     set_rows(twins, [0], worlds__phase=Phase.OVER)
-    twins.sleep._woken.fill_(1)
+    twins.sleep._islands.woken.fill_(1)
     twins.sleep.judge(twins.state, twins.attempts, twins.seals, SLEEP["physics__sleep"])
-    assert not twins.sleep._woken.numpy().any()
+    assert not twins.sleep._islands.woken.numpy().any()
 
 
 # ---- states ----
@@ -224,11 +224,11 @@ def test_worlds_without_rows_need_one_iteration(device):
 
 def joined(device, bodies: int, pairs: list[tuple[int, int]]) -> list[int]:
     """Union-find roots (body) of bodies with one shape each, after contacts `pairs`."""
-    parent = wp.array(np.arange(bodies), dtype=int, device=device)
+    islands = filled(kernels.Islands(), {"parent": wp.array(np.arange(bodies), dtype=int, device=device)})
     values = {f"shape{side}": [pair[side] for pair in pairs] for side in (0, 1)} | {"count": [len(pairs)], "shape_body": range(bodies)}
     contacts = filled(Contacts(), {name: wp.array(list(value), dtype=int, device=device) for name, value in values.items()})
-    launch(kernels.join_islands_kernel, len(pairs), contacts=contacts, parent=parent)
-    roots = parent.numpy()
+    launch(kernels.join_islands_kernel, len(pairs), contacts=contacts, islands=islands)
+    roots = islands.parent.numpy()
     while (roots[roots] != roots).any():
         roots = roots[roots]
     return roots.tolist()

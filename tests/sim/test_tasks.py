@@ -13,7 +13,10 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Removal, Task
 from synpick_warp.kernels.perception import worklist
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.state import Attempts, Worlds
+from synpick_warp.stages.arrays import allocate_struct
+from synpick_warp.stages.perception.perceive import WORKLIST
 from synpick_warp.stages.sim import arrange, gripper
 from tests.worlds.kernel_worlds import KernelWorlds, filled
 
@@ -293,15 +296,14 @@ def test_everybody_who_looks_is_looked_at_once(looking, views, device):
     state = filled(Worlds(), {"phase": wp.full(worlds, Phase.ACT, dtype=int, device=device)})
     tasks = [Task.LOOK if looks else Task.PRESS for looks in looking]
     attempts = filled(Attempts(), {"task": wp.array(tasks, dtype=int, device=device)})
-    listed, world = wp.zeros(worlds, dtype=int, device=device), wp.zeros(views, dtype=int, device=device)
-    count, first, left = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
-    wp.launch(worklist.list_worlds_kernel, dim=1, inputs=[worlds, state, attempts], outputs=[listed, count, first, left], device=device)
+    listed, batch = allocate_struct(WORKLIST, {"world": worlds, "one": 1}, device), filled(Views(), {"world": wp.zeros(views, int, device)})
+    wp.launch(worklist.list_worlds_kernel, dim=1, inputs=[worlds, state, attempts], outputs=[listed], device=device)
     seen: list[int] = []
     batches = 0
-    while left.numpy()[0]:
-        wp.launch(worklist.take_batch_kernel, dim=views, inputs=[listed, count, first], outputs=[world], device=device)
-        seen += [number for number in world.numpy().tolist() if number >= 0]
-        wp.launch(worklist.advance_batch_kernel, dim=1, inputs=[views, count], outputs=[first, left], device=device)
+    while listed.remaining.numpy()[0]:
+        wp.launch(worklist.take_batch_kernel, dim=views, inputs=[listed], outputs=[batch], device=device)
+        seen += [number for number in batch.world.numpy().tolist() if number >= 0]
+        wp.launch(worklist.advance_batch_kernel, dim=1, inputs=[views], outputs=[listed], device=device)
         batches += 1
     assert seen == [number for number, looks in enumerate(looking) if looks]
     assert batches == -(-len(seen) // views)

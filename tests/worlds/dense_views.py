@@ -36,7 +36,7 @@ def dense_batch(toy: ToyScene, device: wp.Device) -> FrameBatch:
     list_boundaries(scratch, count, out, boundaries)
     entries = world.catalog_index.numpy()[0]
     ids = np.append([entry.obj_id for entry in toy.entries], -1)[entries].astype(np.int32)
-    images = {name: array.numpy() for name, array in (vars(out) | vars(boundaries)).items() if name != "effects"}
+    images = {name: array.numpy() for name, array in (vars(out) | vars(boundaries)).items() if name not in ("effects", "bundle")}
     return FrameBatch(
         **images,
         episode=np.zeros(count, np.int32),

@@ -102,7 +102,7 @@ class Suction:
         choices=("hull", "mesh"),
     )
     tolerated_misses: Annotated[int, f"[0, {INT32_MAX}]"] = setting(
-        0, "Maximum rays that may miss for a good seal (paper: 0; released: 2)."
+        0, "Without vacuum: rays that may miss for a good seal (paper: 0; released: 2)."
     )
     good_force: Annotated[float, "(0, 1e5] N"] = setting(40.0, "Break force of a good seal (paper).")
     poor_force: Annotated[float, "(0, 1e5] N"] = setting(2.0, "Break force of any other seal (paper: 2; released: 0.2).")

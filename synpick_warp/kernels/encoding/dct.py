@@ -46,6 +46,32 @@ VALUE_BITS = wp.constant(wp.uint64(16))
 """Bits of a stored coefficient."""
 
 
+@wp.struct
+class JpegData:
+    """Samples, DCT coefficients, bit strings and positions of a batch of images. Scratch."""
+
+    sample: wp.array3d[wp.uint64]
+    """(view, sample_row, sample_block): rows of eight samples: Y, below it Cb and Cr side by side, of whole MCUs."""
+    coefficient: wp.array3d[wp.uint64]
+    """(view, quad, block): quantized DCT coefficients in zigzag order, four of 16 bits in each element, the first one lowest."""
+    nonzero: wp.array2d[wp.uint64]
+    """(view, block): bit field of the coefficients that are not 0."""
+    block_bits: wp.array2d[int]
+    """(view, block): length of each block's bit string [bit]."""
+    block_begin: wp.array2d[int]
+    """(view, block): first bit of each block in its interval."""
+    slot: wp.array3d[wp.uint32]
+    """(view, interval, slot_word): bit string of each restart interval, most significant bit first."""
+    coded: wp.array2d[int]
+    """(view, interval): size of each bit string [B], also beyond its slot."""
+    stuffing: wp.array3d[int]
+    """(view, interval, lane): bytes that each lane stuffs into its chunk of an interval."""
+    interval_size: wp.array2d[int]
+    """(view, interval): size of each interval in the file [B], with stuffing and marker."""
+    interval_begin: wp.array2d[int]
+    """(view, interval): first byte of each interval in the file."""
+
+
 @wp.func
 def luma(color: wp.vec3ub) -> int:
     """Y of an sRGB colour (JFIF, BT.601), rounded to nearest."""
@@ -193,21 +219,19 @@ def read_block(
 @wp.kernel
 def transform_blocks_kernel(
     # In:
-    sample: wp.array3d[wp.uint64],  # (view, sample_row, sample_block)
     rows: int,
     columns: int,
     quality: wp.array[int],  # (view)
     reciprocal: wp.array3d[wp.uint32],  # (quality, component, coefficient)
     # Out:
-    coefficient_out: wp.array3d[wp.uint64],  # (view, quad, block)
-    nonzero_out: wp.array2d[wp.uint64],  # (view, block)
+    data_inout: JpegData,
 ):
     """Quantized DCT coefficients of all blocks, in zigzag order. Launched over view, block.
 
-    `coefficient_out` receives four coefficients of 16 bits in each element, the first one lowest; `nonzero_out` a bit for each
-    coefficient that is not 0. Padding blocks of images of `rows` x `columns` pixels repeat the DC coefficient of the block before them,
-    and have no other (only `nonzero_out` tells so), which costs the fewest bits.
+    Padding blocks of images of `rows` x `columns` pixels repeat the DC coefficient of the block before them, and have no other (only
+    `nonzero` tells so), which costs the fewest bits.
     """
+    sample = data_inout.sample
     view, index = wp.tid()
     mcu, block = index // BLOCKS_PER_MCU, index % BLOCKS_PER_MCU
     across = sample.shape[2] // MCU_BLOCKS_ACROSS
@@ -230,7 +254,7 @@ def transform_blocks_kernel(
         bit = bit << ONE
         packed = (packed >> VALUE_BITS) | (wp.uint64(value & 0xFFFF) << (wp.uint64(3) * VALUE_BITS))
         if k & 3 == 3:
-            coefficient_out[view, k >> 2, index] = packed
+            data_inout.coefficient[view, k >> 2, index] = packed
     if source != block:
         mask = mask & ONE
-    nonzero_out[view, index] = mask
+    data_inout.nonzero[view, index] = mask

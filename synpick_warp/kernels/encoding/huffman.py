@@ -7,7 +7,7 @@ files of them.
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.dct import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS
+from synpick_warp.kernels.encoding.dct import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS, JpegData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -92,23 +92,13 @@ def component_of(block: int) -> int:
 
 
 @wp.func
-def read_coefficient(
-    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
-    view: int,
-    block: int,
-    k: int,
-) -> int:
+def read_coefficient(data: JpegData, view: int, block: int, k: int) -> int:
     """Coefficient k of a block, in zigzag order."""
-    return int(wp.int16(coefficient[view, k >> 2, block] >> wp.uint64(16 * (k & 3))))
+    return int(wp.int16(data.coefficient[view, k >> 2, block] >> wp.uint64(16 * (k & 3))))
 
 
 @wp.func
-def dc_difference(
-    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
-    view: int,
-    block: int,
-    interval_blocks: int,
-) -> int:
+def dc_difference(data: JpegData, view: int, block: int, interval_blocks: int) -> int:
     """DC coefficient of a block minus that of the block before it of the same component in the restart interval; minus 0 for
     the first one.
     """
@@ -119,72 +109,54 @@ def dc_difference(
         previous += LUMA_BLOCKS - 1
     elif part < LUMA_BLOCKS:
         previous = block - 1
-    value = read_coefficient(coefficient, view, block, 0)
+    value = read_coefficient(data, view, block, 0)
     if previous >= block - block % interval_blocks:
-        value -= read_coefficient(coefficient, view, previous, 0)
+        value -= read_coefficient(data, view, previous, 0)
     return value
 
 
 @wp.kernel
-def measure_blocks_kernel(
-    # In:
-    tables: HuffmanTables,
-    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
-    nonzero: wp.array2d[wp.uint64],  # (view, block)
-    interval_blocks: int,
-    # Out:
-    bits_out: wp.array2d[int],  # (view, block) [bit]
-):
+def measure_blocks_kernel(tables: HuffmanTables, interval_blocks: int, data_inout: JpegData):
     """Measure the bit string of each block: Huffman codes and magnitude bits. Launched over view, block."""
     view, block = wp.tid()
     component = component_of(block)
-    bits = bit_length(wp.abs(dc_difference(coefficient, view, block, interval_blocks)))
+    bits = bit_length(wp.abs(dc_difference(data_inout, view, block, interval_blocks)))
     length = code_length(tables.dc[component, bits]) + bits
     long_run = code_length(tables.ac[component, ZERO_RUN])
     last = int(0)
-    mask = nonzero[view, block] & ~ONE
+    mask = data_inout.nonzero[view, block] & ~ONE
     while mask != wp.uint64(0):
         k = lowest_bit(mask)
         mask = mask & (mask - ONE)
         zeros = k - last - 1
-        bits = bit_length(wp.abs(read_coefficient(coefficient, view, block, k)))
+        bits = bit_length(wp.abs(read_coefficient(data_inout, view, block, k)))
         symbol = ((zeros & LONGEST_RUN) << RUN_BITS) + bits
         length += (zeros >> RUN_BITS) * long_run + code_length(tables.ac[component, symbol]) + bits
         last = k
     if last < BLOCK_SIZE - 1:
         # End of block (EOB).
         length += code_length(tables.ac[component, 0])
-    bits_out[view, block] = length
+    data_inout.block_bits[view, block] = length
 
 
 @wp.kernel
-def place_blocks_kernel(
-    # In:
-    bits: wp.array2d[int],  # (view, block) [bit]
-    interval_blocks: int,
-    marker_bytes: int,
-    # Out:
-    begin_out: wp.array2d[int],  # (view, block) [bit]
-    slot_out: wp.array3d[wp.uint32],  # (view, interval, slot_word)
-    coded_out: wp.array2d[int],  # (view, interval) [B]
-    size_out: wp.array2d[int],  # (view, interval) [B]
-):
-    """Prefix sum over the blocks of a restart interval: `begin_out` receives their bit offsets. Launched over view, interval.
+def place_blocks_kernel(interval_blocks: int, marker_bytes: int, data_inout: JpegData):
+    """Prefix sum over the blocks of a restart interval: `block_begin` receives their bit offsets. Launched over view, interval.
 
-    Also clears the words of the slot that blocks share. `coded_out` receives the bytes of the bit string, which may be more than the slot
-    has, `size_out` the same with the closing marker.
+    Also clears the words of the slot that blocks share. `coded` receives the bytes of the bit string, which may be more than the slot has,
+    `interval_size` the same with the closing marker.
     """
     view, interval = wp.tid()
     begin = int(0)
-    for block in range(interval * interval_blocks, wp.min((interval + 1) * interval_blocks, bits.shape[1])):
-        begin_out[view, block] = begin
-        if begin >> WORD_SHIFT < slot_out.shape[2]:
-            slot_out[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
-        begin += bits[view, block]
-    if begin >> WORD_SHIFT < slot_out.shape[2]:
-        slot_out[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
-    coded_out[view, interval] = (begin + 7) // 8
-    size_out[view, interval] = (begin + 7) // 8 + marker_bytes
+    for block in range(interval * interval_blocks, wp.min((interval + 1) * interval_blocks, data_inout.block_bits.shape[1])):
+        data_inout.block_begin[view, block] = begin
+        if begin >> WORD_SHIFT < data_inout.slot.shape[2]:
+            data_inout.slot[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
+        begin += data_inout.block_bits[view, block]
+    if begin >> WORD_SHIFT < data_inout.slot.shape[2]:
+        data_inout.slot[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
+    data_inout.coded[view, interval] = (begin + 7) // 8
+    data_inout.interval_size[view, interval] = (begin + 7) // 8 + marker_bytes
 
 
 @wp.func
@@ -221,50 +193,42 @@ def put_value(writer: WordWriter, slot: wp.array3d[wp.uint32], code: wp.uint32, 
 
 
 @wp.kernel
-def write_blocks_kernel(
-    # In:
-    tables: HuffmanTables,
-    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
-    nonzero: wp.array2d[wp.uint64],  # (view, block)
-    begin: wp.array2d[int],  # (view, block) [bit]
-    interval_blocks: int,
-    # Out:
-    slot_out: wp.array3d[wp.uint32],  # (view, interval, slot_word)
-):
+def write_blocks_kernel(tables: HuffmanTables, interval_blocks: int, data_inout: JpegData):
     """Write the bit string of each block at its bit offset: DC difference, then zero runs and AC coefficients. Launched over view, block.
 
     Words shared by neighbouring blocks are combined by atomic "or", whose result does not depend on the order. The last block of an
     interval pads the last byte with ones.
     """
     view, block = wp.tid()
+    slot = data_inout.slot
     component = component_of(block)
-    offset = begin[view, block]
+    offset = data_inout.block_begin[view, block]
     writer = WordWriter()
     writer.view = view
     writer.interval = block // interval_blocks
     writer.word = offset >> WORD_SHIFT
     writer.bits = offset & (WORD_BITS - 1)
     writer.shared = writer.bits > 0
-    value = dc_difference(coefficient, view, block, interval_blocks)
+    value = dc_difference(data_inout, view, block, interval_blocks)
     bits = bit_length(wp.abs(value))
-    writer = put_value(writer, slot_out, tables.dc[component, bits], value, bits)
+    writer = put_value(writer, slot, tables.dc[component, bits], value, bits)
     last = int(0)
-    mask = nonzero[view, block] & ~ONE
+    mask = data_inout.nonzero[view, block] & ~ONE
     while mask != wp.uint64(0):
         k = lowest_bit(mask)
         mask = mask & (mask - ONE)
         zeros = k - last - 1
         while zeros > LONGEST_RUN:
-            writer = put_value(writer, slot_out, tables.ac[component, ZERO_RUN], 0, 0)
+            writer = put_value(writer, slot, tables.ac[component, ZERO_RUN], 0, 0)
             zeros -= LONGEST_RUN + 1
-        value = read_coefficient(coefficient, view, block, k)
+        value = read_coefficient(data_inout, view, block, k)
         bits = bit_length(wp.abs(value))
-        writer = put_value(writer, slot_out, tables.ac[component, (zeros << RUN_BITS) + bits], value, bits)
+        writer = put_value(writer, slot, tables.ac[component, (zeros << RUN_BITS) + bits], value, bits)
         last = k
     if last < BLOCK_SIZE - 1:
         # End of block (EOB).
-        writer = put_value(writer, slot_out, tables.ac[component, 0], 0, 0)
-    if (block + 1) % interval_blocks == 0 or block == begin.shape[1] - 1:
+        writer = put_value(writer, slot, tables.ac[component, 0], 0, 0)
+    if (block + 1) % interval_blocks == 0 or block == data_inout.block_begin.shape[1] - 1:
         padding = (WORD_BITS - writer.bits) & 7
-        writer = put_bits(writer, slot_out, wp.uint32((1 << padding) - 1), padding)
-    finish_words(writer, slot_out)
+        writer = put_bits(writer, slot, wp.uint32((1 << padding) - 1), padding)
+    finish_words(writer, slot)

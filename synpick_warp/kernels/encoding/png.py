@@ -74,6 +74,28 @@ class SlotSums:
     """(view, slot): sum of position in the filtered image times byte, modulo `ADLER`; of a group: sum of up to `GROUP` of these."""
 
 
+@wp.struct
+class Slots:
+    """Bit strings (slots) of the segments of a batch of images, and positions of these. Scratch."""
+
+    slot: wp.array3d[wp.uint32]
+    """(view, slot, slot_word): bit strings of the header, of each segment of a row, and of the trailer; least significant bit first."""
+    begin: wp.array2d[int]
+    """(view, slot): first bit of each slot in the data of its group."""
+    group_begin: wp.array2d[int]
+    """(view, group): first bit of each group of slots."""
+
+
+@wp.struct
+class DepthFiles:
+    """Compressed data (IDAT) of the depth PNGs of a batch of views, and their sizes."""
+
+    depth_idat_size: wp.array[int]
+    """(view): size of each stream [B]; above the capacity of `depth_idat`: the stream is incomplete."""
+    depth_idat: wp.array2d[wp.uint8]
+    """(view, depth_byte): zlib streams, from the first byte."""
+
+
 @wp.func
 def put_bits(writer: SlotWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, count: int) -> SlotWriter:
     """Append the low `count` bits of `value`, at most 32; writes a word to the slot whenever 32 bits are complete."""
@@ -164,7 +186,7 @@ def encode_segments_kernel(
     codes: Codes,
     segment: int,
     # Out:
-    slot_out: wp.array3d[wp.uint32],  # (view, slot, word)
+    strings_out: Slots,
     sums_out: SlotSums,
 ):
     """Filter and code segments of `segment` pixels of the rows. Launched over view, row, part of the row.
@@ -180,7 +202,7 @@ def encode_segments_kernel(
     writer.slot = 1 + row * ((width + segment - 1) // segment) + part
     total, moment, position = int(0), int(0), int(0)
     if part == 0:
-        writer = put_code(writer, slot_out, codes.literal[UP])
+        writer = put_code(writer, strings_out.slot, codes.literal[UP])
         total, position = int(UP), int(1)
     history = history_vec()
     for k in range(MAX_DISTANCE):
@@ -199,37 +221,30 @@ def encode_segments_kernel(
             matches = matches & here
             run += 1
         else:
-            writer = put_run(writer, slot_out, codes, run, matches, history[0])
+            writer = put_run(writer, strings_out.slot, codes, run, matches, history[0])
             matches = here
             run = wp.where(here != 0, 1, 0)
             if here == 0:
-                writer = put_sample(writer, slot_out, codes, sample)
+                writer = put_sample(writer, strings_out.slot, codes, sample)
         history = push_sample(history, sample)
-    writer = put_run(writer, slot_out, codes, run, matches, history[0])
+    writer = put_run(writer, strings_out.slot, codes, run, matches, history[0])
     first = modulo_product(row, 2 * width + 1) + wp.where(part == 0, 0, 1 + 2 * begin)
-    sums_out.bits[view, writer.slot] = finish_slot(writer, slot_out)
+    sums_out.bits[view, writer.slot] = finish_slot(writer, strings_out.slot)
     sums_out.total[view, writer.slot] = total
     sums_out.moment[view, writer.slot] = (moment + modulo_product(first, total)) % ADLER
 
 
 @wp.kernel
-def sum_groups_kernel(
-    # In:
-    slots: SlotSums,
-    # Out:
-    begin_out: wp.array2d[int],  # (view, slot)
-    groups_out: SlotSums,
-):
+def sum_groups_kernel(slots: SlotSums, strings_out: Slots, groups_out: SlotSums):
     """Prefix sum, level 1: bit offset of each slot within its group, and the sums of each group of `GROUP` slots.
 
-    The last slot of a view is left out: `close_streams_kernel` writes it. `begin_out` receives the offsets [bits]. Launched over view,
-    group.
+    The last slot of a view is left out: `close_streams_kernel` writes it. Launched over view, group.
     """
     view, group = wp.tid()
     bits, total, moment = int(0), int(0), int(0)
-    for slot in range(group * GROUP, wp.min((group + 1) * GROUP, begin_out.shape[1])):
-        begin_out[view, slot] = bits
-        if slot < begin_out.shape[1] - 1:
+    for slot in range(group * GROUP, wp.min((group + 1) * GROUP, strings_out.begin.shape[1])):
+        strings_out.begin[view, slot] = bits
+        if slot < strings_out.begin.shape[1] - 1:
             bits += slots.bits[view, slot]
             total += slots.total[view, slot]
             moment += slots.moment[view, slot]
@@ -240,25 +255,16 @@ def sum_groups_kernel(
 
 @wp.kernel
 def close_streams_kernel(
-    # In:
-    groups: SlotSums,
-    end_code: wp.uint32,
-    rows: int,
-    columns: int,
-    # Out:
-    group_begin_out: wp.array2d[int],  # (view, group)
-    slot_out: wp.array3d[wp.uint32],  # (view, slot, word)
-    slots_inout: SlotSums,
-    size_out: wp.array[int],  # (view)
+    groups: SlotSums, end_code: wp.uint32, rows: int, columns: int, strings_out: Slots, slots_inout: SlotSums, files_out: DepthFiles
 ):
     """Prefix sum, level 2, and end of the stream, in the last slot: end-of-block code, padding to a byte, Adler-32 of the filtered rows.
 
-    `group_begin_out` receives the bit offset of each group, `size_out` the size of the zlib stream [B]. Launched over view.
+    Launched over view.
     """
     view = wp.tid()
     bits, total, moment = int(0), int(0), int(0)
     for group in range(groups.bits.shape[1]):
-        group_begin_out[view, group] = bits
+        strings_out.group_begin[view, group] = bits
         bits += groups.bits[view, group]
         total = (total + groups.total[view, group]) % ADLER
         moment = (moment + groups.moment[view, group]) % ADLER
@@ -267,16 +273,16 @@ def close_streams_kernel(
     low = (1 + total) % ADLER
     writer = SlotWriter()
     writer.view = view
-    writer.slot = slot_out.shape[1] - 1
-    writer = put_code(writer, slot_out, end_code)
+    writer.slot = strings_out.slot.shape[1] - 1
+    writer = put_code(writer, strings_out.slot, end_code)
     end = bits + int(end_code >> wp.uint32(CODE_BITS))
-    writer = put_bits(writer, slot_out, wp.uint32(0), (8 - end % 8) % 8)
+    writer = put_bits(writer, strings_out.slot, wp.uint32(0), (8 - end % 8) % 8)
     # The checksum's highest byte comes first.
     for value in range(2):
         half = wp.where(value == 0, high, low)
-        writer = put_bits(writer, slot_out, wp.uint32((half >> 8) | ((half & 0xFF) << 8)), 16)
-    slots_inout.bits[view, writer.slot] = finish_slot(writer, slot_out)
-    size_out[view] = (bits + slots_inout.bits[view, writer.slot]) // 8
+        writer = put_bits(writer, strings_out.slot, wp.uint32((half >> 8) | ((half & 0xFF) << 8)), 16)
+    slots_inout.bits[view, writer.slot] = finish_slot(writer, strings_out.slot)
+    files_out.depth_idat_size[view] = (bits + slots_inout.bits[view, writer.slot]) // 8
 
 
 @wp.func
@@ -290,23 +296,15 @@ def read_bits(slot: wp.array3d[wp.uint32], view: int, index: int, first: int) ->
 
 
 @wp.kernel
-def join_slots_kernel(
-    # In:
-    slot: wp.array3d[wp.uint32],  # (view, slot, word)
-    slots: SlotSums,
-    begin: wp.array2d[int],  # (view, slot)
-    group_begin: wp.array2d[int],  # (view, group)
-    lanes: int,
-    # Out:
-    data_out: wp.array2d[wp.uint8],  # (view, byte)
-):
-    """Concatenate the bit strings of a view's slots to its bytes, `data_out`. Launched over view, slot, lane: `lanes` threads write the
-    words of the data that begin in a slot.
+def join_slots_kernel(strings: Slots, slots: SlotSums, lanes: int, files_out: DepthFiles):
+    """Concatenate the bit strings of a view's slots to its stream. Launched over view, slot, lane: `lanes` threads write the words of the
+    data that begin in a slot.
 
-    Bytes beyond the capacity of `data_out` are left out.
+    Bytes beyond the capacity are left out.
     """
     view, index, lane = wp.tid()
-    first = group_begin[view, index // GROUP] + begin[view, index]
+    slot = strings.slot
+    first = strings.group_begin[view, index // GROUP] + strings.begin[view, index]
     end = first + slots.bits[view, index]
     for word in range((first + WORD_BITS - 1) // WORD_BITS + lane, (end + WORD_BITS - 1) // WORD_BITS, lanes):
         source, offset, count = int(index), word * WORD_BITS - first, int(0)
@@ -322,5 +320,5 @@ def join_slots_kernel(
             offset = int(0)
         for k in range(4):
             byte = 4 * word + k
-            if 8 * k < count and byte < data_out.shape[1]:
-                data_out[view, byte] = wp.uint8((value >> wp.uint32(8 * k)) & wp.uint32(0xFF))
+            if 8 * k < count and byte < files_out.depth_idat.shape[1]:
+                files_out.depth_idat[view, byte] = wp.uint8((value >> wp.uint32(8 * k)) & wp.uint32(0xFF))

@@ -6,6 +6,8 @@ position of each chunk in the file.
 
 import warp as wp
 
+from synpick_warp.kernels.encoding.dct import JpegData
+
 wp.set_module_options({"enable_backward": False})
 
 MARKER = wp.constant(0xFF)
@@ -20,6 +22,16 @@ WORD_BYTES = wp.constant(4)
 """Bytes of a word of a slot, the first one the most significant."""
 LOW_BITS = wp.constant(wp.uint32(0x7F7F7F7F))
 """All bits of each byte but the highest."""
+
+
+@wp.struct
+class JpegFiles:
+    """JPEG files of a batch of views, and their sizes."""
+
+    jpeg_size: wp.array[int]
+    """(view): size of each file [B]; above the capacity of `jpeg`: the file is incomplete."""
+    jpeg: wp.array2d[wp.uint8]
+    """(view, byte): the files, from the first byte."""
 
 
 @wp.func
@@ -37,57 +49,40 @@ def chunk_words(coded: int, capacity: int, lanes: int) -> int:
 
 
 @wp.kernel
-def count_stuffing_kernel(
-    # In:
-    slot: wp.array3d[wp.uint32],  # (view, interval, slot_word)
-    coded: wp.array2d[int],  # (view, interval) [B]
-    # Out:
-    stuffing_out: wp.array3d[int],  # (view, interval, lane) [B]
-    size_inout: wp.array2d[int],  # (view, interval) [B]
-):
-    """Count the bytes 0 to be stuffed into each lane's chunk of an interval of `coded` bytes: writes them to `stuffing_out`, and adds them
-    to `size_inout`, the size of the interval with its marker. Launched over view, interval, lane.
+def count_stuffing_kernel(data_inout: JpegData):
+    """Count the bytes 0 to be stuffed into each lane's chunk of an interval of `coded` bytes: writes them to `stuffing`, and adds them to
+    `interval_size`. Launched over view, interval, lane.
     """
     view, interval, lane = wp.tid()
-    chunk = chunk_words(coded[view, interval], slot.shape[2], stuffing_out.shape[2])
+    slot, coded = data_inout.slot, data_inout.coded
+    chunk = chunk_words(coded[view, interval], slot.shape[2], data_inout.stuffing.shape[2])
     # Behind the last byte of the bit string, its last word is 0.
     words = wp.min((coded[view, interval] + WORD_BYTES - 1) // WORD_BYTES, slot.shape[2])
     count = int(0)
     for word in range(lane * chunk, wp.min((lane + 1) * chunk, words)):
         count += count_ff_bytes(slot[view, interval, word])
-    stuffing_out[view, interval, lane] = count
+    data_inout.stuffing[view, interval, lane] = count
     if count > 0:
-        wp.atomic_add(size_inout, view, interval, count)
+        wp.atomic_add(data_inout.interval_size, view, interval, count)
 
 
 @wp.kernel
-def place_intervals_kernel(
-    # In:
-    coded: wp.array2d[int],  # (view, interval) [B]
-    size: wp.array2d[int],  # (view, interval) [B]
-    slot_bytes: int,
-    header_bytes: int,
-    capacity: int,
-    # Out:
-    begin_out: wp.array2d[int],  # (view, interval) [B]
-    total_out: wp.array[int],  # (view) [B]
-):
-    """Place the restart intervals of each view in its file: prefix sum over `size`, the bytes of an interval with stuffing and closing
-    marker.
+def place_intervals_kernel(header_bytes: int, data_inout: JpegData, files_out: JpegFiles):
+    """Place the restart intervals of each view in its file: prefix sum over `interval_size`.
 
-    Writes `begin_out`, the first byte of each interval, and `total_out`, the size of the file: above `capacity` if the file does not fit,
-    or if a bit string (`coded`) did not fit its slot. Launched over view.
+    Writes `interval_begin`, and `jpeg_size`: above the capacity if the file does not fit, or if a bit string did not fit its slot. Launched
+    over view.
     """
     view = wp.tid()
     begin = int(header_bytes)
     longest = int(0)
-    for interval in range(size.shape[1]):
-        begin_out[view, interval] = begin
-        begin += size[view, interval]
-        longest = wp.max(longest, coded[view, interval])
-    if longest > slot_bytes:
-        begin = wp.max(begin, capacity + 1)
-    total_out[view] = begin
+    for interval in range(data_inout.interval_size.shape[1]):
+        data_inout.interval_begin[view, interval] = begin
+        begin += data_inout.interval_size[view, interval]
+        longest = wp.max(longest, data_inout.coded[view, interval])
+    if longest > WORD_BYTES * data_inout.slot.shape[2]:
+        begin = wp.max(begin, files_out.jpeg.shape[1] + 1)
+    files_out.jpeg_size[view] = begin
 
 
 @wp.func
@@ -100,30 +95,27 @@ def put_byte(file: wp.array2d[wp.uint8], view: int, position: int, value: wp.uin
 @wp.kernel
 def join_intervals_kernel(
     # In:
-    slot: wp.array3d[wp.uint32],  # (view, interval, slot_word)
-    coded: wp.array2d[int],  # (view, interval) [B]
-    size: wp.array2d[int],  # (view, interval) [B]
-    begin: wp.array2d[int],  # (view, interval) [B]
-    stuffing: wp.array3d[int],  # (view, interval, lane) [B]
+    data: JpegData,
     quality: wp.array[int],  # (view)
     header: wp.array2d[wp.uint8],  # (quality, header_byte)
     # Out:
-    file_out: wp.array2d[wp.uint8],  # (view, byte)
+    files_out: JpegFiles,
 ):
     """Write the file of each view: the header of its `quality` (row of `header`), then the intervals with stuffed bytes, each closed by a
     marker (RST, or EOI after the last one).
 
-    Launched over view, interval, lane. Bytes beyond the capacity of `file_out` are left out.
+    Launched over view, interval, lane. Bytes beyond the capacity of `jpeg` are left out.
     """
     view, interval, lane = wp.tid()
-    lanes = stuffing.shape[2]
+    slot, coded = data.slot, data.coded
+    lanes = data.stuffing.shape[2]
     if interval == 0:
         for k in range(lane, header.shape[1], lanes):
-            file_out[view, k] = header[quality[view], k]
+            files_out.jpeg[view, k] = header[quality[view], k]
     chunk = chunk_words(coded[view, interval], slot.shape[2], lanes)
-    position = begin[view, interval] + WORD_BYTES * lane * chunk
+    position = data.interval_begin[view, interval] + WORD_BYTES * lane * chunk
     for k in range(lane):
-        position += stuffing[view, interval, k]
+        position += data.stuffing[view, interval, k]
     last = wp.min(coded[view, interval], WORD_BYTES * slot.shape[2])
     for word in range(lane * chunk, (lane + 1) * chunk):
         value = wp.uint32(0)
@@ -132,13 +124,13 @@ def join_intervals_kernel(
             value = slot[view, interval, word]
         for k in range(count):
             byte = (value >> wp.uint32(24 - 8 * k)) & wp.uint32(MARKER)
-            put_byte(file_out, view, position, byte)
+            put_byte(files_out.jpeg, view, position, byte)
             position += 1
             if byte == wp.uint32(MARKER):
-                put_byte(file_out, view, position, wp.uint32(0))
+                put_byte(files_out.jpeg, view, position, wp.uint32(0))
                 position += 1
     if lane == 0:
-        end = begin[view, interval] + size[view, interval]
-        marker = wp.where(interval < size.shape[1] - 1, RESTART + interval % RESTARTS, END)
-        put_byte(file_out, view, end - 2, wp.uint32(MARKER))
-        put_byte(file_out, view, end - 1, wp.uint32(marker))
+        end = data.interval_begin[view, interval] + data.interval_size[view, interval]
+        marker = wp.where(interval < data.interval_size.shape[1] - 1, RESTART + interval % RESTARTS, END)
+        put_byte(files_out.jpeg, view, end - 2, wp.uint32(MARKER))
+        put_byte(files_out.jpeg, view, end - 1, wp.uint32(marker))

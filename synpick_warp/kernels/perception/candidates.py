@@ -8,11 +8,13 @@ candidates depend on the state alone. A view shows the world into which the stat
 import warp as wp
 
 from synpick_warp.codes import Share, Stream
-from synpick_warp.kernels.render.images.suction_map import GRAVITY as WEIGHT
-from synpick_warp.kernels.render.images.suction_map import SuctionScene, is_obstructed, place_cup, seal_score, wrench_score
-from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.grasps import Grasps
+from synpick_warp.kernels.perception.components import Patches
+from synpick_warp.kernels.render.images.layers import LayerScene
+from synpick_warp.kernels.render.images.suction_map import loaded_wrench, obstructed_seal, place_cup
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import Views
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import ShotData
 from synpick_warp.kernels.rng import GAMMA, mix, pixel_key, stream_key
 from synpick_warp.kernels.state import Attempts, Observations, Plans, Worlds
 
@@ -68,6 +70,20 @@ class Candidates:
     """(grasp): wrench score."""
 
 
+@wp.struct
+class Sampling:
+    """A batch of states whose candidates are sampled, one a view."""
+
+    count: int
+    """Candidates of a state."""
+    first: int
+    """Number of the first state of the batch."""
+    index: wp.array[int]
+    """(one): index of the candidate whose grasp is planned."""
+    row: wp.array[int]
+    """(world): row of the saved state; -1: none."""
+
+
 @wp.func
 def view_stream(seed: wp.uint64, arrangement_id: wp.vec2i, attempt: int) -> wp.uint64:
     """Key of the random stream that samples the candidates of a state."""
@@ -109,46 +125,31 @@ def assign_states_kernel(
 
 
 @wp.kernel
-def label_instances_kernel(
-    # Scene:
-    obj_id: wp.array[int],  # (entry)
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: Views,
-    # Out:
-    component_out: wp.array3d[int],  # (view, row, column)
-):
+def label_instances_kernel(layer: LayerScene, shot: ShotData, patches_out: Patches):
     """Instance segmentation: write the instance that each pixel shows; -1: none, or one whose object has no `obj_id`.
 
     Written where perception keeps the labels of connected components. Launched over view, image row, column.
     """
     view, row, column = wp.tid()
-    if views.world[view] < 0:
+    if shot.views.world[view] < 0:
         return
-    instance = int(gbuffer.segment[view, row, column]) - 1
+    instance = int(shot.gbuffer.segment[view, row, column]) - 1
     label = int(-1)
-    if instance >= 0 and instance < views.instances:
-        if obj_id[bodies.mesh[view, instance]] >= 0:
+    if instance >= 0 and instance < shot.views.instances:
+        if layer.obj_id[shot.bodies.mesh[view, instance]] >= 0:
             label = instance
-    component_out[view, row, column] = label
+    patches_out.component[view, row, column] = label
 
 
 @wp.kernel
-def count_rows_kernel(
-    # In:
-    views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    # Out:
-    pool_inout: Pool,
-):
+def count_rows_kernel(views: Views, patches: Patches, pool_inout: Pool):
     """Count the labelled pixels of each image row, and set `visible` of its instances to 1; 0 before. Launched over view, image row."""
     view, row = wp.tid()
     if views.world[view] < 0:
         return
     count = int(0)
-    for column in range(component.shape[2]):
-        instance = component[view, row, column]
+    for column in range(patches.component.shape[2]):
+        instance = patches.component[view, row, column]
         if instance >= 0:
             count += 1
             pool_inout.visible[view, instance] = 1
@@ -156,13 +157,7 @@ def count_rows_kernel(
 
 
 @wp.kernel
-def sum_rows_kernel(
-    # In:
-    views: Views,
-    # Out:
-    pool_inout: Pool,
-    largest_out: wp.array2d[int],  # (view, instance)
-):
+def sum_rows_kernel(views: Views, patches_out: Patches, pool_inout: Pool):
     """Exclusive prefix sum of the counts of image rows, in place, and their total.
 
     `largest`, perception's largest component of each instance, becomes the instance itself: all its visible pixels. Launched over view.
@@ -177,7 +172,7 @@ def sum_rows_kernel(
         total += count
     pool_inout.pixels[view] = total
     for instance in range(views.instances):
-        largest_out[view, instance] = instance
+        patches_out.largest[view, instance] = instance
 
 
 @wp.func
@@ -205,17 +200,13 @@ def pixel_of_rank(pool: Pool, component: wp.array3d[int], view: int, rank: int) 
 
 @wp.kernel
 def draw_pixels_kernel(
-    # Scene:
     seed: wp.uint64,
-    # State:
     state: Worlds,
     attempts: Attempts,
     plan: Plans,
     observation: Observations,
-    # In:
     views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    # Out:
+    patches: Patches,
     pool_inout: Pool,
 ):
     """Simple random sampling with replacement: draw labelled pixels uniformly; the last draw is the pixel of the planned grasp.
@@ -232,56 +223,33 @@ def draw_pixels_kernel(
             pixel = observation.grasp_pixel[world, plan.target[world]]
     elif pool_inout.pixels[view] > 0:
         key = view_stream(seed, state.arrangement_id[world], attempts.attempt[world])
-        pixel = pixel_of_rank(pool_inout, component, view, wide_index(key, draw, pool_inout.pixels[view]))
+        pixel = pixel_of_rank(pool_inout, patches.component, view, wide_index(key, draw, pool_inout.pixels[view]))
     pool_inout.pixel[view, draw] = pixel
 
 
 @wp.kernel
-def score_pixels_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: Surfaces,
-    obj_id: wp.array[int],  # (entry)
-    suction: SuctionScene,
-    table: Table,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: Views,
-    # Out:
-    pool_inout: Pool,
-):
+def score_pixels_kernel(scene: PathScene, layer: LayerScene, shot: ShotData, pool_inout: Pool):
     """Write SuctionNet's analytic scores of each drawn pixel, as in the layers `suction_seal` and `suction_wrench`; 0: no pixel.
 
     Launched over view, draw.
     """
     view, draw = wp.tid()
-    if views.world[view] < 0:
+    if shot.views.world[view] < 0:
         return
     seal = float(0.0)
     wrench = float(0.0)
     pixel = pool_inout.pixel[view, draw]
     if pixel[0] >= 0:
-        cup = place_cup(meshes, surfaces, bodies, gbuffer, views, obj_id, view, pixel[1], pixel[0])
+        cup = place_cup(scene, shot, layer.obj_id, view, pixel[1], pixel[0])
         if cup.body >= 0:
-            mesh = bodies.mesh[view, cup.body]
-            seal = seal_score(meshes, mesh, cup, suction.radius)
-            if seal > 0.0 and is_obstructed(meshes, table, bodies, view, cup, suction.radius, views.instances):
-                seal = 0.0
-            weight = bodies.world_rotation[view, cup.body] * wp.vec3(0.0, 0.0, -WEIGHT)
-            wrench = wrench_score(cup, suction.center_of_mass[mesh], weight, suction.radius)
+            seal = obstructed_seal(scene, shot, view, cup, layer.suction.radius)
+            wrench = loaded_wrench(layer, shot, view, cup)
     pool_inout.seal[view, draw] = seal
     pool_inout.wrench[view, draw] = wrench
 
 
 @wp.kernel
-def count_strata_kernel(
-    # In:
-    views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    # Out:
-    pool_inout: Pool,
-):
+def count_strata_kernel(views: Views, patches: Patches, pool_inout: Pool):
     """Histogram of the pixels of phase one by instance and stratum. Launched over view, instance."""
     view, instance = wp.tid()
     if views.world[view] < 0:
@@ -291,7 +259,7 @@ def count_strata_kernel(
     for draw in range(POOL):
         pixel = pool_inout.pixel[view, draw]
         if pixel[0] >= 0:
-            if component[view, pixel[1], pixel[0]] == instance:
+            if patches.component[view, pixel[1], pixel[0]] == instance:
                 stratum = stratum_of(pool_inout.seal[view, draw], pool_inout.wrench[view, draw])
                 pool_inout.count[view, instance, stratum] = pool_inout.count[view, instance, stratum] + 1
 
@@ -353,24 +321,16 @@ def find_draw(pool: Pool, component: wp.array3d[int], view: int, instance: int, 
 
 @wp.kernel
 def choose_candidates_kernel(
-    # Scene:
     seed: wp.uint64,
     uniform: int,
-    candidates: int,
-    first: int,
-    # State:
-    row: wp.array[int],  # (world)
+    sampling: Sampling,
     state: Worlds,
     attempts: Attempts,
-    # In:
     views: Views,
-    component: wp.array3d[int],  # (view, row, column)
+    patches: Patches,
     pool: Pool,
-    # Out:
     candidates_out: Candidates,
-    row_out: wp.array[int],  # (grasp)
-    candidate_out: wp.array[int],  # (grasp)
-    target_out: wp.array[int],  # (grasp)
+    grasps_out: Grasps,
 ):
     """Stratified sampling of the pool: write the planned grasp, stratified candidates, and last `uniform` uniform ones of each view.
 
@@ -384,8 +344,8 @@ def choose_candidates_kernel(
     draw = int(pool.pixel.shape[1] - 1)
     share = int(Share.OWN)
     weight = float(0.0)
-    if candidate >= candidates - uniform:
-        draw = POOL + candidate - (candidates - uniform)
+    if candidate >= sampling.count - uniform:
+        draw = POOL + candidate - (sampling.count - uniform)
         share = int(Share.UNIFORM)
         weight = float(pool.pixels[view])
     elif candidate > 0:
@@ -397,98 +357,61 @@ def choose_candidates_kernel(
         visit = (candidate - 1) // instances
         chosen = find_stratum(pool, view, instance, visit + wide_index(key, STARTS + 1 + instance, STRATA * (STRATA - 1) * 12))
         size = stratum_size(pool, view, instance, chosen[0])
-        draw = find_draw(pool, component, view, instance, chosen[0], (visit // chosen[1]) % size)
+        draw = find_draw(pool, patches.component, view, instance, chosen[0], (visit // chosen[1]) % size)
         weight = float(pool.pixels[view]) / float(POOL) * float(instances * chosen[1] * size)
-    grasp = (first + view) * candidates + candidate
+    grasp = (sampling.first + view) * sampling.count + candidate
     pixel = pool.pixel[view, draw]
-    instance = component[view, pixel[1], pixel[0]]
+    instance = patches.component[view, pixel[1], pixel[0]]
     candidates_out.share[grasp] = share
     candidates_out.weight[grasp] = weight
     candidates_out.pixel[grasp] = pixel
     candidates_out.entry[grasp] = state.catalog_index[world, instance]
     candidates_out.seal[grasp] = pool.seal[view, draw]
     candidates_out.wrench[grasp] = pool.wrench[view, draw]
-    row_out[grasp] = row[world]
-    candidate_out[grasp] = candidate
-    target_out[grasp] = instance
+    grasps_out.row[grasp] = sampling.row[world]
+    grasps_out.candidate[grasp] = candidate
+    grasps_out.target[grasp] = instance
 
 
 @wp.kernel
 def aim_candidates_kernel(
-    # Scene:
-    candidates: int,
-    first: int,
-    # In:
-    index: wp.array[int],  # (one)
-    views: Views,
-    pixel: wp.array[wp.vec2i],  # (grasp)
-    grasp_target: wp.array[int],  # (grasp)
-    # Out:
-    target_out: wp.array[int],  # (world)
-    grasp_pixel_out: wp.array2d[wp.vec2i],  # (world, instance) [px]
+    sampling: Sampling, views: Views, candidates: Candidates, grasps: Grasps, plan_out: Plans, observation_out: Observations
 ):
-    """Write target and grasp pixel of candidate `index` to the plan of each view's world. Launched over view."""
+    """Write target and grasp pixel of a candidate to the plan of each view's world. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world < 0:
         return
-    grasp = (first + view) * candidates + index[0]
-    target_out[world] = grasp_target[grasp]
-    grasp_pixel_out[world, grasp_target[grasp]] = pixel[grasp]
+    grasp = (sampling.first + view) * sampling.count + sampling.index[0]
+    plan_out.target[world] = grasps.target[grasp]
+    observation_out.grasp_pixel[world, grasps.target[grasp]] = candidates.pixel[grasp]
 
 
 @wp.kernel
-def store_normals_kernel(
-    # Scene:
-    candidates: int,
-    first: int,
-    # State:
-    plan: Plans,
-    # In:
-    index: wp.array[int],  # (one)
-    views: Views,
-    # Out:
-    surface_normal_out: wp.array[wp.vec3],  # (grasp)
-):
-    """Write the smoothed surface normals to candidate `index`, as unit vectors. Launched over view."""
+def store_normals_kernel(sampling: Sampling, plan: Plans, views: Views, candidates_out: Candidates):
+    """Write the smoothed surface normals, as unit vectors. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world >= 0:
-        surface_normal_out[(first + view) * candidates + index[0]] = wp.normalize(plan.normal[world])
+        grasp = (sampling.first + view) * sampling.count + sampling.index[0]
+        candidates_out.surface_normal[grasp] = wp.normalize(plan.normal[world])
 
 
 @wp.kernel
-def store_grasps_kernel(
-    # Scene:
-    candidates: int,
-    first: int,
-    # State:
-    plan: Plans,
-    # In:
-    index: wp.array[int],  # (one)
-    views: Views,
-    # Out:
-    grasp_point_out: wp.array[wp.vec3],  # (grasp) [m]
-    grasp_normal_out: wp.array[wp.vec3],  # (grasp)
-    grasp_yaw_out: wp.array[float],  # (grasp) [rad]
-    grasp_tilt_out: wp.array[float],  # (grasp) [rad]
-):
-    """Write the planned grasps of the worlds to candidate `index` of each view's state. Launched over view."""
+def store_grasps_kernel(sampling: Sampling, plan: Plans, views: Views, grasps_out: Grasps):
+    """Write the planned grasps of the worlds to a candidate of each view's state. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     if world < 0:
         return
-    grasp = (first + view) * candidates + index[0]
-    grasp_point_out[grasp] = plan.point[world]
-    grasp_normal_out[grasp] = plan.normal[world]
-    grasp_yaw_out[grasp] = plan.yaw[world]
-    grasp_tilt_out[grasp] = plan.tilt[world]
+    grasp = (sampling.first + view) * sampling.count + sampling.index[0]
+    grasps_out.point[grasp] = plan.point[world]
+    grasps_out.normal[grasp] = plan.normal[world]
+    grasps_out.yaw[grasp] = plan.yaw[world]
+    grasps_out.tilt[grasp] = plan.tilt[world]
 
 
 @wp.kernel
-def increment_kernel(
-    # Out:
-    index_inout: wp.array[int],  # (one)
-):
+def increment_kernel(sampling_inout: Sampling):
     """Increment the candidate index, on the device so that a graph can be replayed. A single thread (dim 1)."""
-    index_inout[0] = index_inout[0] + 1
+    sampling_inout.index[0] = sampling_inout.index[0] + 1

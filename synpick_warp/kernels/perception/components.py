@@ -53,6 +53,24 @@ class Segments:
     """(view, instance): number of contour points."""
 
 
+@wp.struct
+class Patches:
+    """The results of segmentation that planning reads, as images: members of `Segments`."""
+
+    component: wp.array3d[int]
+    """(view, row, column)"""
+    area: wp.array3d[int]
+    """(view, row, column) [px]"""
+    distance: wp.array3d[float]
+    """(view, row, column) [px]"""
+    largest: wp.array2d[int]
+    """(view, instance)"""
+    contour: wp.array3d[wp.vec2i]
+    """(view, instance, point) [px]"""
+    contour_length: wp.array2d[int]
+    """(view, instance)"""
+
+
 @wp.func
 def split_index(index: int, height: int, strips: int) -> tuple[int, int, int]:
     """(view, row, strip) of a thread's flat index."""

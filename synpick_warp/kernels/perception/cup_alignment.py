@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Patches
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, ImageGrid, Views, in_image
 from synpick_warp.kernels.rng import TAU
 from synpick_warp.kernels.state import Plans
@@ -50,14 +51,7 @@ def head_frame(normal: wp.vec3, yaw: float) -> HeadFrame:
 
 
 @wp.func
-def shows(
-    views: Views,
-    grid: ImageGrid,
-    view: int,
-    point: wp.vec3,
-    component: wp.array3d[int],
-    label: int,  # (view, row, column)
-) -> bool:
+def shows(views: Views, grid: ImageGrid, patches: Patches, view: int, point: wp.vec3, label: int) -> bool:
     """True if the pixel of a point in the world [m] has this label."""
     offset = wp.vec3d(wp.float64(point[0]), wp.float64(point[1]), wp.float64(point[2])) - views.cameras.center[view]
     seen = wp.vec3(views.cameras.rotation[view] * offset)
@@ -68,7 +62,7 @@ def shows(
     row = int(wp.floor(intrinsics[1] * seen[1] / seen[2] + intrinsics[3]))
     if not in_image(grid, row, column):
         return False
-    return component[view, row, column] == label
+    return patches.component[view, row, column] == label
 
 
 @wp.func
@@ -79,8 +73,8 @@ def score_frame(
     cups: CupData,
     views: Views,
     grid: ImageGrid,
+    patches: Patches,
     view: int,
-    component: wp.array3d[int],  # (view, row, column)
     label: int,
 ) -> int:
     """WHOLE for each cup of which all points of the ring show the target, and 1 for each point that does of the wider rings."""
@@ -91,9 +85,9 @@ def score_frame(
         for index in range(RIM):
             angle = TAU * float(index) / float(RIM)
             spoke = suction.radius * (wp.cos(angle) * frame.along + wp.sin(angle) * frame.across)
-            if shows(views, grid, view, center + spoke, component, label):
+            if shows(views, grid, patches, view, center + spoke, label):
                 hits += 1
-            if shows(views, grid, view, center + MARGIN * spoke, component, label):
+            if shows(views, grid, patches, view, center + MARGIN * spoke, label):
                 score += 1
         if hits == RIM:
             score += WHOLE
@@ -102,17 +96,7 @@ def score_frame(
 
 @wp.kernel
 def align_cups_kernel(
-    # Scene:
-    pick: PickData,
-    suction: SuctionData,
-    cups: CupData,
-    grid: ImageGrid,
-    # State:
-    plan_inout: Plans,
-    # In:
-    views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    largest: wp.array2d[int],  # (view, instance)
+    pick: PickData, suction: SuctionData, cups: CupData, grid: ImageGrid, plan_inout: Plans, views: Views, patches: Patches
 ):
     """Turn the grasp of each target about its point so that most cups lie on the target's largest component.
 
@@ -124,7 +108,7 @@ def align_cups_kernel(
     world = views.world[view]
     if world < 0 or plan_inout.target[world] < 0:
         return
-    label = largest[view, plan_inout.target[world]]
+    label = patches.largest[view, plan_inout.target[world]]
     normal = plan_inout.normal[world]
     best = head_frame(normal, plan_inout.yaw[world])
     most = int(-1)
@@ -137,7 +121,7 @@ def align_cups_kernel(
         # Sine of the angle between axis and normal.
         deviation = wp.abs(wp.dot(frame.across, normal))
         if candidate == 0 or (deviation <= wp.sin(suction.swing_limit) and wp.abs(frame.tilt) <= pick.tilt_limit):
-            score = score_frame(frame, plan_inout.point[world], suction, cups, views, grid, view, component, label)
+            score = score_frame(frame, plan_inout.point[world], suction, cups, views, grid, patches, view, label)
             if score > most or (score == most and deviation < least):
                 most = score
                 least = deviation

@@ -3,6 +3,8 @@
 import warp as wp
 
 from synpick_warp.codes import Stream
+from synpick_warp.kernels.perception.components import Patches
+from synpick_warp.kernels.perception.occlusion_votes import Voting
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.rng import stream_key, uniform_index
@@ -43,13 +45,7 @@ def lies_on(component: wp.array3d[int], view: int, pixel: wp.vec2i, other: wp.ve
 
 
 @wp.func
-def measure_bump(
-    gbuffer: GBuffer,
-    component: wp.array3d[int],  # (view, row, column)
-    view: int,
-    pixel: wp.vec2i,
-    radius: float,
-) -> float:
+def measure_bump(gbuffer: GBuffer, patches: Patches, view: int, pixel: wp.vec2i, radius: float) -> float:
     """Deviation of the surface around a pixel from a plane [m]: Σ z² |(1 / z_a + 1 / z_b) / 2 - 1 / z| over diameters a, b of a circle.
 
     1 / z of a plane is affine in the image, so that it is 0 there. `radius` is in pixels; ends outside of the component count as OUTSIDE.
@@ -60,7 +56,7 @@ def measure_bump(
         angle = wp.PI * float(index) / float(DIAMETERS)
         offset = wp.vec2i(int(wp.rint(radius * wp.cos(angle))), int(wp.rint(radius * wp.sin(angle))))
         deviation = float(OUTSIDE)
-        if lies_on(component, view, pixel, pixel + offset) and lies_on(component, view, pixel, pixel - offset):
+        if lies_on(patches.component, view, pixel, pixel + offset) and lies_on(patches.component, view, pixel, pixel - offset):
             first = gbuffer.depth[view, pixel[1] + offset[1], pixel[0] + offset[0]]
             second = gbuffer.depth[view, pixel[1] - offset[1], pixel[0] - offset[0]]
             deviation = wp.min(z * z * wp.abs(0.5 * (1.0 / first + 1.0 / second) - 1.0 / z), OUTSIDE)
@@ -70,22 +66,18 @@ def measure_bump(
 
 @wp.kernel
 def choose_flat_points_kernel(
-    # Scene:
     seed: wp.uint64,
     suction: SuctionData,
     cups: CupData,
     least_failures: int,
-    # State:
     state: Worlds,
     attempts: Attempts,
     observation_inout: Observations,
     plan: Plans,
-    # In:
     views: Views,
     gbuffer: GBuffer,
-    component: wp.array3d[int],  # (view, row, column)
-    distance: wp.array3d[float],  # (view, row, column) [px]
-    extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
+    patches: Patches,
+    voting: Voting,
 ):
     """Move the grasp point of targets with at least `least_failures` failed attempts to where the surface below all cups is flat.
 
@@ -102,13 +94,13 @@ def choose_flat_points_kernel(
     if failures < least_failures:
         return
     key = stream_key(seed, state.arrangement_id[world][0], state.arrangement_id[world][1], Stream.GRASPS)
-    box = extent[view, instance]
+    box = voting.extent[view, instance]
     chosen = observation_inout.grasp_pixel[world, instance]
-    label = component[view, chosen[1], chosen[0]]
+    label = patches.component[view, chosen[1], chosen[0]]
     radius = head_span(suction, cups) * views.cameras.intrinsics[view][0]
     bump = float(DIAMETERS + 1) * OUTSIDE
     if failures == 0:
-        bump = measure_bump(gbuffer, component, view, chosen, radius / gbuffer.depth[view, chosen[1], chosen[0]])
+        bump = measure_bump(gbuffer, patches, view, chosen, radius / gbuffer.depth[view, chosen[1], chosen[0]])
     first = 2 * DRAWS * (attempts.attempt[world] + 1)
     draw = int(0)
     while draw < DRAWS and bump > FLAT:
@@ -116,11 +108,11 @@ def choose_flat_points_kernel(
         row = uniform_index(key, first + 2 * draw + 1, box[3] + box[1] + 1) - box[1]
         draw += 1
         if (
-            component[view, row, column] == label
-            and distance[view, row, column] >= MARGIN * observation_inout.distances[world, instance][0]
+            patches.component[view, row, column] == label
+            and patches.distance[view, row, column] >= MARGIN * observation_inout.distances[world, instance][0]
         ):
             pixel = wp.vec2i(column, row)
-            other = measure_bump(gbuffer, component, view, pixel, radius / gbuffer.depth[view, row, column])
+            other = measure_bump(gbuffer, patches, view, pixel, radius / gbuffer.depth[view, row, column])
             if other < bump:
                 bump = other
                 chosen = pixel

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Patches
 from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
@@ -51,20 +52,16 @@ def limit_normal(normal: wp.vec3, limit: float) -> wp.vec3:
 
 @wp.kernel
 def smooth_normal_kernel(
-    # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
     grid: ImageGrid,
     window: int,
-    # State:
     plan_inout: Plans,
     observation: Observations,
-    # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    largest: wp.array2d[int],  # (view, instance)
+    patches: Patches,
 ):
     """Smoothed surface normal of each target: n = Σ n_p over pixels p of its largest component, within `window` of its grasp pixel.
 
@@ -80,7 +77,7 @@ def smooth_normal_kernel(
     total = wp.vec3(0.0, 0.0, 0.0)
     for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
         for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
-            if component[view, row, column] == largest[view, instance]:
+            if patches.component[view, row, column] == patches.largest[view, instance]:
                 ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
                 triangle = gbuffer.triangle[view, row, column]
                 barycentric = gbuffer.barycentric[view, row, column]

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Patches
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.state import Observations, Worlds
@@ -20,6 +21,19 @@ DEEP = wp.constant(1)
 """Indices of the kinds of votes."""
 
 
+@wp.struct
+class Voting:
+    """Scratch of the occlusion votes."""
+
+    count: wp.array4d[int]
+    """(view, instance, instance, kind): votes that the second instance lies above the first, by kind: full, or deep (it is seen below the
+    first one's grasp point)."""
+    extent: wp.array2d[wp.vec4i]
+    """(view, instance): bounding box of each contour as maxima: -column, -row, column, row [px]."""
+    reach: wp.array2d[float]
+    """(view, instance): bound of an object's size in the image: votes from pixels with a farther point of its contour do not count [px]."""
+
+
 @wp.func
 def visible_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances: int) -> int:
     """Instance that the G-buffer shows at a pixel; -1: none."""
@@ -30,14 +44,15 @@ def visible_instance(gbuffer: GBuffer, view: int, row: int, column: int, instanc
 
 
 @wp.func
-def contour_normal(contour: wp.array3d[wp.vec2i], view: int, instance: int, point: int, length: int) -> wp.vec2:
+def contour_normal(patches: Patches, view: int, instance: int, point: int) -> wp.vec2:
     """Outward unit normal (column, row) of an outer contour at a point; zero where the tangent vanishes.
 
     OpenCV's outer contours run counter-clockwise in the displayed image, with rows growing downward: the object lies to the left of the
     tangent t, and n = (-t_y, t_x) / |t|. So the two sides of a thin part have opposite normals even where they share pixels.
     """
-    before = contour[view, instance, (point + length - TANGENT_REACH % length) % length]
-    after = contour[view, instance, (point + TANGENT_REACH) % length]
+    length = patches.contour_length[view, instance]
+    before = patches.contour[view, instance, (point + length - TANGENT_REACH % length) % length]
+    after = patches.contour[view, instance, (point + TANGENT_REACH) % length]
     x = float(after[0] - before[0])
     y = float(after[1] - before[1])
     square = x * x + y * y
@@ -58,12 +73,13 @@ def offset_pixel(point: wp.vec2i, normal: wp.vec2, offset: float, grid: ImageGri
 
 
 @wp.func
-def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d[wp.vec2i], view: int, instance: int, length: int) -> bool:
+def is_in_reach(voting: Voting, patches: Patches, view: int, instance: int, q: wp.vec2i) -> bool:
     """True if max over c of |c - q| ≤ reach [px], for the points c of an instance's contour; True for a contour without points.
 
     Bounding-box test first: a contour touches each side of its box, so its farthest point is at least as far as the farthest side and at
     most as far as the farthest corner. The points are tested only if the reach lies between these two.
     """
+    reach, extent = voting.reach[view, instance], voting.extent[view, instance]
     across = wp.max(wp.max(q[0] + extent[0], extent[2] - q[0]), 0)
     down = wp.max(wp.max(q[1] + extent[1], extent[3] - q[1]), 0)
     side = wp.max(across, down)
@@ -72,8 +88,8 @@ def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d
         return True
     if float(side * side) > square:
         return False
-    for point in range(length):
-        away = contour[view, instance, point] - q
+    for point in range(patches.contour_length[view, instance]):
+        away = patches.contour[view, instance, point] - q
         if float(away[0] * away[0] + away[1] * away[1]) > square:
             return False
     return True
@@ -81,23 +97,17 @@ def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d
 
 @wp.kernel
 def bound_contours_kernel(
-    # Scene:
     catalog: CatalogData,
     perception: PerceptionData,
-    # State:
     state: Worlds,
     observation: Observations,
-    # In:
     views: Views,
-    contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
-    contour_length: wp.array2d[int],  # (view, instance)
-    # Out:
-    extent_out: wp.array2d[wp.vec4i],  # (view, instance) [px]
-    reach_out: wp.array2d[float],  # (view, instance) [px]
+    patches: Patches,
+    voting_out: Voting,
 ):
     """Bounding box of each contour, and reach of each instance.
 
-    extent_out[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start; reach_out[j] =
+    extent[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start; reach[j] =
     perception.reach · diagonal_j · f_x / depth_j [px], unwritten for instances without a catalog entry, which are never visible. Launched
     over view, instance, lane.
     """
@@ -107,36 +117,27 @@ def bound_contours_kernel(
         return
     e = state.catalog_index[world, instance]
     if lane == 0 and e >= 0:
-        reach_out[view, instance] = (
+        voting_out.reach[view, instance] = (
             perception.reach * catalog.diagonal[e] * views.cameras.intrinsics[view][0] / observation.depth[world, instance]
         )
     extent = wp.vec4i(NOWHERE, NOWHERE, NOWHERE, NOWHERE)
-    length = contour_length[view, instance]
+    length = patches.contour_length[view, instance]
     for point in range(lane, length, CONTOUR_LANES):
-        c = contour[view, instance, point]
+        c = patches.contour[view, instance, point]
         extent = wp.max(extent, wp.vec4i(-c[0], -c[1], c[0], c[1]))
     if lane < length:
-        wp.atomic_max(extent_out, view, instance, extent)
+        wp.atomic_max(voting_out.extent, view, instance, extent)
 
 
 @wp.kernel
 def count_votes_kernel(
-    # Scene:
     grid: ImageGrid,
     perception: PerceptionData,
-    # State:
     observation: Observations,
-    # In:
     gbuffer: GBuffer,
     views: Views,
-    component: wp.array3d[int],  # (view, row, column)
-    largest: wp.array2d[int],  # (view, instance)
-    contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
-    contour_length: wp.array2d[int],  # (view, instance)
-    extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
-    reach: wp.array2d[float],  # (view, instance) [px]
-    # Out:
-    count_out: wp.array4d[int],  # (view, instance, instance, kind)
+    patches: Patches,
+    voting_inout: Voting,
 ):
     """count[i, j, kind]: number of points of i's contour at which j occludes i. Counts must be 0 at the start.
 
@@ -148,35 +149,27 @@ def count_votes_kernel(
     """
     view, instance, lane = wp.tid()
     world = views.world[view]
-    if world < 0 or largest[view, instance] < 0:
+    if world < 0 or patches.largest[view, instance] < 0:
         return
-    instances = largest.shape[1]
-    for point in range(lane, contour_length[view, instance], CONTOUR_LANES):
-        p = contour[view, instance, point]
-        normal = contour_normal(contour, view, instance, point, contour_length[view, instance])
+    instances = patches.largest.shape[1]
+    for point in range(lane, patches.contour_length[view, instance], CONTOUR_LANES):
+        p = patches.contour[view, instance, point]
+        normal = contour_normal(patches, view, instance, point)
         inside = offset_pixel(p, normal, -perception.contour_offset, grid)
         q = offset_pixel(p, normal, perception.contour_offset, grid)
-        if inside[0] >= 0 and q[0] >= 0 and component[view, inside[1], inside[0]] == largest[view, instance]:
+        if inside[0] >= 0 and q[0] >= 0 and patches.component[view, inside[1], inside[0]] == patches.largest[view, instance]:
             j = visible_instance(gbuffer, view, q[1], q[0], instances)
             d = gbuffer.depth[view, q[1], q[0]]
-            if j >= 0 and j != instance and largest[view, j] >= 0 and d < gbuffer.depth[view, inside[1], inside[0]]:
-                if is_in_reach(q, reach[view, j], extent[view, j], contour, view, j, contour_length[view, j]):
+            if j >= 0 and j != instance and patches.largest[view, j] >= 0 and d < gbuffer.depth[view, inside[1], inside[0]]:
+                if is_in_reach(voting_inout, patches, view, j, q):
                     if d > observation.depth[world, instance] + perception.deep_distance:
-                        wp.atomic_add(count_out, view, instance, j, DEEP, 1)
+                        wp.atomic_add(voting_inout.count, view, instance, j, DEEP, 1)
                     else:
-                        wp.atomic_add(count_out, view, instance, j, FULL, 1)
+                        wp.atomic_add(voting_inout.count, view, instance, j, FULL, 1)
 
 
 @wp.kernel
-def weigh_votes_kernel(
-    # Scene:
-    perception: PerceptionData,
-    # In:
-    views: Views,
-    count: wp.array4d[int],  # (view, instance, instance, kind)
-    # Out:
-    observation_out: Observations,
-):
+def weigh_votes_kernel(perception: PerceptionData, views: Views, voting: Voting, observation_out: Observations):
     """Write the occlusion votes votes[i, j] = full + deep_weight · deep, that j lies above i, from the counts by kind. Launched over view,
     instance, instance.
     """
@@ -184,5 +177,5 @@ def weigh_votes_kernel(
     world = views.world[view]
     if world < 0:
         return
-    deep = float(count[view, instance, neighbour, DEEP])
-    observation_out.votes[world, instance, neighbour] = float(count[view, instance, neighbour, FULL]) + perception.deep_weight * deep
+    deep = float(voting.count[view, instance, neighbour, DEEP])
+    observation_out.votes[world, instance, neighbour] = float(voting.count[view, instance, neighbour, FULL]) + perception.deep_weight * deep

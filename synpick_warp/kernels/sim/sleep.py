@@ -28,6 +28,18 @@ class Sleepers:
     """(world, slot): consecutive ticks in which the body moved by at most `physics.sleep` [ticks]."""
 
 
+@wp.struct
+class Islands:
+    """Scratch of the search for islands."""
+
+    parent: wp.array[int]
+    """(body): union-find."""
+    restless: wp.array[int]
+    """(body): 1: root of an island that stays awake; 0 before a search."""
+    woken: wp.array2d[int]
+    """(world, slot): 1: slot that names an island to be woken."""
+
+
 @wp.func
 def body_of(shape_body: wp.array[int], shape: int) -> int:
     """Body of a shape of a contact; -1: a fixed shape, or none."""
@@ -74,16 +86,7 @@ def list_awake_pairs_kernel(
 
 
 @wp.kernel
-def wake_touched_kernel(
-    # Scene:
-    layout: LayoutData,
-    threads: int,
-    # State:
-    contacts: Contacts,
-    sleepers: Sleepers,
-    # Out:
-    woken_out: wp.array2d[int],  # (world, slot)
-):
+def wake_touched_kernel(layout: LayoutData, threads: int, contacts: Contacts, sleepers: Sleepers, islands_out: Islands):
     """Mark the sleeping islands in contact with an awake body: `woken` becomes 1 at the slot that names the island (`island`).
 
     Contacts begin at twice the contact margin, so that islands wake before surfaces meet. Grid-stride loop, launched over `threads`.
@@ -98,20 +101,11 @@ def wake_touched_kernel(
                 sleeper = wp.where(one_sleeps, one, other)
                 world = sleeper // layout.bodies
                 slot = sleeper - world * layout.bodies - layout.gripper_bodies
-                woken_out[world, sleepers.island[world, slot]] = 1
+                islands_out.woken[world, sleepers.island[world, slot]] = 1
 
 
 @wp.kernel
-def hold_sleepers_kernel(
-    # Scene:
-    layout: LayoutData,
-    # State:
-    before: Motion,
-    woken: wp.array2d[int],  # (world, slot)
-    sleepers_inout: Sleepers,
-    # Out:
-    after_out: Motion,
-):
+def hold_sleepers_kernel(layout: LayoutData, before: Motion, islands: Islands, sleepers_inout: Sleepers, after_out: Motion):
     """Restore pose and velocity of sleeping bodies after a substep, in which the solver lets them fall; then wake those of woken islands.
 
     Launched over world, slot.
@@ -128,7 +122,7 @@ def hold_sleepers_kernel(
         after_out.joint_qd[qd + axis] = before.joint_qd[qd + axis]
     after_out.body_q[body] = before.body_q[body]
     after_out.body_qd[body] = before.body_qd[body]
-    if woken[world, sleepers_inout.island[world, slot]] != 0:
+    if islands.woken[world, sleepers_inout.island[world, slot]] != 0:
         sleepers_inout.asleep[world, slot] = 0
         sleepers_inout.quiet[world, slot] = 0
 
@@ -143,22 +137,14 @@ def find_root(parent: wp.array[int], body: int) -> int:
 
 
 @wp.kernel
-def begin_islands_kernel(
-    # Out:
-    parent_out: wp.array[int],  # (body)
-):
+def begin_islands_kernel(islands_out: Islands):
     """Union-find: make each body its own root. Launched over body."""
     body = wp.tid()
-    parent_out[body] = body
+    islands_out.parent[body] = body
 
 
 @wp.kernel
-def join_islands_kernel(
-    # State:
-    contacts: Contacts,
-    # Out:
-    parent_inout: wp.array[int],  # (body)
-):
+def join_islands_kernel(contacts: Contacts, islands_inout: Islands):
     """Lock-free union-find: unite the sets of the two bodies of each contact under the smaller root.
 
     Parents only decrease (atomic minimum), and a parent that is replaced is united in turn: the root of an island is its smallest body in
@@ -171,16 +157,16 @@ def join_islands_kernel(
     other = body_of(contacts.shape_body, contacts.shape1[contact])
     if one < 0 or other < 0:
         return
-    one = find_root(parent_inout, one)
-    other = find_root(parent_inout, other)
+    one = find_root(islands_inout.parent, one)
+    other = find_root(islands_inout.parent, other)
     while one != other:
         high = wp.max(one, other)
         low = wp.min(one, other)
-        before = wp.atomic_min(parent_inout, high, low)
+        before = wp.atomic_min(islands_inout.parent, high, low)
         if before == high:
             return
-        one = find_root(parent_inout, before)
-        other = find_root(parent_inout, low)
+        one = find_root(islands_inout.parent, before)
+        other = find_root(islands_inout.parent, low)
 
 
 @wp.func
@@ -193,18 +179,13 @@ def stop(layout: LayoutData, world: int, slot: int, joint_qd_out: wp.array[float
 
 @wp.kernel
 def judge_sleep_kernel(
-    # Scene:
     layout: LayoutData,
     threshold: float,
-    # State:
     state: Worlds,
     attempts: Attempts,
     seals: Seals,
-    parent: wp.array[int],  # (body)
     sleepers_inout: Sleepers,
-    # Out:
-    restless_inout: wp.array[int],  # (body), zero before the launch
-    woken_inout: wp.array2d[int],  # (world, slot)
+    islands_inout: Islands,
     motion_out: Motion,
 ):
     """Put an island to sleep if each of its objects was quiet for QUIET_TICKS ticks and none is attached to a cup or touches the gripper;
@@ -218,10 +199,10 @@ def judge_sleep_kernel(
         for slot in range(layout.slots):
             sleepers_inout.asleep[world, slot] = 0
             sleepers_inout.quiet[world, slot] = 0
-            woken_inout[world, slot] = 0
+            islands_inout.woken[world, slot] = 0
         return
     for body in range(world * layout.bodies, first):
-        restless_inout[find_root(parent, body)] = 1
+        islands_inout.restless[find_root(islands_inout.parent, body)] = 1
     for instance in range(layout.instances):
         slot = state.body_slot[world, instance]
         is_gone = attempts.removed[world, instance] != 0
@@ -230,19 +211,19 @@ def judge_sleep_kernel(
             quiet = wp.where(not is_taken and state.displacement[world, instance] <= threshold, sleepers_inout.quiet[world, slot] + 1, 0)
             sleepers_inout.quiet[world, slot] = quiet
             if sleepers_inout.asleep[world, slot] == 0 and quiet < QUIET_TICKS:
-                restless_inout[find_root(parent, first + slot)] = 1
+                islands_inout.restless[find_root(islands_inout.parent, first + slot)] = 1
             if sleepers_inout.asleep[world, slot] != 0 and is_taken:
-                woken_inout[world, sleepers_inout.island[world, slot]] = 1
+                islands_inout.woken[world, sleepers_inout.island[world, slot]] = 1
     for instance in range(layout.instances):
         slot = state.body_slot[world, instance]
         if attempts.removed[world, instance] != 0 or state.catalog_index[world, instance] >= 0:
             if sleepers_inout.asleep[world, slot] != 0:
-                if woken_inout[world, sleepers_inout.island[world, slot]] != 0:
+                if islands_inout.woken[world, sleepers_inout.island[world, slot]] != 0:
                     sleepers_inout.asleep[world, slot] = 0
                     sleepers_inout.quiet[world, slot] = 0
-            elif restless_inout[find_root(parent, first + slot)] == 0:
+            elif islands_inout.restless[find_root(islands_inout.parent, first + slot)] == 0:
                 sleepers_inout.asleep[world, slot] = 1
-                sleepers_inout.island[world, slot] = find_root(parent, first + slot) - first
+                sleepers_inout.island[world, slot] = find_root(islands_inout.parent, first + slot) - first
                 stop(layout, world, slot, motion_out.joint_qd, motion_out.body_qd)
     for slot in range(layout.slots):
-        woken_inout[world, slot] = 0
+        islands_inout.woken[world, slot] = 0

@@ -86,6 +86,12 @@ class Progress:
     """(world): number of objects that were lost when the trial began."""
     pose: wp.array2d[wp.transform]
     """(world, instance): pose of each object when the trial began [m]."""
+    row: wp.array[int]
+    """(world): row of the state in worlds that begin a trial, else -1."""
+    next: wp.array[int]
+    """(one): index of the next trial."""
+    done: wp.array[int]
+    """(one): number of trials that are done."""
 
 
 @wp.func
@@ -100,14 +106,7 @@ def count_lost(removed: wp.array2d[int], world: int) -> int:
 
 @wp.func
 def measure_motion(
-    layout: LayoutData,
-    world: int,
-    target: int,
-    moved_distance: float,
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    pose: wp.array2d[wp.transform],
+    layout: LayoutData, world: int, target: int, moved_distance: float, state: Worlds, motion: Motion, pose: wp.array2d[wp.transform]
 ):
     """Collateral motion: number of a world's present objects, except the target, whose origins are displaced from `pose` by more than
     `moved_distance`, and the largest displacement of any of them [m].
@@ -116,8 +115,8 @@ def measure_motion(
     moved = int(0)
     farthest = float(0.0)
     for instance in range(layout.instances):
-        if catalog_index[world, instance] >= 0 and instance != target:
-            now = wp.transform_get_translation(body_q[body + body_slot[world, instance]])
+        if state.catalog_index[world, instance] >= 0 and instance != target:
+            now = wp.transform_get_translation(motion.body_q[body + state.body_slot[world, instance]])
             distance = wp.length(now - wp.transform_get_translation(pose[world, instance]))
             farthest = wp.max(farthest, distance)
             if distance > moved_distance:
@@ -126,46 +125,23 @@ def measure_motion(
 
 
 @wp.kernel
-def assign_trials_kernel(
-    # Scene:
-    count: int,
-    repeats: int,
-    # In:
-    grasps: Grasps,
-    # Out:
-    progress_inout: Progress,
-    next_inout: wp.array[int],  # (one)
-    row_out: wp.array[int],  # (world)
-):
-    """Work queue: assign the next of `count` trials to each world without one, in order of worlds.
-
-    `row` becomes the row of the trial's state in worlds that begin one, else -1. A single thread (dim 1).
-    """
-    following = next_inout[0]
-    for world in range(row_out.shape[0]):
-        row_out[world] = -1
+def assign_trials_kernel(count: int, repeats: int, grasps: Grasps, progress_inout: Progress):
+    """Work queue: assign the next of `count` trials to each world without one, in order of worlds. A single thread (dim 1)."""
+    following = progress_inout.next[0]
+    for world in range(progress_inout.row.shape[0]):
+        progress_inout.row[world] = -1
         if progress_inout.trial[world] < 0 and following < count:
             progress_inout.trial[world] = following
-            row_out[world] = grasps.row[following // repeats]
+            progress_inout.row[world] = grasps.row[following // repeats]
             following += 1
-    next_inout[0] = following
+    progress_inout.next[0] = following
 
 
 @wp.kernel
-def begin_trials_kernel(
-    # Scene:
-    layout: LayoutData,
-    # State:
-    row: wp.array[int],  # (world)
-    attempts_inout: Attempts,
-    state: Worlds,
-    motion: Motion,
-    # Out:
-    progress_inout: Progress,
-):
-    """Reset attempt state and `Progress` of worlds that begin a trial (`row` is not -1), with task APPROACH. Launched over world."""
+def begin_trials_kernel(layout: LayoutData, attempts_inout: Attempts, state: Worlds, motion: Motion, progress_inout: Progress):
+    """Reset attempt state and `Progress` of worlds that begin a trial, with task APPROACH. Launched over world."""
     world = wp.tid()
-    if row[world] < 0:
+    if progress_inout.row[world] < 0:
         return
     attempts_inout.task[world] = Task.APPROACH
     attempts_inout.steps[world] = 0
@@ -190,7 +166,6 @@ def set_friction_kernel(
     layout: LayoutData,
     course: TrialData,
     # State:
-    row: wp.array[int],  # (world)
     progress: Progress,
     friction: wp.array[float],  # (trial)
     # Out:
@@ -198,7 +173,7 @@ def set_friction_kernel(
 ):
     """Set friction in worlds that begin a trial: base coefficient times the trial's factor. Launched over world, shape within the world."""
     world, shape = wp.tid()
-    if row[world] >= 0:
+    if progress.row[world] >= 0:
         mu_out[world * layout.shapes + shape] = friction[progress.trial[world]] * course.base_friction
 
 
@@ -267,19 +242,15 @@ def advance_trials_kernel(move: MoveData, pick: PickData, course: TrialData, sta
 
 @wp.kernel
 def judge_trials_kernel(
-    # Scene:
     layout: LayoutData,
     course: TrialData,
-    # State:
     grasps: Grasps,
     state: Worlds,
     attempts: Attempts,
     seals: Seals,
     motion: Motion,
-    # Out:
     progress_inout: Progress,
     labels_out: Labels,
-    done_inout: wp.array[int],  # (one)
 ):
     """Write labels of trials at the end of a tick: of the attempt at its outcome, and of collateral motion `settle_ticks` later.
 
@@ -314,14 +285,12 @@ def judge_trials_kernel(
     if settling > 0 and state.phase[world] == Phase.ACT:
         return
     target = grasps.target[trial // course.repeats]
-    moved, farthest = measure_motion(
-        layout, world, target, course.moved_distance, state.catalog_index, state.body_slot, motion.body_q, progress_inout.pose
-    )
+    moved, farthest = measure_motion(layout, world, target, course.moved_distance, state, motion, progress_inout.pose)
     labels_out.moved[trial] = moved
     labels_out.farthest[trial] = farthest
     labels_out.lost[trial] = count_lost(attempts.removed, world) - progress_inout.lost[world]
     progress_inout.trial[world] = -1
-    wp.atomic_add(done_inout, 0, 1)
+    wp.atomic_add(progress_inout.done, 0, 1)
 
 
 @wp.kernel

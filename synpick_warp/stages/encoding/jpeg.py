@@ -6,13 +6,20 @@ tenth of the image's size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.encoding.dct import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU, convert_colors_kernel, transform_blocks_kernel
+from synpick_warp.kernels.encoding.dct import (
+    BLOCK,
+    BLOCK_SIZE,
+    BLOCKS_PER_MCU,
+    MCU,
+    JpegData,
+    convert_colors_kernel,
+    transform_blocks_kernel,
+)
 from synpick_warp.kernels.encoding.huffman import (
     CODE_BITS,
     HuffmanTables,
@@ -23,13 +30,14 @@ from synpick_warp.kernels.encoding.huffman import (
 from synpick_warp.kernels.encoding.stuffing import (
     MARKER_BYTES,
     WORD_BYTES,
+    JpegFiles,
     count_stuffing_kernel,
     join_intervals_kernel,
     place_intervals_kernel,
 )
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
-from synpick_warp.stages.arrays import allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate_struct, array_group, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.system.codecs.jpeg import (
     DIVISOR_SCALE,
@@ -56,40 +64,17 @@ QUAD = 4
 HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
 
 
-@dataclass(frozen=True, eq=False)
-class JpegBuffers:
-    """JPEG files of one batch of views, and their sizes [B]; above the capacity: the file is incomplete."""
-
-    jpeg_size: wp.array = device_array("view", dtype=wp.int32)
-    """Size of each file [B]; above the capacity of `jpeg`: the file is incomplete."""
-    jpeg: wp.array = device_array("view", "byte", dtype=wp.uint8)
-    """The files, from the first byte."""
+class JpegBuffers(array_group(JpegFiles, "view", jpeg=("view", "byte"))):
+    """JPEG files of one batch of views, and their sizes."""
 
 
-@dataclass(frozen=True, eq=False)
-class JpegScratch:
-    """Samples, DCT coefficients, bit strings and positions of one batch: scratch of the encoder."""
+_BLOCKS = dict.fromkeys(("nonzero", "block_bits", "block_begin"), ("view", "block")) | {"coefficient": ("view", "quad", "block")}
+_INTERVALS = {"slot": ("view", "interval", "slot_word"), "stuffing": ("view", "interval", "lane")}
+_SAMPLES = {"sample": ("view", "sample_row", "sample_block")}
 
-    sample: wp.array = device_array("view", "sample_row", "sample_block", dtype=wp.uint64)
-    """Rows of eight samples: Y, below it Cb and Cr side by side, of whole MCUs."""
-    coefficient: wp.array = device_array("view", "quad", "block", dtype=wp.uint64)
-    """Quantized DCT coefficients in zigzag order, four of 16 bits in each element."""
-    nonzero: wp.array = device_array("view", "block", dtype=wp.uint64)
-    """Bit field of the coefficients that are not 0."""
-    block_bits: wp.array = device_array("view", "block", dtype=wp.int32)
-    """Length of each block's bit string [bit]."""
-    block_begin: wp.array = device_array("view", "block", dtype=wp.int32)
-    """First bit of each block in its interval."""
-    slot: wp.array = device_array("view", "interval", "slot_word", dtype=wp.uint32)
-    """Bit string of each restart interval, most significant bit first."""
-    coded: wp.array = device_array("view", "interval", dtype=wp.int32)
-    """Size of each bit string [B], also beyond its slot."""
-    stuffing: wp.array = device_array("view", "interval", "lane", dtype=wp.int32)
-    """Bytes that each lane stuffs into its chunk of an interval."""
-    interval_size: wp.array = device_array("view", "interval", dtype=wp.int32)
-    """Size of each interval in the file [B], with stuffing and marker."""
-    interval_begin: wp.array = device_array("view", "interval", dtype=wp.int32)
-    """First byte of each interval in the file."""
+
+class JpegScratch(array_group(JpegData, "view", "interval", **_SAMPLES, **_BLOCKS, **_INTERVALS)):
+    """Scratch of the encoder for one batch."""
 
 
 def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
@@ -133,31 +118,20 @@ class JpegEncoder:
             count: Views in use.
             out: Written.
         """
-        scratch = self.scratch
-        blocks, intervals = (count, scratch.nonzero.shape[1]), (count, scratch.slot.shape[1])
+        scratch, data = self.scratch, self.scratch.bundle
+        blocks, intervals, lanes = ((count, *array.shape[1:]) for array in (scratch.nonzero, scratch.coded, scratch.stuffing))
         _, rows, columns = self._samples.shape
         # A third of the rows are chroma: a row for each pair of rows of Y.
         self._launch(convert_colors_kernel, (count, rows // 3, columns // 2), [image], [self._samples])
-        inputs = [scratch.sample, *image.shape[1:3], quality, self.reciprocal]
-        self._launch(transform_blocks_kernel, blocks, inputs, [scratch.coefficient, scratch.nonzero])
-        inputs = [self.tables, scratch.coefficient, scratch.nonzero]
-        self._launch(measure_blocks_kernel, blocks, [*inputs, INTERVAL_BLOCKS], [scratch.block_bits])
-        placed = [scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size]
-        self._launch(place_blocks_kernel, intervals, [scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)], placed)
-        self._launch(write_blocks_kernel, blocks, [*inputs, scratch.block_begin, INTERVAL_BLOCKS], [scratch.slot])
-        self._join(quality, count, out)
+        self._launch(transform_blocks_kernel, blocks, [*image.shape[1:3], quality, self.reciprocal], [data])
+        self._launch(measure_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
+        self._launch(place_blocks_kernel, intervals, [INTERVAL_BLOCKS, int(MARKER_BYTES)], [data])
+        self._launch(write_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
+        self._launch(count_stuffing_kernel, lanes, [], [data])
+        self._launch(place_intervals_kernel, count, [self.header.shape[1]], [data, out.bundle])
+        self._launch(join_intervals_kernel, lanes, [data, quality, self.header], [out.bundle])
 
-    def _join(self, quality: wp.array, count: int, out: JpegBuffers) -> None:
-        """Launch the last passes: stuff bytes, and join the restart intervals to files."""
-        scratch = self.scratch
-        lanes, slot_bytes = (count, *scratch.stuffing.shape[1:]), int(WORD_BYTES) * scratch.slot.shape[2]
-        self._launch(count_stuffing_kernel, lanes, [scratch.slot, scratch.coded], [scratch.stuffing, scratch.interval_size])
-        inputs = [scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]]
-        self._launch(place_intervals_kernel, count, inputs, [scratch.interval_begin, out.jpeg_size])
-        inputs = [scratch.slot, scratch.coded, scratch.interval_size, scratch.interval_begin, scratch.stuffing, quality, self.header]
-        self._launch(join_intervals_kernel, lanes, inputs, [out.jpeg])
-
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[wp.array]) -> None:
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with the block size of the encoder."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=JPEG_THREADS)
 

@@ -5,7 +5,6 @@ See `system.codecs.depth_png` for the format. The bytes depend on the image alon
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,13 +13,15 @@ import warp as wp
 from synpick_warp.kernels.encoding.png import (
     GROUP,
     Codes,
+    DepthFiles,
+    Slots,
     SlotSums,
     close_streams_kernel,
     encode_segments_kernel,
     join_slots_kernel,
     sum_groups_kernel,
 )
-from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, struct_arrays
 from synpick_warp.stages.launch import launch
 from synpick_warp.system.codecs.depth_png import (
     MAX_RUN,
@@ -45,26 +46,12 @@ SLOT_SUMS = struct_arrays(SlotSums, "view", "slot")
 GROUP_SUMS = struct_arrays(SlotSums, "view", "group")
 
 
-@dataclass(frozen=True, eq=False)
-class DepthBuffers:
-    """Compressed data (IDAT) of the depth PNGs of one batch of views, and their sizes [B]; above the capacity: the data is incomplete."""
-
-    depth_idat_size: wp.array = device_array("view", dtype=wp.int32)
-    """Size of each stream [B]; above the capacity of `depth_idat`: the stream is incomplete."""
-    depth_idat: wp.array = device_array("view", "depth_byte", dtype=wp.uint8)
-    """zlib streams, from the first byte."""
+class DepthBuffers(array_group(DepthFiles, "view", depth_idat=("view", "depth_byte"))):
+    """Compressed data (IDAT) of the depth PNGs of one batch of views, and their sizes."""
 
 
-@dataclass(frozen=True, eq=False)
-class DepthScratch:
-    """Bit strings (slots) of the segments of one batch, and positions of these: scratch of the encoder."""
-
-    slot: wp.array = device_array("view", "slot", "slot_word", dtype=wp.uint32)
-    """Bit strings of the header, of each segment of a row, and of the trailer; least significant bit first."""
-    begin: wp.array = device_array("view", "slot", dtype=wp.int32)
-    """First bit of each slot in the data of its group."""
-    group_begin: wp.array = device_array("view", "group", dtype=wp.int32)
-    """First bit of each group of slots."""
+class DepthScratch(array_group(Slots, "view", "slot", slot=("view", "slot", "slot_word"), group_begin=("view", "group"))):
+    """Scratch of the encoder for one batch."""
 
 
 def depth_sizes(views: int, width: int, height: int) -> dict[str, int]:
@@ -121,5 +108,5 @@ class DepthEncoder:
         segments = (count, self.height, -(-self.width // SEGMENT))
         launch(encode_segments_kernel, segments, self, scratch, image=image, segment=SEGMENT, sums=self.slots)
         launch(sum_groups_kernel, (count, scratch.group_begin.shape[1]), self, scratch)
-        launch(close_streams_kernel, count, self, scratch, rows=self.height, columns=self.width, size=out.depth_idat_size)
-        launch(join_slots_kernel, (count, scratch.slot.shape[1], LANES), self, scratch, lanes=LANES, data=out.depth_idat)
+        launch(close_streams_kernel, count, self, scratch, rows=self.height, columns=self.width, files=out.bundle)
+        launch(join_slots_kernel, (count, scratch.slot.shape[1], LANES), self, scratch, lanes=LANES, files=out.bundle)

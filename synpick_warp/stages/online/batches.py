@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
-from synpick_warp.stages.arrays import allocate, device_array
+from synpick_warp.kernels.render.images.ground_truth import ViewTruth, expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
+from synpick_warp.stages.arrays import allocate, array_group, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.mask_pool import widen
@@ -23,28 +23,12 @@ GPU_RING = 3
 """Slots on a GPU: one with the consumer, one rendered ahead, and one that the consumer's queue may still read."""
 
 
-@dataclass(frozen=True, eq=False)
-class TruthBuffers:
-    """Ground truth of one batch of views, beside what the renderer writes: indices, obj_ids (-1: not in the scene), object-to-world and
-    object-to-camera poses, K, world-to-camera matrices (OpenCV's axes), row by row.
-    """
+_METRES = dict.fromkeys(("pose", "object_to_camera", "world_to_camera"), "m")
+_INSTANCES = dict.fromkeys(("object_id", "pose", "object_to_camera"), ("view", "instance"))
 
-    episode: wp.array = device_array("view", dtype=wp.int32)
-    """Episode index."""
-    camera: wp.array = device_array("view", dtype=wp.int32)
-    """Camera index."""
-    frame: wp.array = device_array("view", dtype=wp.int32)
-    """Frame index within the episode, from 0."""
-    object_id: wp.array = device_array("view", "instance", dtype=wp.int32)
-    """obj_id of each instance; -1: the instance is not in the scene; below: a distractor, without label."""
-    pose: wp.array = device_array("view", "instance", dtype=wp.transformf, unit="m")
-    """Object to world: x, y, z, quaternion x, y, z, w."""
-    object_to_camera: wp.array = device_array("view", "instance", dtype=wp.mat44, unit="m")
-    """Object to camera, OpenCV's axes."""
-    intrinsics: wp.array = device_array("view", dtype=wp.mat33, unit="px")
-    """Camera matrix K; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
-    world_to_camera: wp.array = device_array("view", dtype=wp.mat44, unit="m")
-    """Extrinsics."""
+
+class TruthBuffers(array_group(ViewTruth, "view", units=_METRES | {"intrinsics": "px"}, **_INSTANCES)):
+    """Ground truth of one batch of views, beside what the renderer writes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +222,6 @@ class BatchRing:
 
     def _gather(self, snapshot: Snapshot, views: Any, truth: TruthBuffers) -> None:
         """Launch the kernels that write `truth` for a batch of views."""
-        scene = self.renderer.scene
-        launch(gather_cameras_kernel, views.count, scene, snapshot, out=truth, views=views)
-        objects = (views.count, self.instances)
-        launch(gather_objects_kernel, objects, scene, snapshot, out=truth, views=views, object_ids=scene.obj_id)
+        objects, ids = (views.count, self.instances), self.renderer.scene.obj_id
+        launch(gather_cameras_kernel, views.count, snapshot=snapshot.frames, views=views, truth=truth.bundle)
+        launch(gather_objects_kernel, objects, snapshot, views=views, object_ids=ids, truth=truth.bundle)

@@ -9,20 +9,16 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from synpick_warp.kernels.perception.components import Patches
 from synpick_warp.kernels.state import Observations, Plans
 from synpick_warp.stages.arrays import array_group, device_array
 
+_LENGTHS = dict.fromkeys(("area", "distance", "contour"), "px")
+_LISTS = {"largest": ("view", "instance"), "contour": ("view", "instance", "point"), "contour_length": ("view", "instance")}
 
-@dataclass(frozen=True, eq=False)
-class PerceptionArrays:
-    """Segmentation of a batch of views, each an image of one world: members of `kernels.perception.components.Segments`."""
 
-    component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
-    area: wp.array = device_array("view", "row", "column", dtype=wp.int32, unit="px")
-    largest: wp.array = device_array("view", "instance", dtype=wp.int32)
-    distance: wp.array = device_array("view", "row", "column", dtype=wp.float32, unit="px")
-    contour: wp.array = device_array("view", "instance", "point", dtype=wp.vec2i, unit="px")
-    contour_length: wp.array = device_array("view", "instance", dtype=wp.int32)
+class PerceptionArrays(array_group(Patches, "view", "row", "column", units=_LENGTHS, **_LISTS)):
+    """Segmentation of a batch of views, each an image of one world."""
 
 
 @dataclass(frozen=True, eq=False)

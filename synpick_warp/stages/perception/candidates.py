@@ -10,9 +10,12 @@ import warp as wp
 
 from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.kernels.perception import candidates as kernels
+from synpick_warp.kernels.state import Frames
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.perceive import Perception
+from synpick_warp.stages.render.layers import layer_scene
+from synpick_warp.stages.render.view_setup import make_shot
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
 from synpick_warp.stages.sim.trials import GRASPS
@@ -28,6 +31,7 @@ POOL = struct_arrays(
     count=("view", "instance", "stratum"),
     units={"pixel": "px", "pixels": "px"},
 )
+SAMPLING = struct_arrays(kernels.Sampling, "one", row=("world",))
 CANDIDATES = struct_arrays(kernels.Candidates, "grasp", units={"pixel": "px"})
 
 
@@ -53,8 +57,10 @@ class CandidateSampler:
         sizes = {"view": views.count, "row": height, "instance": views.instances, "stratum": int(kernels.STRATA)}
         self._draws = sizes["draw"] = int(kernels.POOL) + self.uniform + 1
         self._pool = allocate_struct(POOL, sizes, self.device)
-        self._row = wp.zeros(simulation.layout.worlds, dtype=wp.int32, device=self.device)
-        self._index = wp.zeros(1, dtype=wp.int32, device=self.device)
+        images = self.images
+        self._shot = make_shot(images.scene, Frames(), images.bodies, images.gbuffer, views)
+        self._sampling = allocate_struct(SAMPLING, {"world": simulation.layout.worlds, "one": 1}, self.device)
+        self._sampling.count = self.count
         self._graph: wp.Graph | None = None
 
     def sample(self, state: State, rows: Sequence[int]) -> tuple[Any, Any, np.ndarray]:
@@ -79,24 +85,21 @@ class CandidateSampler:
 
     def _sample_batch(self, state: State, first: int, rows: wp.array, grasps: Any, candidates: Any) -> None:
         """Sample the candidates of one batch: `rows[first]` and following, one per view."""
-        simulation, views = self.simulation, self.images.views
-        assigned = {"first": first, "rows": rows, "views": views.count, "row_out": self._row}
+        simulation, views, self._sampling.first = self.simulation, self.images.views, first
+        assigned = {"first": first, "rows": rows, "views": views.count, "row_out": self._sampling.row}
         launch(kernels.assign_states_kernel, simulation.layout.worlds, **assigned, world_out=views.world)
         with scope("load states", self.device):
-            simulation.states.load(state, self._row)
+            simulation.states.load(state, self._sampling.row)
         with scope("render", self.device):
             self.images.render(simulation.record.snapshot)
         with scope("draw and score pixels", self.device):
             self._draw()
         sources = (simulation.state, simulation.attempts)
-        drawn = {"component": self.images.arrays.component, "pool": self._pool, "views": views, "row": self._row}
-        chosen = {"row_out": grasps.row, "candidate_out": grasps.candidate, "target_out": grasps.target}
-        numbers = {"seed": self._seed, "uniform": self.uniform, "candidates": self.count, "first": first}
-        launch(
-            kernels.choose_candidates_kernel, (views.count, self.count), *sources, **numbers, **drawn, **chosen, candidates_out=candidates
-        )
+        drawn = {"sampling": self._sampling, "patches": self.images.arrays.bundle, "pool": self._pool, "views": views}
+        chosen = {"seed": self._seed, "uniform": self.uniform, "candidates": candidates, "grasps": grasps}
+        launch(kernels.choose_candidates_kernel, (views.count, self.count), *sources, **drawn, **chosen)
         with scope("frame grasps", self.device):
-            self._frame(first, grasps, candidates)
+            self._frame(grasps, candidates)
 
     @property
     def _seed(self) -> Any:
@@ -106,36 +109,34 @@ class CandidateSampler:
         """Phase one: draw and score the pixels of a batch of views, and count those of each stratum."""
         simulation, images, pool = self.simulation, self.images, self._pool
         views, scene = images.views, images.scene
-        launch(kernels.label_instances_kernel, self._dim, scene, images, component=images.arrays.component)
+        shown, seen = {"layer": layer_scene(scene), "shot": self._shot}, {"pool": pool, "views": views, "patches": images.arrays.bundle}
+        launch(kernels.label_instances_kernel, self._dim, **shown, patches=images.arrays.bundle)
         pool.visible.zero_()
-        seen = {"pool": pool, "views": views, "component": images.arrays.component}
         launch(kernels.count_rows_kernel, self._dim[:2], **seen)
-        launch(kernels.sum_rows_kernel, views.count, views=views, pool=pool, largest=images.arrays.largest)
+        launch(kernels.sum_rows_kernel, views.count, **seen)
         sources = (simulation.state, simulation.attempts, simulation.observation, simulation.plan)
         launch(kernels.draw_pixels_kernel, (views.count, self._draws), *sources, **seen, seed=self._seed)
-        launch(kernels.score_pixels_kernel, (views.count, self._draws), scene, images, pool=pool, suction=scene.suction_maps)
+        launch(kernels.score_pixels_kernel, (views.count, self._draws), **shown, scene=scene.plain, pool=pool)
         launch(kernels.count_strata_kernel, (views.count, views.instances), **seen)
 
-    def _frame(self, first: int, grasps: Any, candidates: Any) -> None:
+    def _frame(self, grasps: Any, candidates: Any) -> None:
         """Plan the candidates' grasps by the functions that plan an attempt, one candidate of each view at a time (a CUDA graph)."""
         simulation, planner, views = self.simulation, self.perception.planner, self.images.views
         scene, observation, plan, device = simulation.scene, simulation.observation, simulation.plan, self.device
-        at = {"candidates": self.count, "first": first, "index": self._index, "views": views}
-        stored = {f"grasp_{name}_out": getattr(grasps, name) for name in ("point", "normal", "yaw", "tilt")}
-        target = {"pixel": candidates.pixel, "grasp_target": grasps.target, "target_out": plan.target}
-        self._index.zero_()
-        launch(kernels.store_grasps_kernel, views.count, plan, **at, **stored)
+        at = {"sampling": self._sampling, "views": views}
+        self._sampling.index.zero_()
+        launch(kernels.store_grasps_kernel, views.count, plan, **at, grasps=grasps)
 
         def frame(stores: bool) -> None:
-            launch(kernels.aim_candidates_kernel, views.count, **at, **target, grasp_pixel_out=observation.grasp_pixel)
+            launch(kernels.aim_candidates_kernel, views.count, plan, observation, **at, candidates=candidates, grasps=grasps)
             planner.smooth_normal(scene, observation, plan)
-            launch(kernels.store_normals_kernel, views.count, plan, **at, surface_normal=candidates.surface_normal)
+            launch(kernels.store_normals_kernel, views.count, plan, **at, candidates=candidates)
             if stores:
                 planner.frame_grasp(scene, observation, plan)
                 if simulation.behavior.choose_grasps is not None:
                     simulation.behavior.choose_grasps(planner, scene, plan)
-                launch(kernels.store_grasps_kernel, views.count, plan, **at, **stored)
-            launch(kernels.increment_kernel, 1, index=self._index)
+                launch(kernels.store_grasps_kernel, views.count, plan, **at, grasps=grasps)
+            launch(kernels.increment_kernel, 1, sampling=self._sampling)
 
         frame(False)
         if self.count == 1:

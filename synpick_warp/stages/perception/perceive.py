@@ -9,6 +9,7 @@ import warp as wp
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.kernels.perception import worklist
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
@@ -18,6 +19,8 @@ from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.perception.segment import Segmenter
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
+
+WORKLIST = struct_arrays(worklist.Worklist, "one", world=("world",))
 
 
 class Perception:
@@ -49,8 +52,7 @@ class Perception:
         self.images.fixture_visible[:, :1].fill_(scene.bins.visible)
         self.segmenter = Segmenter(self.images)
         self.planner = GraspPlanner(settings, self.images, self.segmenter.arrays)
-        self._worklist = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        self._length, self._next, self._remaining = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
+        self._worklist = allocate_struct(WORKLIST, {"world": worlds, "one": 1}, self.device)
         self._graphs: dict[int, wp.Graph] = {}
         self._warm = False
 
@@ -82,23 +84,20 @@ class Perception:
     def _loop(self, snapshot: Snapshot) -> None:
         """Process the worklist to its end: the loop is a conditional node of the graph that is captured."""
         self.list_worlds()
-        wp.capture_while(self._remaining, self.perceive_batch, snapshot=snapshot)
+        wp.capture_while(self._worklist.remaining, self.perceive_batch, snapshot=snapshot)
 
     def list_worlds(self) -> None:
         """Build the worklist of worlds whose task is LOOK and reset the loop to its beginning."""
-        sources, lists = (self.state, self.attempts), {"worklist": self._worklist, "length": self._length}
-        given = {"worlds": len(self.state.phase), "next": self._next, "remaining": self._remaining}
-        launch(worklist.list_worlds_kernel, 1, *sources, **lists, **given)
+        given = {"worlds": len(self.state.phase), "worklist": self._worklist}
+        launch(worklist.list_worlds_kernel, 1, self.state, self.attempts, **given)
 
     def perceive_batch(self, snapshot: Snapshot) -> None:
         """Loop body: observe the next worlds of the worklist, one a view, and plan their attempts."""
         views = self.images.views
-        given = {"worklist": self._worklist, "length": self._length, "next_item": self._next}
-        launch(worklist.take_batch_kernel, views.count, **given, world_out=views.world)
+        launch(worklist.take_batch_kernel, views.count, worklist=self._worklist, views=views)
         self.images.render(snapshot)
         self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
         self.planner.plan(self.scene, self.state, self.attempts, self.observation, self.plan, self.seed)
         if self.choose_grasps is not None:
             self.choose_grasps(self.planner, self.scene, self.plan)
-        given = {"views": views.count, "length": self._length, "next": self._next, "remaining": self._remaining}
-        launch(worklist.advance_batch_kernel, 1, **given)
+        launch(worklist.advance_batch_kernel, 1, views=views.count, worklist=self._worklist)

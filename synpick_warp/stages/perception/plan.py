@@ -6,7 +6,6 @@ directed acyclic graph, has edges from upper to lower instances by their votes. 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -20,30 +19,25 @@ from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_nor
 from synpick_warp.kernels.perception.occlusion_votes import (
     CONTOUR_LANES,
     NOWHERE,
+    Voting,
     bound_contours_kernel,
     count_votes_kernel,
     weigh_votes_kernel,
 )
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
-from synpick_warp.stages.arrays import allocate, allocate_struct, count_words, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, count_words, struct_arrays
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
+_KINDS = {"count": ("view", "instance", "instance", "kind")}
 
-@dataclass(frozen=True, eq=False)
-class VoteArrays:
-    """Scratch of the occlusion votes: vote counts, bounding boxes of contours and reaches of instances."""
 
-    count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
-    """Votes that the second instance lies above the first, by kind: full, or deep (it is seen below the first one's grasp point)."""
-    extent: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
-    """Bounding box of each contour as maxima: -column, -row, column, row."""
-    reach: wp.array = device_array("view", "instance", dtype=wp.float32, unit="px")
-    """Bound of an object's size in the image: votes from pixels with a farther point of its contour do not count."""
+class VoteArrays(array_group(Voting, "view", "instance", units={"extent": "px", "reach": "px"}, **_KINDS)):
+    """Scratch of the occlusion votes."""
 
 
 CYCLES = struct_arrays(

@@ -37,33 +37,28 @@ class Annotator:
         self.scene = scene
         self.border_boxes: Any = allocate_struct(BORDER_BOXES, {"view_instance": views * instances, "one": 1}, scene.device)
 
-    def annotate(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
-        """Compute `out.pixels` and `out.boxes` of the views from their images and, beyond the image border, by rays.
-
-        Args:
-            bodies: The struct `ViewBodies` that `set_up_views` filled for these views.
-            views: The struct `Views`.
-            out: Its images and masks are read, its counts and boxes written.
-        """
-        scene, instances = self.scene, out.pixels.shape[1]
+    def annotate(self, shot: Any, out: ViewBuffers) -> None:
+        """Compute `out.pixels` and `out.boxes` of the views of the struct `ShotData` from their images and, beyond the image border, by
+        rays."""
+        scene, instances, views = self.scene, out.pixels.shape[1], shot.views
         threads = COUNT_THREADS if scene.device.is_cuda else 1
         images = {"instance_image": out.instance, "depth_image": out.depth, "masks": masks_of(out)}
         launch(clear_boxes_counts_kernel, (views.count, instances), out)
         launch(count_image_pixels_kernel, (views.count, instances, threads), out, threads=threads, **images)
-        self._count_border_pixels(bodies, views, out)
+        self._count_border_pixels(shot, out)
         launch(reset_empty_boxes_kernel, (views.count, instances, 2), out)
 
-    def _count_border_pixels(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
+    def _count_border_pixels(self, shot: Any, out: ViewBuffers) -> None:
         """List the boxes that reach beyond the image, and count the pixels there by rays."""
         scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
         groups, threads = (BORDER_GROUPS, BORDER_THREADS) if device.is_cuda else (1, 1)
         self.border_boxes.length.zero_()
         wp.launch(
             list_border_boxes_kernel,
-            dim=(views.count, instances),
-            inputs=[scene.grid, bodies, instances, BORDER_CHUNK],
+            dim=(shot.views.count, instances),
+            inputs=[scene.grid, shot.bodies, instances, BORDER_CHUNK],
             outputs=[self.border_boxes],
             device=device,
         )
-        given = {"bodies": bodies, "views": views, "groups": groups, "threads": threads, "chunk": BORDER_CHUNK}
+        given = {"shot": shot, "groups": groups, "threads": threads, "chunk": BORDER_CHUNK}
         launch(count_border_pixels_kernel, (groups, threads), self, scene, out, block_dim=BORDER_THREADS, **given)

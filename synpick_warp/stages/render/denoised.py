@@ -5,7 +5,6 @@ Mode unoccluded leaves out the first two: no ambient occlusion, no indirect ligh
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -13,6 +12,7 @@ import warp as wp
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import (
     CHUNK_TILES,
+    FootprintLists,
     MultiWordMask,
     SingleWordMask,
     find_footprints_kernel,
@@ -20,11 +20,7 @@ from synpick_warp.kernels.render.images.antialias import (
 )
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
-from synpick_warp.kernels.render.lighting.history import (
-    NEVER,
-    LightHistory,
-    advance_history_kernel,
-)
+from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, advance_history_kernel
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.paths.bounces import extend_queued_paths_kernel
 from synpick_warp.kernels.render.lighting.paths.coarse import start_paths_kernel, trace_coarse_paths_kernel
@@ -32,7 +28,7 @@ from synpick_warp.kernels.render.lighting.paths.light import CoarseLight
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists
 from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEUE_CAPACITY, PathQueues
 from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel
-from synpick_warp.kernels.render.lighting.shading import shade_kernel, shade_samples_kernel
+from synpick_warp.kernels.render.lighting.shading import DenoisedLight, shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
 from synpick_warp.kernels.render.lighting.shadow_edges import (
     MAX_CHUNK_PIXELS,
@@ -43,12 +39,12 @@ from synpick_warp.kernels.render.lighting.shadow_edges import (
     trace_shadow_edges_kernel,
 )
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
-from synpick_warp.kernels.render.lighting.shadows import trace_shadow_rays_kernel
+from synpick_warp.kernels.render.lighting.shadows import ShadowRays, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS, EDGE_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
-from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.arrays import allocate_struct, bundle, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.looks import shade_floor
@@ -125,26 +121,8 @@ PATH_QUEUES = struct_arrays(
     record=("queue_view", "queue_region", "path_record"),
 )
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
-
-
-@dataclass(frozen=True, eq=False)
-class ShadowRays:
-    """Traced shadow rays on the shadow grid: per pixel the lamps' visibility bits, depth, segmentation id and normal, packed."""
-
-    packed: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
-    """Packed by `shadows.pack_rays`."""
-
-
-@dataclass(frozen=True, eq=False)
-class FootprintLists:
-    """Work lists for anti-aliasing: the squares between four pixel centres (footprints) to resolve, by chunk of tiles, and
-    their numbers.
-    """
-
-    footprint: wp.array = device_array("view", "chunk", "chunk_footprint", dtype=wp.int32)
-    """Row * columns + column of each listed footprint; a chunk is a run of tiles of footprints with a list of its own."""
-    count: wp.array = device_array("view", "chunk", dtype=wp.int32)
-    """Footprints in each list."""
+SHADOW_RAYS = struct_arrays(ShadowRays, "view", "shadow_row", "shadow_column")
+FOOTPRINT_LISTS = struct_arrays(FootprintLists, "view", "chunk", footprint=("view", "chunk", "chunk_footprint"))
 
 
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
@@ -258,39 +236,37 @@ class DenoisedRenderer:
         self.queues = allocate_struct(PATH_QUEUES, queues, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
-        self.shadow_rays = allocate(ShadowRays, sizes, scene.device)
+        self.shadow_rays = allocate_struct(SHADOW_RAYS, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
         self.edge_lists = allocate_struct(EDGE_LISTS, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
         self.footprints = footprint_grid(scene.width, scene.height)
-        self.footprint_lists = allocate(FootprintLists, sizes, scene.device)
+        self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
 
-    def shade(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
+    def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
         """Render the radiance of a batch of views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `ViewBodies` of these views.
-            gbuffer: The struct `GBuffer` of these views.
-            views: The struct `Views`.
+            shot: The struct `ShotData`.
             image: The struct `ShadedImage`; written.
         """
         device = self.scene.device
         if self.traces_paths:
             with scope("trace coarse paths", device):
-                self.find_moving_bodies(snapshot, views)
-                self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
+                self.find_moving_bodies(snapshot, shot.views)
+                self.trace_coarse_paths(shot)
             with scope("denoise", device):
-                self.denoise(views)
+                self.denoise(shot.views)
         with scope("lamp shadows", device):
-            self.trace_shadows(snapshot, bodies, gbuffer, views, image.radiance)
+            self.trace_shadows(shot, image)
         with scope("shade pixels", device):
-            self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
+            self.shade_pixels(shot, image)
         if self.antialias:
             with scope("anti-alias", device):
-                self.resolve_footprints(bodies, gbuffer, views, image)
+                self.resolve_footprints(shot, image)
 
     def find_moving_bodies(self, snapshot: Snapshot, views: Any) -> None:
         """Find the bodies that moved since the previous frame, where the light history contains that frame; sets the history's frame to
@@ -306,18 +282,18 @@ class DenoisedRenderer:
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
-    def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
+    def trace_coarse_paths(self, shot: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).
 
         Wavefront path tracing where there are queues: one launch for the first bounce, then one for each further bounce.
         """
-        scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
+        scene, views, threads = self.scene, shot.views, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            inputs = [scene.paths, self.coarse, snapshot.frames, bodies, gbuffer, views, self.moving]
+            inputs = [scene.paths, self.coarse, shot, self.moving]
             outputs = [self.history, self.path_lists, self.guide, self.coarse_light]
             launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
-        inputs = [scene.paths, self.coarse, snapshot.frames, bodies, gbuffer, views, self.path_lists, self.rules]
+        inputs = [scene.paths, self.coarse, shot, self.path_lists, self.rules]
         outputs = [self.queues, self.history, self.guide, self.coarse_light]
         if self.queues.count.shape[1] == 0:
             launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
@@ -328,14 +304,14 @@ class DenoisedRenderer:
             count = min(views.count - first_view, turn)
             self.queues.count.zero_()
             launch_views(start_paths_kernel, count, threads, inputs, outputs, scene.device, first_view)
-            self.extend_queued_paths(snapshot, bodies, views, first_view, count)
+            self.extend_queued_paths(shot, first_view, count)
 
-    def extend_queued_paths(self, snapshot: Snapshot, bodies: Any, views: Any, first_view: int, count: int) -> None:
+    def extend_queued_paths(self, shot: Any, first_view: int, count: int) -> None:
         """Later bounces of the queued paths of `count` views from `first_view` on, one launch a bounce."""
         threads = self.queues.count.shape[1] * int(QUEUE_CAPACITY)
         outputs = [self.queues, self.history, self.coarse_light]
         for stage in range(self.rules.bounces - 1):
-            inputs = [self.scene.paths, self.coarse, snapshot.frames, bodies, views, self.rules, stage]
+            inputs = [self.scene.paths, self.coarse, shot, self.rules, stage]
             launch_views(extend_queued_paths_kernel, count, threads, inputs, outputs, self.scene.device, first_view)
 
     def denoise(self, views: Any) -> None:
@@ -345,72 +321,48 @@ class DenoisedRenderer:
         self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [self.chosen])
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
 
-    def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+    def trace_shadows(self, shot: Any, image: Any) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
-        scene, coarse, rays = self.scene, self.shadow_grid, self.shadow_rays.packed
-        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.frames, bodies, gbuffer]
-        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, views, self.moving], [self.history, rays])
-        inputs = [scene.meshes, coarse, scene.lights, snapshot.frames, bodies, gbuffer, rays, views]
-        self._launch(filter_shadows_kernel, coarse.grid, views, inputs, [self.shadows])
-        self._launch(measure_steepness_kernel, coarse.grid, views, inputs, [self.shadows])
-        self.trace_shadow_edges(snapshot, bodies, gbuffer, views, radiance)
+        coarse, views, inputs = self.shadow_grid, shot.views, [self.scene.plain, self.shadow_grid, shot]
+        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, self.moving], [self.history, self.shadow_rays])
+        for kernel in (filter_shadows_kernel, measure_steepness_kernel):
+            self._launch(kernel, coarse.grid, views, [*inputs, self.shadow_rays], [self.shadows])
+        self.trace_shadow_edges(shot, image)
 
-    def trace_shadow_edges(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+    def trace_shadow_edges(self, shot: Any, image: Any) -> None:
         """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions, which
-        lie in `radiance` until the pixels are shaded."""
-        scene, lists, coarse, device = self.scene, self.edge_lists, self.shadow_grid, self.scene.device
+        lie in the image's radiance until the pixels are shaded."""
+        scene, lists, coarse, device, views = self.scene, self.edge_lists, self.shadow_grid, self.scene.device, shot.views
         lists.count.zero_()
         self.shadows.edge.zero_()
         outputs = [self.shadows, lists]
         launch_views(list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device)
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
         sharing = lists.count.shape[1] * threads
-        inputs = [scene.meshes, coarse, bodies, gbuffer, views, threads]
-        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, outputs, device)
-        inputs = [scene.meshes, scene.table, coarse, scene.lights, snapshot.frames, bodies, gbuffer]
-        inputs += [lists, views, threads]
-        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, inputs, [self.shadows], device)
-        inputs = [scene.meshes, coarse, scene.lights, snapshot.frames, bodies, gbuffer, lists, self.shadows]
-        inputs += [views, threads]
-        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, inputs, [radiance], device)
+        launch_views(list_edge_pixels_kernel, views.count, sharing, [scene.meshes, coarse, shot, threads], outputs, device)
+        inputs = [scene.plain, coarse, shot, lists]
+        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, threads], [self.shadows], device)
+        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, [*inputs, self.shadows, threads], [image], device)
 
-    def shade_pixels(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+    def shade_pixels(self, shot: Any, image: Any) -> None:
         """Deferred shading: radiance of each pixel."""
-        scene = self.scene
-        inputs = [scene.paths, self.coarse, self.shadow_grid, snapshot.frames, bodies, gbuffer]
-        inputs += [self.ratios, self.shadows, views]
-        self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
-        shade_floor(scene, snapshot, bodies, gbuffer, views, radiance)
+        self._launch(self.shade_kernel, shot.grid, shot.views, [self.scene.paths, shot, bundle(DenoisedLight, self)], [image])
+        shade_floor(self.scene, shot, image)
 
-    def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
+    def resolve_footprints(self, shot: Any, image: Any) -> None:
         """Anti-alias by coverage rays; writes `image.resolve` and `image.samples`."""
         image.samples = self.coverage_rays
-        scene, lists = self.scene, self.footprint_lists
+        lists, device = self.footprint_lists, self.scene.device
         lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
-        inputs = [scene.grid, self.footprints, gbuffer, image.radiance, views]
-        outputs = [image.resolve, lists.footprint, lists.count]
-        footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
-        wp.launch(
-            kernel_for(find_footprints_kernel, views),
-            dim=footprints,
-            inputs=inputs,
-            outputs=outputs,
-            device=scene.device,
-            block_dim=PIXEL_BLOCK,
-        )
-        threads = FOOTPRINT_THREADS if scene.device.is_cuda else CPU_FOOTPRINT_THREADS
-        inputs = [scene.meshes, scene.table, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
-        inputs += [views, image.samples, threads, mask_width_of(bodies)]
-        samples = views.count * lists.count.shape[1] * threads
-        wp.launch(
-            kernel_for(resolve_footprints_kernel, *inputs),
-            dim=samples,
-            inputs=inputs,
-            outputs=[image.resolve],
-            device=scene.device,
-            block_dim=PIXEL_BLOCK,
-        )
+        options: dict[str, Any] = {"device": device, "block_dim": PIXEL_BLOCK}
+        inputs = [self.footprints, shot]
+        dim = shot.views.count * self.footprints.tiles * int(TILE_PIXELS)
+        wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=[image, lists], **options)
+        threads = FOOTPRINT_THREADS if device.is_cuda else CPU_FOOTPRINT_THREADS
+        inputs = [self.scene.plain, self.footprints, shot, lists, threads, mask_width_of(shot.bodies)]
+        dim = shot.views.count * lists.count.shape[1] * threads
+        wp.launch(kernel_for(resolve_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=[image], **options)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""

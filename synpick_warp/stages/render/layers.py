@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import pkgutil
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
 from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.images.depth_sensor import SensorParameters, render_depth_sensor_kernel
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters
+from synpick_warp.kernels.render.images.depth_sensor import render_depth_sensor_kernel
 from synpick_warp.kernels.render.images.layers import (
     BodyMotions,
+    LayerScene,
     compute_motions_kernel,
     render_albedo_kernel,
     render_classes_kernel,
@@ -28,7 +29,7 @@ from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
-from synpick_warp.stages.launch import launch_images
+from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.stereo import STEREO_LAYERS, StereoRenderer
 from synpick_warp.views.layers import LAYER_TABLE
@@ -48,7 +49,7 @@ KERNELS = {
     "suction_seal": render_suction_seal_kernel,
     "suction_wrench": render_suction_wrench_kernel,
 }
-"""Kernel of each layer of ours but those of `STEREO_LAYERS`; its output is named as the layer."""
+"""Kernel of each layer of ours but those of `STEREO_LAYERS`."""
 BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
 
 
@@ -68,6 +69,13 @@ def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> A
     for name in ("dot_spacing", "dot_brightness", "ambient", "infrared_noise"):
         setattr(result, name, getattr(settings, name))
     return result
+
+
+def layer_scene(scene: RenderScene) -> Any:
+    """The struct `LayerScene` without sensor and motions."""
+    layer = LayerScene()
+    layer.obj_id, layer.suction = scene.obj_id, scene.suction_maps
+    return layer
 
 
 class LayerRenderer:
@@ -98,31 +106,26 @@ class LayerRenderer:
             self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES) + 1}, scene.device)
         self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
 
-    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers, last: Any) -> None:
+    def render(self, snapshot: Snapshot, shot: Any, out: LayerBuffers, last: Any) -> None:
         """Render the layers of a batch of views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `ViewBodies`, set up for these views.
-            gbuffer: The struct `GBuffer` of these views.
-            views: The struct `Views`.
+            shot: The struct `ShotData`.
             out: The arrays of the named layers are written.
-            last: The cameras of the views in the frame before, as those of `views`; the same if they do not move.
+            last: The cameras of the views in the frame before, as those of the views; the same if they do not move.
         """
-        scene = self.scene
+        scene, layer, views = self.scene, layer_scene(self.scene), shot.views
+        layer.sensor, layer.follows = self.sensor, snapshot.follows
         if self.motions is not None:
-            self.compute_motions(snapshot, views, last)
-        batch = SimpleNamespace(bodies=bodies, gbuffer=gbuffer, views=views, suction=scene.suction_maps)
+            layer.motions = self.motions
+            inputs = [snapshot.bundle, views, last.rotation, last.center]
+            dim = (views.count, layer.motions.known.shape[1])
+            wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[layer.motions], device=scene.device)
         for name in self.names:
             if name not in STEREO_LAYERS:
                 pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
                 kernel = KERNELS.get(name) or pkgutil.resolve_name(LAYER_TABLE[name].kernel)
-                launch_images(kernel, pixels, scene, self, snapshot, batch, out=out)
+                launch_pixels(kernel, pixels, [scene.paths, layer, shot], [getattr(out, name)], scene.device)
         if self.stereo is not None:
-            self.stereo.render(snapshot, bodies, gbuffer, views, out)
-
-    def compute_motions(self, snapshot: Snapshot, views: Any, last: Any) -> None:
-        """Compute the motion of every body, and of the table, from this frame back to the previous one; arguments as of `render`."""
-        inputs = [snapshot.bundle, views, last.rotation, last.center]
-        dim = (views.count, self.motions.known.shape[1])
-        wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
+            self.stereo.render(shot, out)

@@ -163,11 +163,11 @@ class Dresser:
         )
 
 
-def shade_floor(scene: RenderScene, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, radiance: wp.array) -> None:
+def shade_floor(scene: RenderScene, shot: Any, image: Any) -> None:
     """Shade what the views show beyond the scene as a floor, if episodes draw a background."""
     if scene.looks is not None and scene.looks.background_textures:
-        inputs = [scene.paths, scene.grid, FLOOR_DROP, snapshot.frames, bodies, gbuffer, views]
-        launch_pixels(shade_floor_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
+        pixels = shot.views.count * scene.grid.tiles * int(TILE_PIXELS)
+        launch_pixels(shade_floor_kernel, pixels, [scene.paths, FLOOR_DROP, shot], [image], scene.device)
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import warp as wp
 
 from synpick_warp.kernels.render.images.mask_runs import (
+    Boundaries,
+    BoundaryCounts,
     count_boundaries_kernel,
     count_runs_kernel,
     list_boundaries_kernel,
     list_runs_kernel,
 )
 from synpick_warp.kernels.tuning import RUN_LANES
-from synpick_warp.stages.arrays import device_array
+from synpick_warp.stages.arrays import array_group
 from synpick_warp.stages.buffers import ViewBuffers, masks_of
 from synpick_warp.views.frames import WORD_BYTES
 
@@ -24,30 +24,15 @@ FIELDS = 2
 """Fields of a boundary of the ids: position; values above and below."""
 
 
-@dataclass(frozen=True, eq=False)
-class BoundaryBuffers:
-    """Run boundaries of the segmentation ids and amodal masks of a batch of views, and their counts. A count may exceed the capacity of its
-    list; the list is then truncated. See `FrameBatch`.
-    """
-
-    boundary_count: wp.array = device_array("view", dtype=wp.int32)
-    """Run boundaries of the ids, including those beyond the capacity of `boundaries`."""
-    boundaries: wp.array = device_array("view", "field", "boundary", dtype=wp.uint32)
-    """Position, and values above and below, of each run boundary of the ids."""
-    run_count: wp.array = device_array("view", "instance", dtype=wp.int32)
-    """Run boundaries of each amodal mask, including those beyond the capacity of `runs`."""
-    runs: wp.array = device_array("view", "run", dtype=wp.uint32)
-    """Positions of the run boundaries of the amodal masks, mask by mask."""
+_LISTS = {"boundaries": ("view", "field", "boundary"), "runs": ("view", "run")}
 
 
-@dataclass(frozen=True, eq=False)
-class BoundaryScratch:
-    """Run boundaries per column and per lane: scratch between the two passes over images and masks."""
+class BoundaryBuffers(array_group(Boundaries, boundary_count=("view",), run_count=("view", "instance"), **_LISTS)):
+    """Run boundaries of the ids and amodal masks of a batch of views."""
 
-    column_count: wp.array = device_array("view", "column", dtype=wp.int32)
-    """Run boundaries of each column of the ids."""
-    lane_count: wp.array = device_array("view", "instance", "lane", dtype=wp.int32)
-    """Run boundaries of each lane of a mask."""
+
+class BoundaryScratch(array_group(BoundaryCounts, column_count=("view", "column"), lane_count=("view", "instance", "lane"))):
+    """Scratch between the two passes over images and masks."""
 
 
 def boundary_sizes(view_sizes: dict[str, int]) -> dict[str, int]:
@@ -69,12 +54,11 @@ def list_boundaries(scratch: BoundaryScratch, count: int, images: ViewBuffers, o
         out: Written.
     """
     instance, masks, device = images.instance, masks_of(images), scratch.column_count.device
+    counts, runs = scratch.bundle, out.bundle
     dim = (count, scratch.column_count.shape[1])
-    wp.launch(count_boundaries_kernel, dim=dim, inputs=[instance], outputs=[scratch.column_count], device=device)
-    outputs = [out.boundary_count, out.boundaries]
-    wp.launch(list_boundaries_kernel, dim=dim, inputs=[instance, scratch.column_count], outputs=outputs, device=device)
+    wp.launch(count_boundaries_kernel, dim=dim, inputs=[instance], outputs=[counts], device=device)
+    wp.launch(list_boundaries_kernel, dim=dim, inputs=[instance, counts], outputs=[runs], device=device)
     out.run_count.zero_()
     dim = (count, *scratch.lane_count.shape[1:])
-    wp.launch(count_runs_kernel, dim=dim, inputs=[masks], outputs=[scratch.lane_count, out.run_count], device=device)
-    inputs = [masks, instance.shape[1], scratch.lane_count, out.run_count]
-    wp.launch(list_runs_kernel, dim=dim, inputs=inputs, outputs=[out.runs], device=device)
+    wp.launch(count_runs_kernel, dim=dim, inputs=[masks], outputs=[counts, runs], device=device)
+    wp.launch(list_runs_kernel, dim=dim, inputs=[masks, instance.shape[1], counts], outputs=[runs], device=device)

@@ -9,7 +9,6 @@ import warp as wp
 
 from synpick_warp.codes import Tone
 from synpick_warp.configs.cell.sensors import Effects, effect_ranges
-from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters, EffectRanges, sample_effects_kernel
 from synpick_warp.kernels.render.images.postprocess import (
     PostProcessSettings,
@@ -18,9 +17,10 @@ from synpick_warp.kernels.render.images.postprocess import (
     postprocess_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.gbuffer import ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.stages.arrays import allocate, device_array
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
 
@@ -76,30 +76,26 @@ class PostProcessor:
             sizes = {"view": views, "row": scene.height, "column": scene.width}
             self.filtered = allocate(LensArrays, sizes, scene.device).radiance
 
-    def process(self, snapshot: Snapshot, views: Any, image: Any, out: ViewBuffers) -> None:
+    def process(self, shot: Any, image: Any, out: ViewBuffers) -> None:
         """Compute the colour images of a batch of views.
 
         Args:
-            snapshot: The worlds.
-            views: The struct `Views`.
+            shot: The struct `ShotData`.
             image: The struct `ShadedImage`.
             out: `color` is written, and `effects` if any effect is on; else it stays zero.
         """
-        scene = self.scene
+        scene, count = self.scene, shot.views.count
         if self.effects is None:
-            inputs = [scene.grid, scene.lights, snapshot.frames, views, image, self.settings.tone]
-            self._launch(postprocess_kernel, views.count, inputs, out.color)
+            self._launch(postprocess_kernel, count, [scene.lights, shot, image, self.settings.tone], out.color)
             return
-        inputs = [snapshot.frames, self.effects, views]
-        wp.launch(kernel_for(sample_effects_kernel, views), dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
+        inputs = [self.effects, shot]
+        wp.launch(kernel_for(sample_effects_kernel, shot), dim=count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.filtered is not None:
-            inputs = [scene.grid, out.effects, views, image]
-            self._launch(filter_lens_rows_kernel, views.count, inputs, self.filtered)
+            self._launch(filter_lens_rows_kernel, count, [out.effects, shot, image], self.filtered)
             filtered = ShadedImage()
             filtered.radiance, filtered.resolve, filtered.samples = self.filtered, image.resolve, image.samples
             image = filtered
-        inputs = [scene.grid, scene.lights, snapshot.frames, self.settings, out.effects, views, image]
-        self._launch(postprocess_effects_kernel, views.count, inputs, out.color)
+        self._launch(postprocess_effects_kernel, count, [scene.lights, self.settings, out.effects, shot, image], out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         """Launch a kernel over all pixels of `count` views."""

@@ -40,17 +40,11 @@ class ReferenceRenderer:
         self.scene = scene
         self.rules = make_path_rules(render, seed, render.samples, ROULETTE)
 
-    def shade(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
-        """Render the radiance of a batch of views.
+    def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
+        """Render the radiance of a batch of views; arguments as of `DenoisedRenderer.shade`.
 
-        Args:
-            snapshot: The worlds.
-            bodies: The struct `ViewBodies` of these views.
-            gbuffer: The struct `GBuffer` of these views; each path traces its own camera ray, so that it is read for the floor alone.
-            views: The struct `Views`.
-            image: The struct `ShadedImage`; its `radiance` is written, which is anti-aliased.
+        It is anti-aliased. Each path traces its own camera ray: the G-buffer is read for the floor alone.
         """
-        scene = self.scene
-        inputs = [scene.paths, scene.grid, snapshot.frames, bodies, views, self.rules]
-        launch_pixels(trace_paths_kernel, views.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [image.radiance], scene.device)
-        shade_floor(scene, snapshot, bodies, gbuffer, views, image.radiance)
+        scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
+        launch_pixels(trace_paths_kernel, pixels, [scene.paths, shot, self.rules], [image], scene.device)
+        shade_floor(scene, shot, image)

@@ -6,7 +6,7 @@ from typing import Any
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.sensors import DepthSensor, Effects
-from synpick_warp.kernels.render.images.antialias import ShadedImage
+from synpick_warp.kernels.render.visibility.gbuffer import ShadedImage
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
@@ -18,7 +18,7 @@ from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views, with_cameras
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_shot, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
@@ -110,17 +110,17 @@ class Renderer:
             return
         device = self.scene.device
         views = self.render_gbuffer(snapshot, views, out, placed)
+        shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, views)
         if layers is not None:
             with scope("layers", device):
-                last = views.cameras if placed is None else placed[1]
-                self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers, last)
+                self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1])
         if self.shading is not None:
             with scope("shade", device):
-                self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
+                self.shading.shade(snapshot, shot, self.image)
             with scope("post-process", device):
-                self.postprocessor.process(snapshot, views, self.image, out)
+                self.postprocessor.process(shot, self.image, out)
         with scope("annotate", device):
-            self.annotator.annotate(self.bodies, views, out)
+            self.annotator.annotate(shot, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
         """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the views with their cameras."""

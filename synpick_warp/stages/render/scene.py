@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.kernels.render.images.suction_map import SuctionScene
+from synpick_warp.kernels.render.images.layers import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
@@ -54,7 +54,9 @@ class RenderScene:
     table: Any
     """The struct `Table`."""
     paths: Any
-    """The struct `PathScene`: all of the above that path tracing reads."""
+    """The struct `PathScene`, or `RandomizedScene`: all of the above that path tracing reads."""
+    plain: Any
+    """The struct `PathScene`, for kernels that read no materials of views."""
     grid: Any
     """The struct `ImageGrid` of the cameras' images."""
     obj_id: wp.array
@@ -81,7 +83,7 @@ class RenderScene:
 
 def blank_scene(cameras: int, width: int, height: int, device: wp.Device) -> RenderScene:
     """Scene of cameras without content: in a dry run, constructors ask it for sizes alone."""
-    content = dict.fromkeys(("meshes", "surfaces", "cameras", "lights", "table", "paths"))
+    content = dict.fromkeys(("meshes", "surfaces", "cameras", "lights", "table", "paths", "plain"))
     ids = wp.empty(0, dtype=wp.int32, device="cpu")
     return RenderScene(**content, grid=build_grid(width, height), obj_id=ids, camera_count=cameras, device=device, keep=())
 
@@ -337,8 +339,7 @@ def build_render_scene(
     table.half = wp.vec2(*(0.5 * size if size > 0.0 else FAR for size in settings.table_size))
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
-    paths.meshes = meshes
-    paths.table = table
+    paths.meshes, paths.table = meshes, table
     paths.surfaces = build_surfaces(shapes, materials, device)
     paths.lights = build_lights(lights, ground, settings.exposure, device, shadowed_lamps(settings))
     paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
@@ -349,6 +350,7 @@ def build_render_scene(
         lights=paths.lights,
         table=table,
         paths=paths,
+        plain=paths,
         grid=build_grid(*cameras[0].resolution),
         obj_id=wp.array(catalog.object_ids, dtype=wp.int32, device=device),
         camera_count=len(cameras),

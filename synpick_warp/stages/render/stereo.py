@@ -12,6 +12,7 @@ from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.kernels.render.images.infrared import render_infrared_kernel
 from synpick_warp.kernels.render.images.stereo_matching import (
     WARP,
+    MatchingScratch,
     match_left_kernel,
     match_right_kernel,
     measure_depth_kernel,
@@ -19,8 +20,8 @@ from synpick_warp.kernels.render.images.stereo_matching import (
     transform_census_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.stages.arrays import allocate, device_array
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot
+from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.stages.buffers import LayerBuffers
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
 
@@ -44,15 +45,9 @@ class InfraredImages:
     ir_right: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
 
 
-@dataclass(frozen=True, eq=False)
-class MatchingScratch:
-    """Scratch of matching: a slot for each view that is matched at a time."""
-
-    census: wp.array = device_array("slot", "eye", "row", "column", dtype=wp.uint32)
-    cost: wp.array = device_array("slot", "row", "column", "disparity", dtype=wp.uint16)
-    """Cost volumes: sum of the costs of all paths."""
-    right_match: wp.array = device_array("slot", "row", "column", dtype=wp.int32)
-    disparity: wp.array = device_array("slot", "row", "column", dtype=wp.int32)
+MATCHING = struct_arrays(
+    MatchingScratch, "slot", "row", "column", census=("slot", "eye", "row", "column"), cost=("slot", "row", "column", "disparity")
+)
 
 
 def count_disparities(max_disparity: float) -> int:
@@ -80,16 +75,16 @@ class StereoRenderer:
         sizes = {"view": views, "slot": self.slots, "eye": len(EYES), "row": scene.height, "column": scene.width, "disparity": disparities}
         self.eyes = [eye for eye in EYES if eye in names or self.matches]
         self.images = allocate(InfraredImages, sizes, scene.device, set(self.eyes) - set(names))
-        self.scratch = allocate(MatchingScratch, sizes, scene.device) if self.matches else None
+        self.scratch: Any = allocate_struct(MATCHING, sizes, scene.device) if self.matches else None
 
-    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers) -> None:
+    def render(self, shot: Any, out: LayerBuffers) -> None:
         """Render the infrared images of a batch of views, and match them; arguments as of `LayerRenderer.render`."""
-        scene = self.scene
+        scene, views = self.scene, shot.views
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         own = [getattr(self.images, eye) for eye in self.eyes]
         images = {eye: getattr(out, eye) if image is None else image for eye, image in zip(self.eyes, own, strict=True)}
         for eye, image in images.items():
-            inputs = [scene.paths, scene.grid, snapshot.frames, self.sensor, bodies, gbuffer, views, EYES.index(eye)]
+            inputs = [scene.paths, self.sensor, shot, EYES.index(eye)]
             launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
         if self.scratch is not None:
             for first in range(0, views.count, self.slots):
@@ -98,16 +93,13 @@ class StereoRenderer:
     def match(self, first_view: int, count: int, views: Any, images: list[wp.array], depth: wp.array) -> None:
         """Match the left and right images of `count` views, at most as many as there are slots."""
         grid, sensor, scratch, device = self.scene.grid, self.sensor, self.scratch, self.scene.device
-        assert scratch is not None
         pixels = count * grid.tiles * int(TILE_PIXELS)
         launch_pixels(transform_census_kernel, len(EYES) * pixels, [grid, *images, first_view], [scratch.census], device)
         lanes = WARP if device.is_cuda else 1
         for direction in range(DIRECTIONS):
             lines = grid.height if direction < DIRECTIONS // 2 else grid.width
-            inputs = [sensor, views, scratch.census, first_view, direction, lines, lanes]
-            launch_views(sum_path_costs_kernel, count * lines, lanes, inputs, [scratch.cost], device)
-        inputs = [grid, sensor, views, scratch.cost]
-        launch_pixels(match_right_kernel, pixels, [*inputs, first_view], [scratch.right_match], device)
-        inputs += [scratch.right_match, scratch.census, first_view]
-        launch_pixels(match_left_kernel, pixels, inputs, [scratch.disparity], device)
+            inputs = [sensor, views, first_view, direction, lines, lanes]
+            launch_views(sum_path_costs_kernel, count * lines, lanes, inputs, [scratch], device)
+        for kernel in (match_right_kernel, match_left_kernel):
+            launch_pixels(kernel, pixels, [grid, sensor, views, first_view], [scratch], device)
         launch_pixels(measure_depth_kernel, pixels, [grid, sensor, views, scratch.disparity, first_view], [depth], device)

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, Views
-from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, LensShot, ShotData, ViewBodies
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
@@ -62,6 +62,13 @@ def with_cameras(views: Any, cameras: Any) -> Any:
         return make_views(views.world, views.camera, views.count, views.instances, cameras, views.slot)
     views.cameras = cameras
     return views
+
+
+def make_shot(scene: RenderScene, frames: Any, bodies: Any, gbuffer: Any, views: Any) -> Any:
+    """The struct `ShotData`, or `LensShot` if some cameras are distorted, of the structs `Frames`, `ViewBodies`, `GBuffer` and `Views`."""
+    shot = LensShot() if isinstance(views, LensViews.cls) else ShotData()
+    shot.grid, shot.snapshot, shot.bodies, shot.gbuffer, shot.views = scene.grid, frames, bodies, gbuffer, views
+    return shot
 
 
 def first_views(count: int, cameras: int, instances: int, device: wp.Device, lenses: Any = None) -> Any:

@@ -14,12 +14,13 @@ from synpick_warp.kernels.sim import sleep
 from synpick_warp.kernels.state import Motion
 from synpick_warp.newton_patches.broad_phase import SeparatingBroadPhase
 from synpick_warp.newton_patches.solver import FusedSteel
-from synpick_warp.stages.arrays import allocate, array_group, bundle
+from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, bundle, struct_arrays
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
+ISLANDS = struct_arrays(sleep.Islands, "body", woken=("world", "slot"))
 THREADS = 64
 """Threads per world of the grid-stride loops over the overlaps and contacts of all worlds."""
 
@@ -39,10 +40,9 @@ class Sleep:
             raise SynpickError(f"physics.sleep needs another version of Newton than {newton.__version__}; set it to 0")
         self._scene, self._physics = scene, physics
         worlds, device = physics.layout.worlds, physics.device
-        self.state = allocate(SleepState, {"world": worlds, "slot": physics.layout.slots}, device)
         self._threads = worlds * THREADS if device.is_cuda else 1
-        self._woken = wp.zeros_like(self.state.asleep)
-        self._parent, self._restless = (wp.zeros(physics.model.body_count, dtype=wp.int32, device=device) for _ in range(2))
+        sizes = {"world": worlds, "slot": physics.layout.slots, "body": physics.model.body_count}
+        self.state, self._islands = allocate(SleepState, sizes, device), allocate_struct(ISLANDS, sizes, device)
         self._pairs = wp.zeros(pipeline.broad_phase_shape_pairs.shape[0], dtype=wp.vec2i, device=device)
         self._pair_count = wp.zeros(1, dtype=wp.int32, device=device)
         pipeline.broad_phase.choose = self.choose
@@ -59,21 +59,20 @@ class Sleep:
 
     def touch(self) -> None:
         """Mark sleeping islands in contact with an awake body. Runs between collision detection and solver."""
-        given = {"threads": self._threads, "woken": self._woken, "contacts": contact_arrays(self._physics)}
+        given = {"threads": self._threads, "islands": self._islands, "contacts": contact_arrays(self._physics)}
         launch(sleep.wake_touched_kernel, self._threads, self._scene, self.state, **given)
 
     def hold(self, before: newton.State, after: newton.State) -> None:
         """Restore the sleeping bodies to their state before the substep, and wake the marked islands. Runs after the solver."""
-        motions = {"before": bundle(Motion, before), "after": bundle(Motion, after)}
-        launch(sleep.hold_sleepers_kernel, self.state.asleep.shape, self._scene, self.state, woken=self._woken, **motions)
+        given = {"before": bundle(Motion, before), "after": bundle(Motion, after), "islands": self._islands}
+        launch(sleep.hold_sleepers_kernel, self.state.asleep.shape, self._scene, self.state, **given)
 
     def judge(self, state: WorldState, attempts: AttemptState, seals: SealState, threshold: float) -> None:
         """Put islands to sleep whose objects moved by at most `threshold` [m] in each of the last ticks, and wake those of which an
         object was attached or removed. Runs at the end of a tick."""
-        scene, physics = self._scene, self._physics
-        launch(sleep.begin_islands_kernel, len(self._parent), parent=self._parent)
-        launch(sleep.join_islands_kernel, physics.contacts.rigid_contact_max, contacts=contact_arrays(physics), parent=self._parent)
-        self._restless.zero_()
-        scratch = {"parent": self._parent, "restless": self._restless, "woken": self._woken}
+        scene, physics, islands = self._scene, self._physics, self._islands
+        launch(sleep.begin_islands_kernel, len(islands.parent), islands=islands)
+        launch(sleep.join_islands_kernel, physics.contacts.rigid_contact_max, contacts=contact_arrays(physics), islands=islands)
+        islands.restless.zero_()
         sources = (scene, state, attempts, seals, self.state, physics.state)
-        launch(sleep.judge_sleep_kernel, len(state.phase), *sources, threshold=threshold, **scratch)
+        launch(sleep.judge_sleep_kernel, len(state.phase), *sources, threshold=threshold, islands=islands)

@@ -34,7 +34,8 @@ from synpick_warp.views.picks import MOVED
 GRASPS = struct_arrays(Grasps, "grasp", units={"point": "m", "yaw": "rad", "tilt": "rad"})
 PERTURBATIONS = struct_arrays(Perturbations, "trial", units={"offset": "m", "rotation": "rad"})
 LABELS = struct_arrays(kernels.Labels, "trial", units={"peak_force": "N", "farthest": "m", "ticks": "ticks", "held": "steps"})
-PROGRESS = struct_arrays(kernels.Progress, "world", pose=("world", "instance"), units={"peak_force": "N", "pose": "m"})
+_SHAPES = {"pose": ("world", "instance"), "next": ("one",), "done": ("one",)}
+PROGRESS = struct_arrays(kernels.Progress, "world", units={"peak_force": "N", "pose": "m"}, **_SHAPES)
 GPU_WORLDS = 2048
 """Maximum number of trial worlds on a GPU if `picks.worlds` is 0. On an H200, 512 worlds run 293 trials of the synpick preset a second,
 2,048 worlds more than 530."""
@@ -94,11 +95,9 @@ class Trials:
         self.course = make_course(settings, simulation.config.physics, simulation.config.pick)
         seed = wp.uint64(simulation.config.bake.seed)
         self.spread = fill(PerturbationData, settings, angle=math.radians(settings.angle), seed=seed)
-        sizes = {"world": simulation.layout.worlds, "instance": simulation.layout.instances}
+        sizes = {"world": simulation.layout.worlds, "instance": simulation.layout.instances, "one": 1}
         self._progress = allocate_struct(PROGRESS, sizes, self.device)
         self._progress.trial.fill_(-1)
-        self._next, self._done = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
-        self._row = wp.zeros(simulation.layout.worlds, dtype=wp.int32, device=self.device)
         simulation.behavior = replace(simulation.behavior, law=TrialLaw(self.course))
         simulation.hold = WatchedHold(simulation.hold, self._progress)
         simulation.clear_graphs()
@@ -120,9 +119,9 @@ class Trials:
         """
         sizes = {"trial": len(grasps.row) * self.course.repeats}
         labels, perturbations = (allocate_struct(kind, sizes, self.device) for kind in (LABELS, PERTURBATIONS))
-        self._next.zero_()
-        self._done.zero_()
-        while int(self._done.numpy()[0]) < sizes["trial"]:
+        self._progress.next.zero_()
+        self._progress.done.zero_()
+        while int(self._progress.done.numpy()[0]) < sizes["trial"]:
             for _ in range(POLL):
                 self.tick(state, grasps, labels, perturbations)
         return {name: getattr(part, name).numpy() for part in (labels, perturbations) for name in part._cls.vars}
@@ -133,17 +132,17 @@ class Trials:
         scene, physics, plan = simulation.scene, simulation.physics, simulation.plan
         sources = (scene, simulation.state, simulation.attempts)
         with scope("load states", self.device):
-            numbers = {"count": len(labels.outcome), "repeats": self.course.repeats, "next": self._next, "row_out": self._row}
+            numbers = {"count": len(labels.outcome), "repeats": self.course.repeats}
             launch(kernels.assign_trials_kernel, 1, progress=progress, grasps=grasps, **numbers)
-            self.states.load(state, self._row)
+            self.states.load(state, progress.row)
             planned = {"spread": self.spread, "trial": progress.trial, "grasps": grasps, "perturbations": perturbations}
-            launch(plan_trials_kernel, worlds, *sources, row=self._row, **planned, out=plan)
-            launch(kernels.begin_trials_kernel, worlds, *sources, physics.state, row=self._row, progress=progress)
-            given = {"row": self._row, "progress": progress, "friction": perturbations.friction, "mu": physics.model.shape_material_mu}
+            launch(plan_trials_kernel, worlds, *sources, row=progress.row, **planned, out=plan)
+            launch(kernels.begin_trials_kernel, worlds, *sources, physics.state, progress=progress)
+            given = {"progress": progress, "friction": perturbations.friction, "mu": physics.model.shape_material_mu}
             launch(kernels.set_friction_kernel, (worlds, simulation.layout.shapes_per_world), scene, course=self.course, **given)
             gripper.place_grippers(scene, simulation.state, simulation.attempts, plan, physics, simulation.behavior.law)
         simulation.tick(perceives=False)
-        given = {"course": self.course, "grasps": grasps, "labels": labels, "progress": progress, "done": self._done}
+        given = {"course": self.course, "grasps": grasps, "labels": labels, "progress": progress}
         launch(kernels.judge_trials_kernel, worlds, *sources, simulation.seals, physics.state, **given)
 
 

@@ -2,15 +2,17 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.render.images.layers import LayerScene, kernel_of_layer
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
+from synpick_warp.kernels.render.visibility.camera import camera_ray
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot
 
 
-@kernel_of_views
-def render_range_kernel(grid: ImageGrid, gbuffer: GBuffer, views: AnyViews, first: int, range_out: wp.array3d[wp.uint16]):
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if in_image(grid, row, column):
-        ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-        depth = wp.where(gbuffer.segment[view, row, column] != wp.uint8(0), gbuffer.depth[view, row, column], 0.0)
-        range_out[view, row, column] = wp.uint16(1000.0 * wp.length(ray) * depth + 0.5)
+@wp.func
+def range_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.uint16:
+    ray = camera_ray(shot.views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    depth = wp.where(shot.gbuffer.segment[view, row, column] != wp.uint8(0), shot.gbuffer.depth[view, row, column], 0.0)
+    return wp.uint16(1000.0 * wp.length(ray) * depth + 0.5)
+
+
+render_range_kernel = kernel_of_layer(range_at, "range", wp.uint16)

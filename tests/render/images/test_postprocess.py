@@ -17,9 +17,9 @@ from synpick_warp.codes import Effect, Tone, names
 from synpick_warp.configs.cell.sensors import Effects, effect_ranges
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ShadedImage, ViewBodies
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
@@ -27,6 +27,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_grid
+from synpick_warp.stages.render.view_setup import make_shot
 from synpick_warp.system.hardware.device import pick_device
 from tests.builders import refusal
 from tests.harness.aimed_views import aimed_views
@@ -79,7 +80,8 @@ def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops:
     image.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
     image.resolve = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
     batch = aimed_views(range(views), at.camera, 0, build_cameras((lens,) * 9, device), device)
-    PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views).process(world, batch, image, out)
+    shot = make_shot(scene, world.frames, ViewBodies(), GBuffer(), batch)  # type: ignore[arg-type]
+    PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views).process(shot, image, out)
     return out.color.numpy(), out.effects.numpy()
 
 

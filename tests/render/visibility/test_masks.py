@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +19,7 @@ from synpick_warp.exporters.bop.view import ViewSettings, make_view_task, rotati
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
 from synpick_warp.kernels.render.visibility.camera import CameraTable
+from synpick_warp.kernels.state import Frames, Snapshots
 from synpick_warp.scenes.cameras import CAMERA_KEYS
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
@@ -223,7 +224,7 @@ def sample_blocks(rows: int, columns: int, instances: int = 40, views: int = 3) 
 def test_device_lists_the_same_boundaries_as_numpy(device, shape):
     ids, masks = sample_blocks(*shape)
     lists = list_on_device(ids, masks, device)
-    counts, boundaries, run_counts, runs = (array.numpy() for array in vars(lists).values())
+    counts, boundaries, run_counts, runs = (getattr(lists, item.name).numpy() for item in fields(lists))
     assert counts[-1] == -1
     assert not run_counts[-1].any()
     for view in range(2):
@@ -253,7 +254,7 @@ def with_boundaries(batch, device):
     """The same views, with lists of run boundaries."""
     masks = np.stack([masks_of_batch(batch, view) for view in range(len(batch))])
     lists = list_on_device(*(np.concatenate((images, images[:1])) for images in (batch.instance, masks)), device)
-    return dataclasses.replace(batch, **{name: array.numpy()[:-1] for name, array in vars(lists).items()})
+    return dataclasses.replace(batch, **{item.name: getattr(lists, item.name).numpy()[:-1] for item in fields(lists)})
 
 
 def test_lists_that_overflowed_or_are_large_are_not_used(device):
@@ -306,21 +307,17 @@ def gather(device: wp.Device, rotation: np.ndarray, center: np.ndarray, entry: n
     cameras.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
     cameras.center = wp.array(center, dtype=wp.vec3d, device=device)
     index = np.arange(WORLDS, dtype=np.int32)
-    episode, frame = (wp.array(values, dtype=wp.int32, device=device) for values in (20 + index, 2 * index))
+    frames, snapshots = Frames(), Snapshots()
+    frames.episode, frames.frame = (wp.array(values, dtype=wp.int32, device=device) for values in (20 + index, 2 * index))
     cameras.to_world = wp.zeros(CAMERAS, dtype=wp.mat33, device=device)
     views = aimed_views(WORLD, CAMERA, ROOM, cameras, device)
     out = allocate(TruthBuffers, {"view": VIEWS, "instance": ROOM}, device)
-    outputs = [out.episode, out.camera, out.frame, out.intrinsics, out.world_to_camera]
-    wp.launch(gather_cameras_kernel, dim=VIEWS, inputs=[episode, frame, views], outputs=outputs, device=device)
-    inputs = [
-        wp.array(OBJECT_IDS, dtype=wp.int32, device=device),
-        wp.array(entry, dtype=wp.int32, device=device),
-        wp.array(pose, dtype=wp.transformf, device=device),
-        views,
-    ]
-    outputs = [out.object_id, out.pose, out.object_to_camera]
-    wp.launch(gather_objects_kernel, dim=(VIEWS, ROOM), inputs=inputs, outputs=outputs, device=device)
-    return {name: array.numpy() for name, array in vars(out).items()}
+    wp.launch(gather_cameras_kernel, dim=VIEWS, inputs=[frames, views], outputs=[out.bundle], device=device)
+    snapshots.catalog_index = wp.array(entry, dtype=wp.int32, device=device)
+    snapshots.pose = wp.array(pose, dtype=wp.transformf, device=device)
+    inputs = [wp.array(OBJECT_IDS, dtype=wp.int32, device=device), snapshots, views]
+    wp.launch(gather_objects_kernel, dim=(VIEWS, ROOM), inputs=inputs, outputs=[out.bundle], device=device)
+    return {item.name: getattr(out, item.name).numpy() for item in fields(out)}
 
 
 def test_a_camera_that_looks_down_from_two_metres(device):

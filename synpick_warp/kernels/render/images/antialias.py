@@ -10,16 +10,18 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     MASK_BITS,
+    AnyShot,
     GBuffer,
     Hit,
     Meshes,
-    Table,
+    ShadedImage,
     ViewBodies,
     body_of,
     face_normal,
@@ -67,18 +69,13 @@ which lies on both planes, would lend its colour to samples of the other face.""
 
 
 @wp.struct
-class ShadedImage:
-    """Linear radiance of a batch of views before post-processing, and for each pixel a resolve code: 0, it keeps its radiance, else packed
-    selectors of the pixels whose radiance its samples average.
-    """
+class FootprintLists:
+    """Work lists of the footprints to resolve, by chunk of tiles, and their numbers. Scratch."""
 
-    radiance: wp.array3d[wp.vec3]
-    """Linear radiance (view, row, column) before exposure; of anti-aliased pixels, that of the pixel's centre."""
-    resolve: wp.array3d[wp.uint32]
-    """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
-    SOURCE_BITS that select the pixel whose radiance it takes, see `source_offset`."""
-    samples: int
-    """Number of coverage samples per anti-aliased pixel: 4, 8 or 16, distributed equally over its quadrants."""
+    footprint: wp.array3d[int]
+    """(view, chunk, chunk_footprint): row * columns + column of each listed footprint, in any order."""
+    count: wp.array2d[int]
+    """(view, chunk): footprints in each list."""
 
 
 @wp.func
@@ -207,39 +204,28 @@ def has_discontinuity(
 
 
 @kernel_of_views
-def find_footprints_kernel(
-    # Scene:
-    grid: ImageGrid,
-    footprints: ImageGrid,
-    # In:
-    gbuffer: GBuffer,
-    radiance: wp.array3d[wp.vec3],  # (view, row, column)
-    views: AnyViews,
-    # Out:
-    resolve_out: wp.array3d[wp.uint32],  # (view, row, column)
-    footprint_out: wp.array3d[int],  # (view, chunk, chunk_footprint)
-    count_inout: wp.array2d[int],  # (view, chunk)
-):
-    """Find footprints with a geometric discontinuity and visible contrast, and list them by chunk of tiles, in any order.
+def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: ShadedImage, lists_inout: FootprintLists):
+    """Find footprints with a geometric discontinuity and visible contrast, and list them.
 
-    `footprint_out` receives row * columns + column of the grid `footprints`, `count_inout` is increased by the number of footprints, and
-    `resolve_out` is cleared to 0. Footprint (row, column) has pixel (row, column) as its lower right corner, and only one or two corners at
-    the image border. Launched over view, footprint, in tile order.
+    `count`, which must be 0, receives the numbers of footprints, and `resolve` is cleared to 0. Footprint (row, column) has pixel (row,
+    column) as its lower right corner, and only one or two corners at the image border. Launched over view, footprint, in tile order.
     """
+    grid = shot.grid
     view, row, column = tile_pixel(footprints, wp.tid())
     if not in_image(footprints, row, column):
         return
     if row < grid.height and column < grid.width:
-        resolve_out[view, row, column] = wp.uint32(0)
+        image_inout.resolve[view, row, column] = wp.uint32(0)
     top = wp.max(row - 1, 0)
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
-    if has_contrast(radiance, view, top, left, bottom, right):
-        if has_discontinuity(gbuffer, grid, views.cameras.intrinsics[view], view, top, left, bottom, right):
+    if has_contrast(image_inout.radiance, view, top, left, bottom, right):
+        if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
             chunk = tile_of(footprints, row, column) // CHUNK_TILES
-            footprint_out[view, chunk, wp.atomic_add(count_inout, view, chunk, 1)] = row * footprints.width + column
+            rank = wp.atomic_add(lists_inout.count, view, chunk, 1)
+            lists_inout.footprint[view, chunk, rank] = row * footprints.width + column
 
 
 @wp.func
@@ -267,16 +253,16 @@ VARIANTS["mask_width"] = SingleWordMask, MultiWordMask
 
 
 @wp.func
-def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
+def visible_bodies(shot: AnyShot, view: int, row: int, column: int) -> wp.uint64:
     """Bit mask, by body index, of the bodies that a footprint's corners show, if there are at most 64."""
     mask = wp.uint64(0)
     for corner in range(FOOTPRINT_PIXELS):
         # Clamped, a corner outside the image is another corner within it.
-        r = clamp_index(corner_row(row, corner), grid.height)
-        c = clamp_index(corner_column(column, corner), grid.width)
-        segment = int(gbuffer.segment[view, r, c])
+        r = clamp_index(corner_row(row, corner), shot.grid.height)
+        c = clamp_index(corner_column(column, corner), shot.grid.width)
+        segment = int(shot.gbuffer.segment[view, r, c])
         if segment != Segment.NOTHING and segment != Segment.TABLE:
-            mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, instances)))
+            mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, shot.views.instances)))
     return mask
 
 
@@ -296,12 +282,12 @@ def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint6
 
 
 @wp.func
-def visible_segments(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int) -> wp.vec4i:
+def visible_segments(shot: AnyShot, view: int, row: int, column: int) -> wp.vec4i:
     """Segmentation ids at a footprint's corners; a corner outside the image has that of another."""
     segments = wp.vec4i(0, 0, 0, 0)
     for corner in range(FOOTPRINT_PIXELS):
-        r = clamp_index(corner_row(row, corner), grid.height)
-        segments[corner] = int(gbuffer.segment[view, r, clamp_index(corner_column(column, corner), grid.width)])
+        r = clamp_index(corner_row(row, corner), shot.grid.height)
+        segments[corner] = int(shot.gbuffer.segment[view, r, clamp_index(corner_column(column, corner), shot.grid.width)])
     return segments
 
 
@@ -327,86 +313,60 @@ def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: w
 
 @wp.func
 def trace_visible(
-    mask_width: SingleWordMask,
-    meshes: Meshes,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    grid: ImageGrid,
-    view: int,
-    row: int,
-    column: int,
-    tile: int,
-    ray: wp.vec3,
-    instances: int,
+    mask_width: SingleWordMask, meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3
 ) -> Hit:
     """Closest hit of a coverage ray among the bodies that its footprint's corners show."""
-    visible = visible_bodies(gbuffer, grid, view, row, column, instances)
-    body_mask = filter_body_mask(bodies, view, tile, visible)
-    return trace_bodies(meshes, bodies, view, 0, body_mask, ray, instances, no_hit())
+    body_mask = filter_body_mask(shot.bodies, view, tile, visible_bodies(shot, view, row, column))
+    return trace_bodies(meshes, shot.bodies, view, 0, body_mask, ray, shot.views.instances, no_hit())
 
 
 @wp.func
 def trace_visible(  # noqa: F811
-    mask_width: MultiWordMask,
-    meshes: Meshes,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    grid: ImageGrid,
-    view: int,
-    row: int,
-    column: int,
-    tile: int,
-    ray: wp.vec3,
-    instances: int,
+    mask_width: MultiWordMask, meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3
 ) -> Hit:
     """Closest hit of a coverage ray among the bodies that its footprint's corners show, at most four.
 
     All are found before the first is traced, so that rays of a warp traverse BVHs at the same time.
     """
-    ranks, found = find_ranks(bodies, view, tile, mask_width.words, visible_segments(gbuffer, grid, view, row, column), instances)
+    instances = shot.views.instances
+    ranks, found = find_ranks(shot.bodies, view, tile, mask_width.words, visible_segments(shot, view, row, column), instances)
     hit = no_hit()
     for index in range(found):
         rank = int((ranks >> wp.uint32(RANK_BITS * index)) & RANK_MASK)
-        hit = trace_bodies(meshes, bodies, view, rank, wp.uint64(1), ray, instances, hit)
+        hit = trace_bodies(meshes, shot.bodies, view, rank, wp.uint64(1), ray, instances, hit)
     return hit
 
 
 @wp.func
 def select_source(
-    meshes: Meshes,
-    gbuffer: GBuffer,
-    grid: ImageGrid,
-    view: int,
-    row: int,
-    column: int,
-    mesh: int,
-    own: int,
-    offset: wp.vec2,
-    hit: Hit,
-    plane: Plane,
+    meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane
 ) -> int:
     """Corner of a footprint that matches a coverage ray's hit best: same body, least sum of plane distance, normal difference and distance.
 
+    Normals of background and table are not compared.
+
     Args:
-        mesh: Row of `Meshes` of the body that the ray hit; -1: background or table, whose normals are not compared.
         own: Corner whose pixel owns the sample; the result if no corner shows the body.
         offset: The sample [px from that pixel's centre].
         plane: Tangent plane of the hit, as seen from that pixel.
     """
+    mesh = int(-1)
+    if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:
+        mesh = shot.bodies.mesh[view, body_of(hit.segment, shot.views.instances)]
     best = own
     min_cost = float(wp.inf)
     for corner in range(FOOTPRINT_PIXELS):
         r = corner_row(row, corner)
         c = corner_column(column, corner)
-        if in_image(grid, r, c):
-            if int(gbuffer.segment[view, r, c]) == hit.segment:
+        if in_image(shot.grid, r, c):
+            if int(shot.gbuffer.segment[view, r, c]) == hit.segment:
                 down = corner // 2 - own // 2
                 right = corner % 2 - own % 2
                 cost = DISTANCE_WEIGHT * wp.length(wp.vec2(float(right) - offset[0], float(down) - offset[1]))
                 if hit.segment != Segment.NOTHING:
-                    cost += plane_distance(plane, down, right, gbuffer.depth[view, r, c]) / plane.width
+                    cost += plane_distance(plane, down, right, shot.gbuffer.depth[view, r, c]) / plane.width
                 if mesh >= 0:
-                    other = triangle_normal(meshes, mesh, gbuffer.triangle[view, r, c])
+                    other = triangle_normal(meshes, mesh, shot.gbuffer.triangle[view, r, c])
                     cost += NORMAL_WEIGHT * (1.0 - wp.dot(triangle_normal(meshes, mesh, hit.triangle), other))
                 if cost < min_cost:
                     min_cost = cost
@@ -416,38 +376,30 @@ def select_source(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def resolve_footprints_kernel(
-    # Scene:
-    meshes: Meshes,
-    table: Table,
-    grid: ImageGrid,
+    scene: PathScene,
     footprints: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    footprint: wp.array3d[int],  # (view, chunk, chunk_footprint)
-    count: wp.array2d[int],  # (view, chunk)
-    views: AnyViews,
-    samples: int,
+    shot: AnyShot,
+    lists: FootprintLists,
     threads: int,
     mask_width: AnyMaskWidth,
-    # Out:
-    resolve_inout: wp.array3d[wp.uint32],  # (view, row, column)
+    image_inout: ShadedImage,
 ):
     """Trace a coverage ray for each sample in the listed footprints, and select the pixel whose radiance the sample takes.
 
-    A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve_inout` receives the
+    A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve` receives the
     samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
     neighbouring threads take samples of one footprint, whose rays meet the same bodies. Launched over view, chunk, thread.
     """
     # Unsigned: cheaper to divide.
     thread = wp.uint32(wp.tid())
     place = thread // wp.uint32(threads)
-    chunks = wp.uint32(count.shape[1])
+    chunks = wp.uint32(lists.count.shape[1])
     view = int(place // chunks)
     chunk = int(place % chunks)
-    intrinsics = views.cameras.intrinsics[view]
-    for index in range(int(thread % wp.uint32(threads)), samples * count[view, chunk], threads):
-        cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
+    cameras, samples = shot.views.cameras, image_inout.samples
+    intrinsics = cameras.intrinsics[view]
+    for index in range(int(thread % wp.uint32(threads)), samples * lists.count[view, chunk], threads):
+        cell = wp.uint32(lists.footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
         row = int(cell // wp.uint32(footprints.width))
         column = int(cell % wp.uint32(footprints.width))
         # The footprint contains the lower right quadrant of its upper left corner pixel, and so on.
@@ -455,19 +407,16 @@ def resolve_footprints_kernel(
         own = QUADRANTS - 1 - int(wp.uint32(sample) // (wp.uint32(samples) // wp.uint32(QUADRANTS)))
         r = corner_row(row, own)
         c = corner_column(column, own)
-        if in_image(grid, r, c):
+        if in_image(shot.grid, r, c):
             offset = sample_offset(sample, samples)
-            ray = loop_ray(views.cameras, intrinsics, view, r, c, offset)
-            hit = trace_visible(mask_width, meshes, bodies, gbuffer, grid, view, row, column, tile_of(grid, r, c), ray, views.instances)
-            hit = hit_table(table, views.cameras, view, ray, hit)
+            ray = loop_ray(cameras, intrinsics, view, r, c, offset)
+            hit = trace_visible(mask_width, scene.meshes, shot, view, row, column, tile_of(shot.grid, r, c), ray)
+            hit = hit_table(scene.table, cameras, view, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
-                normal = wp.transpose(views.cameras.to_world[view]) * face_normal(meshes, bodies, view, hit, views.instances)
-            plane = tangent_plane(views.cameras, intrinsics, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
+                normal = wp.transpose(cameras.to_world[view]) * face_normal(scene.meshes, shot, view, hit)
+            plane = tangent_plane(cameras, intrinsics, view, r, c, wp.uint8(hit.segment), hit.depth, normal)
             # The plane passes through the hit of the sample's ray, not through the pixel's centre.
             plane.height = hit.depth * wp.dot(normal, ray)
-            mesh = int(-1)
-            if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:
-                mesh = bodies.mesh[view, body_of(hit.segment, views.instances)]
-            best = select_source(meshes, gbuffer, grid, view, row, column, mesh, own, offset, hit, plane)
-            wp.atomic_or(resolve_inout, view, r, c, wp.uint32(best ^ own) << wp.uint32(SOURCE_BITS * sample))
+            best = select_source(scene.meshes, shot, view, row, column, own, offset, hit, plane)
+            wp.atomic_or(image_inout.resolve, view, r, c, wp.uint32(best ^ own) << wp.uint32(SOURCE_BITS * sample))

@@ -3,8 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, border_ray, in_image
-from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, border_ray, in_image
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.masks import ROWS, InstanceMasks, count_words, read_mask
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
@@ -24,21 +24,27 @@ LOWER_HALF = wp.constant(wp.uint64(0xFFFFFFFF))
 """Shift of the upper, and mask of the lower, of the two 32-bit counters packed in `BorderBoxes.length`."""
 
 
+@wp.struct
+class BoxesCounts:
+    """Pixel counts and boxes of every instance."""
+
+    pixels: wp.array3d[int]
+    """(view, instance, count)."""
+    boxes: wp.array4d[int]
+    """(view, instance, box, side)."""
+
+
 @wp.kernel
-def clear_boxes_counts_kernel(
-    # Out:
-    pixels_out: wp.array3d[int],  # (view, instance, count)
-    boxes_out: wp.array4d[int],  # (view, instance, box, side)
-):
+def clear_boxes_counts_kernel(counts_out: BoxesCounts):
     """Set pixel counts to 0 and boxes to inverted ones, which hold no pixel. Launched over view, instance."""
     view, instance = wp.tid()
     for i in range(3):
-        pixels_out[view, instance, i] = 0
+        counts_out.pixels[view, instance, i] = 0
     for i in range(2):
-        boxes_out[view, instance, i, 0] = UNSET
-        boxes_out[view, instance, i, 1] = UNSET
-        boxes_out[view, instance, i, 2] = -UNSET
-        boxes_out[view, instance, i, 3] = -UNSET
+        counts_out.boxes[view, instance, i, 0] = UNSET
+        counts_out.boxes[view, instance, i, 1] = UNSET
+        counts_out.boxes[view, instance, i, 2] = -UNSET
+        counts_out.boxes[view, instance, i, 3] = -UNSET
 
 
 @wp.func
@@ -70,12 +76,11 @@ def count_image_pixels_kernel(
     masks: InstanceMasks,
     threads: int,
     # Out:
-    pixels_inout: wp.array3d[int],  # (view, instance, count)
-    boxes_inout: wp.array4d[int],  # (view, instance, box, side)
+    counts_inout: BoxesCounts,
 ):
     """Count an instance's pixels inside the image and extend its boxes: reduction in registers, then one atomic operation per thread.
 
-    `pixels_inout` is increased by the three counts, `boxes_inout` is extended by the amodal and the visible pixels. Launched over view,
+    `pixels` is increased by the three counts, `boxes` is extended by the amodal and the visible pixels. Launched over view,
     instance, thread: `threads` threads stride over the words of an instance's mask.
     """
     view, instance, thread = wp.tid()
@@ -102,12 +107,12 @@ def count_image_pixels_kernel(
             word = word >> wp.uint32(1)
             row += 1
     if amodal > 0:
-        wp.atomic_add(pixels_inout, view, instance, ALL, amodal)
-        wp.atomic_add(pixels_inout, view, instance, VALID, valid)
-        merge_box(boxes_inout, view, instance, AMODAL_BOX, amodal_box)
+        wp.atomic_add(counts_inout.pixels, view, instance, ALL, amodal)
+        wp.atomic_add(counts_inout.pixels, view, instance, VALID, valid)
+        merge_box(counts_inout.boxes, view, instance, AMODAL_BOX, amodal_box)
     if visible > 0:
-        wp.atomic_add(pixels_inout, view, instance, VISIBLE, visible)
-        merge_box(boxes_inout, view, instance, VISIBLE_BOX, visible_box)
+        wp.atomic_add(counts_inout.pixels, view, instance, VISIBLE, visible)
+        merge_box(counts_inout.boxes, view, instance, VISIBLE_BOX, visible_box)
 
 
 @wp.struct
@@ -167,25 +172,14 @@ def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
 
 @kernel_of_views
 def count_border_pixels_kernel(
-    # Scene:
-    meshes: Meshes,
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    views: AnyViews,
-    border_boxes: BorderBoxes,
-    groups: int,
-    threads: int,
-    chunk: int,
-    # Out:
-    pixels_inout: wp.array3d[int],  # (view, instance, count)
-    boxes_inout: wp.array4d[int],  # (view, instance, box, side)
+    meshes: Meshes, shot: AnyShot, border_boxes: BorderBoxes, groups: int, threads: int, chunk: int, counts_inout: BoxesCounts
 ):
     """Count amodal pixels outside the image, up to one image size beyond each border, by a ray per pixel of the listed boxes.
 
     Groups of `threads` threads stride over the chunks: one object near the camera has more pixels than all others of a batch.
-    `pixels_inout` is increased by the amodal count, `boxes_inout` is extended in its amodal box. Launched over group, thread.
+    `pixels` is increased by the amodal count, `boxes` is extended in its amodal box. Launched over group, thread.
     """
+    views, bodies = shot.views, shot.bodies
     group, thread = wp.tid()
     length = border_boxes.length[0]
     for index in range(group, int(length & LOWER_HALF), groups):
@@ -201,24 +195,21 @@ def count_border_pixels_kernel(
         for i in range(begin + thread, wp.min(begin + chunk, box_pixels(box)), threads):
             row = box[1] + i // columns
             column = box[0] + i % columns
-            if not in_image(grid, row, column):
+            if not in_image(shot.grid, row, column):
                 if hits_body(meshes, bodies, view, instance, border_ray(views.cameras, intrinsics, view, row, column)):
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:
-            wp.atomic_add(pixels_inout, view, instance, ALL, amodal)
-            merge_box(boxes_inout, view, instance, AMODAL_BOX, amodal_box)
+            wp.atomic_add(counts_inout.pixels, view, instance, ALL, amodal)
+            merge_box(counts_inout.boxes, view, instance, AMODAL_BOX, amodal_box)
 
 
 @wp.kernel
-def reset_empty_boxes_kernel(
-    # Out:
-    boxes_inout: wp.array4d[int],  # (view, instance, box, side)
-):
+def reset_empty_boxes_kernel(counts_inout: BoxesCounts):
     """Set boxes without pixels to (0, 0, -1, -1). Launched over view, instance, box."""
     view, instance, box = wp.tid()
-    if boxes_inout[view, instance, box, 2] < boxes_inout[view, instance, box, 0]:
-        boxes_inout[view, instance, box, 0] = 0
-        boxes_inout[view, instance, box, 1] = 0
-        boxes_inout[view, instance, box, 2] = -1
-        boxes_inout[view, instance, box, 3] = -1
+    if counts_inout.boxes[view, instance, box, 2] < counts_inout.boxes[view, instance, box, 0]:
+        counts_inout.boxes[view, instance, box, 0] = 0
+        counts_inout.boxes[view, instance, box, 1] = 0
+        counts_inout.boxes[view, instance, box, 2] = -1
+        counts_inout.boxes[view, instance, box, 3] = -1

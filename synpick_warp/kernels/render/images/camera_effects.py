@@ -1,12 +1,12 @@
-"""Camera effects: per-view parameters sampled from ranges (domain randomization), and the lens and sensor models that use them."""
+"""Parameters of sensors, and camera effects: sampled for each view from ranges (domain randomization), with the lens and sensor models that
+use them."""
 
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream
-from synpick_warp.kernels.render.visibility.camera import AnyViews
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
-from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,8 +15,6 @@ EffectParameters = wp.types.vector(length=11, dtype=float)
 noise, JPEG quality, contrast, saturation; zero: off."""
 BLUR_REACH = wp.constant(3.0)
 """The blur kernel is cut at this many standard deviations: 0.3 % of a Gaussian lie beyond."""
-
-
 LUMA = wp.constant(wp.vec3(0.299, 0.587, 0.114))
 """Weights of red, green and blue in luma (ITU-R BT.601)."""
 
@@ -33,13 +31,74 @@ class EffectRanges:
     """Largest value of each parameter."""
 
 
+@wp.struct
+class SensorParameters:
+    """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
+    lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
+    and noise. See configs.cell.sensors.DepthSensor.
+    """
+
+    seed: wp.uint64
+    """Seed of the bake."""
+    baseline: float
+    """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
+    disparity_step: float
+    """Quantization step of disparity [px]."""
+    disparity_noise: float
+    """Standard deviation of disparity [px]."""
+    max_disparity: float
+    """Largest disparity that is measured [px]; 0: any."""
+    near: float
+    far: float
+    """Measuring range of depth [m]."""
+    noise: float
+    """Axial noise at `noise_distance` [m]."""
+    noise_growth: float
+    """Growth of axial noise with the square of depth [1/m]."""
+    noise_distance: float
+    """Depth of least noise [m]."""
+    noise_angle: float
+    """Growth of axial noise with the angle of incidence [m^1.5]."""
+    lateral_noise: float
+    """Standard deviation of the pixel that is measured instead [px]."""
+    noise_width: int
+    """Distance of the lattice points between which noise is interpolated [px]; 1: each pixel has its own."""
+    grazing_cosine: float
+    """Cosine of the largest angle of incidence that is measured."""
+    edge_width: int
+    """Half width of the matching window [px]."""
+    edge_step: float
+    """Disparity difference within the window that invalidates a pixel [px]."""
+    shadows: int
+    """1: pixels that the projector does not light, or the infrared camera does not see, are invalid."""
+    registration: float
+    """Place on the baseline of the camera of the depth image: 0 that of the infrared camera, 1 that of the projector."""
+    counts_per_meter: float
+    """Depth counts in a metre."""
+    projector: float
+    """From the left camera to the projector of dots, to the right [m]."""
+    dot_spacing: float
+    """Width of a cell of the pattern, which has one dot [px]."""
+    dot_brightness: float
+    """Brightness of dots on a white surface at 1 m, relative to full scale."""
+    ambient: float
+    """Brightness of ambient infrared light, relative to that of colour images."""
+    infrared_noise: float
+    """Standard deviation of infrared images, relative to full scale."""
+
+
+@wp.func
+def shot_key(seed: wp.uint64, shot: AnyShot, view: int, stream: int) -> wp.uint64:
+    """Key of the random number stream (seed, episode, frame, camera, stream) of a view."""
+    world = shot.views.world[view]
+    return view_key(seed, shot.snapshot.episode[world], shot.snapshot.frame[world], shot.views.camera[view], stream)
+
+
 @kernel_of_views
 def sample_effects_kernel(
-    # State:
-    snapshot: Frames,
     # In:
     ranges: EffectRanges,
-    views: AnyViews,
+    shot: AnyShot,
     # Out:
     effects_out: wp.array[EffectParameters],  # (view)
 ):
@@ -49,8 +108,7 @@ def sample_effects_kernel(
     view.
     """
     view = wp.tid()
-    world = views.world[view]
-    key = view_key(ranges.seed, snapshot.episode[world], snapshot.frame[world], views.camera[view], Stream.EFFECTS)
+    key = shot_key(ranges.seed, shot, view, Stream.EFFECTS)
     parameters = EffectParameters()
     for index in range(wp.static(len(Effect))):
         parameters[index] = ranges.low[index] + (ranges.high[index] - ranges.low[index]) * uniform(key, index)

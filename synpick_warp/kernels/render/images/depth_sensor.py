@@ -3,13 +3,12 @@
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
-from synpick_warp.kernels.render.images.layers import hit_surface
-from synpick_warp.kernels.render.lighting.materials import AnySurfaces
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, GBuffer, Meshes, ViewBodies
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
-from synpick_warp.kernels.state import Frames
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters, shot_key
+from synpick_warp.kernels.render.images.layers import LayerScene, hit_surface, kernel_of_layer
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray
+from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, AnyShot, GBuffer, ViewBodies
+from synpick_warp.kernels.rng import normal_pair, pixel_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,62 +20,6 @@ MIN_DEPTH = wp.constant(1.0e-3)
 """Smallest depth of a body that is used for a search range [m]: bodies may reach behind the camera."""
 
 
-@wp.struct
-class SensorParameters:
-    """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
-    lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
-    and noise. See configs.cell.sensors.DepthSensor.
-    """
-
-    seed: wp.uint64
-    """Seed of the bake."""
-    baseline: float
-    """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
-    disparity_step: float
-    """Quantization step of disparity [px]."""
-    disparity_noise: float
-    """Standard deviation of disparity [px]."""
-    max_disparity: float
-    """Largest disparity that is measured [px]; 0: any."""
-    near: float
-    far: float
-    """Measuring range of depth [m]."""
-    noise: float
-    """Axial noise at `noise_distance` [m]."""
-    noise_growth: float
-    """Growth of axial noise with the square of depth [1/m]."""
-    noise_distance: float
-    """Depth of least noise [m]."""
-    noise_angle: float
-    """Growth of axial noise with the angle of incidence [m^1.5]."""
-    lateral_noise: float
-    """Standard deviation of the pixel that is measured instead [px]."""
-    noise_width: int
-    """Distance of the lattice points between which noise is interpolated [px]; 1: each pixel has its own."""
-    grazing_cosine: float
-    """Cosine of the largest angle of incidence that is measured."""
-    edge_width: int
-    """Half width of the matching window [px]."""
-    edge_step: float
-    """Disparity difference within the window that invalidates a pixel [px]."""
-    shadows: int
-    """1: pixels that the projector does not light, or the infrared camera does not see, are invalid."""
-    registration: float
-    """Place on the baseline of the camera of the depth image: 0 that of the infrared camera, 1 that of the projector."""
-    counts_per_meter: float
-    """Depth counts in a metre."""
-    projector: float
-    """From the left camera to the projector of dots, to the right [m]."""
-    dot_spacing: float
-    """Width of a cell of the pattern, which has one dot [px]."""
-    dot_brightness: float
-    """Brightness of dots on a white surface at 1 m, relative to full scale."""
-    ambient: float
-    """Brightness of ambient infrared light, relative to that of colour images."""
-    infrared_noise: float
-    """Standard deviation of infrared images, relative to full scale."""
-
-
 @wp.func
 def disparity_at(gbuffer: GBuffer, focal_baseline: float, view: int, row: int, column: int) -> float:
     """Disparity of a pixel's surface d = f b / z [px], 0 without surface; `focal_baseline` is f b [px m]."""
@@ -86,19 +29,17 @@ def disparity_at(gbuffer: GBuffer, focal_baseline: float, view: int, row: int, c
 
 
 @wp.func
-def near_discontinuity(
-    gbuffer: GBuffer, grid: ImageGrid, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int
-) -> bool:
+def near_discontinuity(shot: AnyShot, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int) -> bool:
     """Edge invalidation: True if disparities within the matching window differ by more than the threshold from the centre's.
 
     A window over two surfaces has no match, or that of the wrong surface.
     """
-    here = disparity_at(gbuffer, focal_baseline, view, row, column)
+    here = disparity_at(shot.gbuffer, focal_baseline, view, row, column)
     for down in range(-sensor.edge_width, sensor.edge_width + 1):
         for right in range(-sensor.edge_width, sensor.edge_width + 1):
-            at_row = wp.clamp(row + down, 0, grid.height - 1)
-            at_column = wp.clamp(column + right, 0, grid.width - 1)
-            if wp.abs(disparity_at(gbuffer, focal_baseline, view, at_row, at_column) - here) > sensor.edge_step:
+            at_row = wp.clamp(row + down, 0, shot.grid.height - 1)
+            at_column = wp.clamp(column + right, 0, shot.grid.width - 1)
+            if wp.abs(disparity_at(shot.gbuffer, focal_baseline, view, at_row, at_column) - here) > sensor.edge_step:
                 return True
     return False
 
@@ -114,39 +55,35 @@ def min_body_depth(bodies: ViewBodies, view: int) -> float:
 
 
 @wp.func
-def is_occluded(
-    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, focal_baseline: float, side: int, view: int, row: int, column: int
-) -> bool:
+def is_occluded(shot: AnyShot, focal_baseline: float, side: int, view: int, row: int, column: int) -> bool:
     """Shadow test against a second viewpoint at the camera's right (`side` 1) or left (-1): True if a surface in the same row occludes it.
 
     The column of a pixel in the second view is its own column minus `side` times its disparity. A pixel k columns to that side whose
     disparity is larger by k lies on the same ray and is nearer. The largest disparity of any body bounds the search.
     """
-    here = disparity_at(gbuffer, focal_baseline, view, row, column)
-    max_difference = focal_baseline / wp.max(min_body_depth(bodies, view), MIN_DEPTH) - here
-    space = grid.width - 1 - column
+    here = disparity_at(shot.gbuffer, focal_baseline, view, row, column)
+    max_difference = focal_baseline / wp.max(min_body_depth(shot.bodies, view), MIN_DEPTH) - here
+    space = shot.grid.width - 1 - column
     if side < 0:
         space = column
     reach = wp.min(int(wp.ceil(max_difference)), space)
     for away in range(1, reach + 1):
-        difference = disparity_at(gbuffer, focal_baseline, view, row, column + side * away) - here
+        difference = disparity_at(shot.gbuffer, focal_baseline, view, row, column + side * away) - here
         if wp.abs(difference - float(away)) <= SAME_RAY:
             return True
     return False
 
 
 @wp.func
-def in_shadow(
-    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int
-) -> bool:
+def in_shadow(shot: AnyShot, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int) -> bool:
     """True if the projector, at the right of the depth image's camera, or the infrared camera, at its left, does not see a pixel's
     surface."""
     to_projector = focal_baseline * (1.0 - sensor.registration)
-    if is_occluded(gbuffer, bodies, grid, to_projector, 1, view, row, column):
+    if is_occluded(shot, to_projector, 1, view, row, column):
         return True
     if sensor.registration == 0.0:
         return False
-    return is_occluded(gbuffer, bodies, grid, focal_baseline * sensor.registration, -1, view, row, column)
+    return is_occluded(shot, focal_baseline * sensor.registration, -1, view, row, column)
 
 
 @wp.func
@@ -200,58 +137,38 @@ def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float
     return focal_baseline / (steps * sensor.disparity_step)
 
 
-@kernel_of_views
-def render_depth_sensor_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    grid: ImageGrid,
-    # State:
-    snapshot: Frames,
-    # In:
-    sensor: SensorParameters,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    depth_sensor_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
-):
+@wp.func
+def sensor_depth_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.uint16:
     """Simulate a structured-light depth image: disparity d = f b / (z + σ n) + σ' n', rounded to steps; n and n' are standard normal.
 
-    z is the depth of a pixel displaced by lateral noise, σ its axial noise, σ' the noise of disparity. `depth_sensor_out` receives f b / d
-    in counts, 0 for invalid pixels (holes): no surface, grazing incidence, depth discontinuities, shadow of the projector or of the
-    infrared camera, outside of the measuring range. n and n' are of the random number stream (seed, episode, frame, camera, DEPTH_NOISE)
-    and the pixel, or the lattice points around it, so each image has noise of its own. Launched over view, pixel (tile order, from flat
-    index `first` on).
+    z is the depth of a pixel displaced by lateral noise, σ its axial noise, σ' the noise of disparity. The result is f b / d in counts, 0
+    for invalid pixels (holes): no surface, grazing incidence, depth discontinuities, shadow of the projector or of the infrared camera,
+    outside of the measuring range. n and n' are of the random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, or
+    the lattice points around it, so each image has noise of its own.
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    depth_sensor_out[view, row, column] = wp.uint16(0)
-    camera = views.camera[view]
-    world = views.world[view]
-    key = view_key(sensor.seed, snapshot.episode[world], snapshot.frame[world], camera, Stream.DEPTH_NOISE)
+    sensor, grid, cameras = layer.sensor, shot.grid, shot.views.cameras
+    key = shot_key(sensor.seed, shot, view, Stream.DEPTH_NOISE)
     displacement = sensor.lateral_noise * lattice_normals(key, grid, sensor.noise_width, row, column, 0)
     at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
     at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
-    if int(gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
-        return
-    intrinsics = views.cameras.intrinsics[view]
-    focal_baseline = intrinsics[0] * sensor.baseline
-    depth = gbuffer.depth[view, at_row, at_column]
-    surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, at_row, at_column, views.instances)
-    ray = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, at_row, at_column, wp.vec2(0.0, 0.0)))
+    if int(shot.gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
+        return wp.uint16(0)
+    focal_baseline = cameras.intrinsics[view][0] * sensor.baseline
+    depth = shot.gbuffer.depth[view, at_row, at_column]
+    surface = hit_surface(scene, shot, view, at_row, at_column)
+    ray = wp.normalize(cameras.to_world[view] * camera_ray(cameras, view, at_row, at_column, wp.vec2(0.0, 0.0)))
     cosine = wp.abs(wp.dot(surface.face_normal, ray))
     if cosine < sensor.grazing_cosine:
-        return
-    if near_discontinuity(gbuffer, grid, sensor, focal_baseline, view, at_row, at_column):
-        return
+        return wp.uint16(0)
+    if near_discontinuity(shot, sensor, focal_baseline, view, at_row, at_column):
+        return wp.uint16(0)
     if sensor.shadows != 0:
-        if in_shadow(gbuffer, bodies, grid, sensor, focal_baseline, view, at_row, at_column):
-            return
+        if in_shadow(shot, sensor, focal_baseline, view, at_row, at_column):
+            return wp.uint16(0)
     noise = lattice_normals(key, grid, sensor.noise_width, row, column, 2)
     noisy = depth + axial_noise(sensor, depth, cosine) * noise[0]
     counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy, noise[1]))
-    if counts <= MAX_COUNTS:
-        depth_sensor_out[view, row, column] = wp.uint16(counts)
+    return wp.uint16(wp.where(counts <= MAX_COUNTS, counts, 0.0))
+
+
+render_depth_sensor_kernel = kernel_of_layer(sensor_depth_at, "depth_sensor", wp.uint16)

@@ -6,6 +6,7 @@ from synpick_warp.kernels.render.images.layers import position_of, rotation_of
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.masks import InstanceMasks, has_pixel, read_mask
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+from synpick_warp.kernels.state import Frames, Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
@@ -28,30 +29,40 @@ def rigid_transform(r: wp.mat33d, t: wp.vec3d) -> wp.mat44:
     )  # fmt: skip
 
 
+@wp.struct
+class ViewTruth:
+    """Ground truth of a batch of views, beside what the renderer writes."""
+
+    episode: wp.array[int]
+    """(view): episode index."""
+    camera: wp.array[int]
+    """(view): camera index."""
+    frame: wp.array[int]
+    """(view): frame index within the episode, from 0."""
+    object_id: wp.array2d[int]
+    """(view, instance): obj_id; -1: the instance is not in the scene; below: a distractor, without label."""
+    pose: wp.array2d[wp.transform]
+    """(view, instance): object to world: x, y, z, quaternion x, y, z, w [m]."""
+    object_to_camera: wp.array2d[wp.mat44]
+    """(view, instance): object to camera, OpenCV's axes [m]."""
+    intrinsics: wp.array[wp.mat33]
+    """(view): camera matrix K; the centre of pixel (row, column) is (column + 0.5, row + 0.5) [px]."""
+    world_to_camera: wp.array[wp.mat44]
+    """(view): extrinsics [m]."""
+
+
 @kernel_of_views
-def gather_cameras_kernel(
-    # State:
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
-    # In:
-    views: AnyViews,
-    # Out:
-    episode_out: wp.array[int],  # (view)
-    camera_out: wp.array[int],  # (view)
-    frame_out: wp.array[int],  # (view)
-    intrinsics_out: wp.array[wp.mat33],  # (view) [px]
-    world_to_camera_out: wp.array[wp.mat44],  # (view) [m]
-):
+def gather_cameras_kernel(snapshot: Frames, views: AnyViews, truth_out: ViewTruth):
     """Gather what belongs to a view as a whole: episode, camera and frame index, camera matrix and extrinsics. Launched over view."""
     view = wp.tid()
     world = views.world[view]
     camera = views.camera[view]
-    episode_out[view] = episode[world]
-    camera_out[view] = camera
-    frame_out[view] = frame[world]
-    intrinsics_out[view] = camera_matrix(views.cameras.intrinsics[view])
+    truth_out.episode[view] = snapshot.episode[world]
+    truth_out.camera[view] = camera
+    truth_out.frame[view] = snapshot.frame[world]
+    truth_out.intrinsics[view] = camera_matrix(views.cameras.intrinsics[view])
     rotation = views.cameras.rotation[view]
-    world_to_camera_out[view] = rigid_transform(rotation, -(rotation * views.cameras.center[view]))
+    truth_out.world_to_camera[view] = rigid_transform(rotation, -(rotation * views.cameras.center[view]))
 
 
 @kernel_of_views
@@ -59,14 +70,11 @@ def gather_objects_kernel(
     # Scene:
     object_ids: wp.array[int],  # (entry)
     # State:
-    catalog_index: wp.array2d[int],  # (world, instance)
-    pose: wp.array2d[wp.transform],  # (world, instance) [m]
+    snapshot: Snapshots,
     # In:
     views: AnyViews,
     # Out:
-    object_id_out: wp.array2d[int],  # (view, instance)
-    pose_out: wp.array2d[wp.transform],  # (view, instance) [m]
-    object_to_camera_out: wp.array2d[wp.mat44],  # (view, instance) [m]
+    truth_out: ViewTruth,
 ):
     """Gather obj_id and pose of each instance: object to world as simulated, object to camera computed in float64.
 
@@ -74,18 +82,18 @@ def gather_objects_kernel(
     """
     view, instance = wp.tid()
     world = views.world[view]
-    entry = catalog_index[world, instance]
+    entry = snapshot.catalog_index[world, instance]
     if entry < 0:
-        object_id_out[view, instance] = -1
-        pose_out[view, instance] = wp.transform_identity()
-        object_to_camera_out[view, instance] = wp.identity(n=4, dtype=float)
+        truth_out.object_id[view, instance] = -1
+        truth_out.pose[view, instance] = wp.transform_identity()
+        truth_out.object_to_camera[view, instance] = wp.identity(n=4, dtype=float)
         return
-    body = pose[world, instance]
+    body = snapshot.pose[world, instance]
     rotation = views.cameras.rotation[view]
-    object_id_out[view, instance] = object_ids[entry]
-    pose_out[view, instance] = body
+    truth_out.object_id[view, instance] = object_ids[entry]
+    truth_out.pose[view, instance] = body
     position = rotation * (position_of(body) - views.cameras.center[view])
-    object_to_camera_out[view, instance] = rigid_transform(rotation * rotation_of(body), position)
+    truth_out.object_to_camera[view, instance] = rigid_transform(rotation * rotation_of(body), position)
 
 
 @wp.kernel

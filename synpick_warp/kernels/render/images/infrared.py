@@ -6,7 +6,7 @@ The left camera is the view's own, whose G-buffer is read; rays of the right one
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
-from synpick_warp.kernels.render.images.depth_sensor import SensorParameters
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters, shot_key
 from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, make_brdf
 from synpick_warp.kernels.render.lighting.color import luminance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
@@ -21,11 +21,10 @@ from synpick_warp.kernels.render.lighting.materials import (
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, body_of, read_hit
+from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, ViewBodies, body_of, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
-from synpick_warp.kernels.state import Frames
+from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False})
@@ -59,12 +58,12 @@ def dot_pattern(column: float, row: float, spacing: float) -> float:
 
 
 @wp.func
-def right_camera_hit(scene: AnyScene, bodies: ViewBodies, views: AnyViews, view: int, ray: wp.vec3, baseline: float) -> Hit:
+def right_camera_hit(scene: AnyScene, shot: AnyShot, view: int, ray: wp.vec3, baseline: float) -> Hit:
     """Closest hit of a ray of the right camera, with planar depth."""
-    cameras = views.cameras
+    cameras = shot.views.cameras
     origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(baseline, 0.0, 0.0)
     direction = wp.normalize(cameras.to_world[view] * ray)
-    hit = trace_ray(scene.meshes, scene.table, bodies, view, views.instances, origin, direction)
+    hit = trace_ray(scene.meshes, scene.table, shot.bodies, view, shot.views.instances, origin, direction)
     hit.depth = hit.depth / wp.length(ray)
     return hit
 
@@ -110,14 +109,9 @@ def seen_surface(
 def render_infrared_kernel(
     # Scene:
     scene: AnyScene,
-    grid: ImageGrid,
-    # State:
-    snapshot: Frames,
     # In:
     sensor: SensorParameters,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
+    shot: AnyShot,
     eye: int,
     first: int,
     # Out:
@@ -129,34 +123,35 @@ def render_infrared_kernel(
     the random number stream (seed, episode, frame, camera, INFRARED_NOISE), eye and pixel. Launched over view, pixel (tile order, from flat
     index `first` on).
     """
+    grid, cameras = shot.grid, shot.views.cameras
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    world = views.world[view]
-    which = snapshot.light[world]
-    yaw = snapshot.light_yaw[world]
-    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(views.cameras.to_world[view] * ray)
+    world = shot.views.world[view]
+    which = shot.snapshot.light[world]
+    yaw = shot.snapshot.light_yaw[world]
+    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(cameras.to_world[view] * ray)
     offset = wp.where(eye == 0, 0.0, sensor.baseline)
     hit = Hit()
     if eye == 0:
-        hit = read_hit(gbuffer, view, row, column)
+        hit = read_hit(shot.gbuffer, view, row, column)
     else:
-        hit = right_camera_hit(scene, bodies, views, view, ray, offset)
+        hit = right_camera_hit(scene, shot, view, ray, offset)
     radiance = float(0.0)
     dots = float(0.0)
     if hit.segment == Segment.NOTHING:
         radiance = luminance(environment_radiance(scene.lights, which, rotate_z(-outgoing, -yaw)))
     else:
         point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
-        surface = seen_surface(scene, bodies, views.cameras, view, hit, point, outgoing, views.instances)
+        surface = seen_surface(scene, shot.bodies, cameras, view, hit, point, outgoing, shot.views.instances)
         roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
         color = sample_base_color(scene.surfaces, surface)
         brdf = make_brdf(scene.surfaces.albedo, color, scene.surfaces.metallic[surface.row], roughness, surface.normal, outgoing)
         ambient = unoccluded_light(scene.lights, which, yaw, brdf)
         radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
-        dots = dot_light(scene, sensor, bodies, views, view, point, surface, brdf)
-    key = view_key(sensor.seed, snapshot.episode[world], snapshot.frame[world], views.camera[view], Stream.INFRARED_NOISE)
+        dots = dot_light(scene, sensor, shot.bodies, shot.views, view, point, surface, brdf)
+    key = shot_key(sensor.seed, shot, view, Stream.INFRARED_NOISE)
     noise = normal_pair(pixel_key(key, (eye * grid.height + row) * grid.width + column), 0)[0]
     value = sensor.ambient * scene.lights.exposure[which] * radiance + dots + sensor.infrared_noise * noise
     image_out[view, row, column] = wp.uint8(wp.rint(255.0 * wp.clamp(value, 0.0, 1.0)))

@@ -3,30 +3,26 @@
 `synpick_warp.views.layers` has the table of layers, and says what to touch to add one.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.materials import (
-    AnySurfaces,
-    Surface,
-    interpolate_surface,
-    make_table_surface,
-    map_table,
-    sample_base_color,
-)
+from synpick_warp.kernels.render.lighting.materials import Surface, interpolate_surface, make_table_surface, map_table, sample_base_color
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.visibility.camera import (
     NEAR_PLANE,
-    AnyCameras,
     AnyViews,
-    ImageGrid,
     camera_ray,
     hit_position,
     in_image,
     lens_of,
     tile_pixel,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, body_of
 from synpick_warp.kernels.render.visibility.lens import distort
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.state import Snapshots
@@ -115,168 +111,136 @@ def compute_motions_kernel(
     motions_out.displacement[view, body] = wp.vec3(displacement)
 
 
+@wp.struct
+class SuctionScene:
+    """Radius of the suction cup, and centres of mass of the catalog's objects. Constant."""
+
+    radius: float
+    """[m]"""
+    center_of_mass: wp.array[wp.vec3]
+    """(entry): in the object's frame [m]."""
+
+
+@wp.struct
+class LayerScene:
+    """What layers need beside the renderer's scene and views."""
+
+    obj_id: wp.array[int]
+    """(entry): obj_id of the catalog's objects; negative: without label."""
+    suction: SuctionScene
+    sensor: SensorParameters
+    motions: BodyMotions
+    follows: wp.array[int]
+    """(world): as in `Snapshots`."""
+
+
+def kernel_of_layer(value: wp.Function, name: str, dtype: Any) -> Callable[..., None]:
+    """Kernel that writes a function of the pixel to the image of the layer `name`. Launched over view, pixel (tile order, from flat index
+    `first` on)."""
+
+    @kernel_of_views(name=f"render_{name}_kernel")
+    def render_layer_kernel(
+        # Scene:
+        scene: AnyScene,
+        layer: LayerScene,
+        # In:
+        shot: AnyShot,
+        first: int,
+        # Out:
+        image_out: wp.array3d[dtype],  # (view, row, column)
+    ):
+        """Layer of which `value` is the law."""
+        view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+        if in_image(shot.grid, row, column):
+            image_out[view, row, column] = value(scene, layer, shot, view, row, column)
+
+    return render_layer_kernel
+
+
 @wp.func
-def hit_surface(
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    cameras: AnyCameras,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    view: int,
-    row: int,
-    column: int,
-    instances: int,
-) -> Surface:
+def hit_surface(scene: AnyScene, shot: AnyShot, view: int, row: int, column: int) -> Surface:
     """Surface attributes of a pixel's primary hit, from the G-buffer; the pixel must show a body or the table."""
+    cameras = shot.views.cameras
     ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
     to_camera = -wp.normalize(cameras.to_world[view] * ray)
-    segment = int(gbuffer.segment[view, row, column])
-    depth = gbuffer.depth[view, row, column]
+    segment = int(shot.gbuffer.segment[view, row, column])
+    depth = shot.gbuffer.depth[view, row, column]
     width = depth / cameras.intrinsics[view][0]
     if segment == Segment.TABLE:
-        table = make_table_surface(meshes, surfaces, bodies, view, to_camera)
-        return map_table(surfaces, table, hit_position(cameras, view, ray, depth), to_camera, width)
-    triangle = gbuffer.triangle[view, row, column]
-    barycentric = gbuffer.barycentric[view, row, column]
-    return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
-
-
-@kernel_of_views
-def render_normals_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    normals_out: wp.array3d[wp.vec3],  # (view, row, column)
-):
-    """Normal map: the interpolated shading normal in the camera's axes; zero without surface.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    normal = wp.vec3(0.0, 0.0, 0.0)
-    if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, row, column, views.instances)
-        normal = wp.transpose(views.cameras.to_world[view]) * surface.normal
-    normals_out[view, row, column] = normal
-
-
-@kernel_of_views
-def render_albedo_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    grid: ImageGrid,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    albedo_out: wp.array3d[wp.vec3ub],  # (view, row, column)
-):
-    """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    color = wp.vec3(0.0, 0.0, 0.0)
-    if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, row, column, views.instances)
-        color = sample_base_color(surfaces, surface)
-    albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
-
-
-@kernel_of_views
-def render_nocs_kernel(
-    # Scene:
-    meshes: Meshes,
-    grid: ImageGrid,
-    obj_id: wp.array[int],  # (entry)
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    nocs_out: wp.array3d[wp.vec3],  # (view, row, column)
-):
-    """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
-
-    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components. Launched over
-    view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    segment = int(gbuffer.segment[view, row, column])
-    coordinates = wp.vec3(0.0, 0.0, 0.0)
-    if segment != Segment.NOTHING and segment <= views.instances:
-        mesh = bodies.mesh[view, segment - 1]
-        if obj_id[mesh] >= 0:
-            lower = meshes.lower[mesh]
-            upper = meshes.upper[mesh]
-            barycentric = gbuffer.barycentric[view, row, column]
-            point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
-            coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
-    nocs_out[view, row, column] = coordinates
-
-
-@kernel_of_views
-def render_classes_kernel(
-    # Scene:
-    grid: ImageGrid,
-    obj_id: wp.array[int],  # (entry)
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    classes_out: wp.array3d[wp.uint16],  # (view, row, column)
-):
-    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance, or of one without label.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    segment = int(gbuffer.segment[view, row, column])
-    class_id = int(0)
-    if segment != Segment.NOTHING and segment <= views.instances:
-        class_id = wp.max(obj_id[bodies.mesh[view, segment - 1]], 0)
-    classes_out[view, row, column] = wp.uint16(class_id)
+        table = make_table_surface(scene.meshes, scene.surfaces, shot.bodies, view, to_camera)
+        return map_table(scene.surfaces, table, hit_position(cameras, view, ray, depth), to_camera, width)
+    triangle = shot.gbuffer.triangle[view, row, column]
+    barycentric = shot.gbuffer.barycentric[view, row, column]
+    body = body_of(segment, shot.views.instances)
+    return interpolate_surface(scene.meshes, scene.surfaces, shot.bodies, view, body, triangle, barycentric, to_camera, width)
 
 
 @wp.func
-def point_displacement(
-    motions: BodyMotions, gbuffer: GBuffer, cameras: AnyCameras, view: int, row: int, column: int, follows: int, instances: int
-) -> wp.vec3:
-    """Displacement from a pixel's surface point to its position in the previous frame, each in the axes of its camera [m]; NaN: unknown."""
+def normal_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3:
+    """Normal map: the interpolated shading normal in the camera's axes; zero without surface."""
+    normal = wp.vec3(0.0, 0.0, 0.0)
+    if int(shot.gbuffer.segment[view, row, column]) != Segment.NOTHING:
+        normal = wp.transpose(shot.views.cameras.to_world[view]) * hit_surface(scene, shot, view, row, column).normal
+    return normal
+
+
+@wp.func
+def albedo_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3ub:
+    """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface."""
+    color = wp.vec3(0.0, 0.0, 0.0)
+    if int(shot.gbuffer.segment[view, row, column]) != Segment.NOTHING:
+        color = sample_base_color(scene.surfaces, hit_surface(scene, shot, view, row, column))
+    return wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
+
+
+@wp.func
+def nocs_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3:
+    """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
+
+    Zero stands for no instance, or one without label: no point of an object with an extent has 0 in all three components.
+    """
+    segment = int(shot.gbuffer.segment[view, row, column])
+    coordinates = wp.vec3(0.0, 0.0, 0.0)
+    if segment != Segment.NOTHING and segment <= shot.views.instances:
+        mesh = shot.bodies.mesh[view, segment - 1]
+        if layer.obj_id[mesh] >= 0:
+            lower = scene.meshes.lower[mesh]
+            upper = scene.meshes.upper[mesh]
+            barycentric = shot.gbuffer.barycentric[view, row, column]
+            triangle = shot.gbuffer.triangle[view, row, column]
+            point = wp.mesh_eval_position(scene.meshes.id[mesh], triangle, barycentric[0], barycentric[1])
+            coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
+    return coordinates
+
+
+@wp.func
+def class_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.uint16:
+    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance, or of one without label."""
+    segment = int(shot.gbuffer.segment[view, row, column])
+    class_id = int(0)
+    if segment != Segment.NOTHING and segment <= shot.views.instances:
+        class_id = wp.max(layer.obj_id[shot.bodies.mesh[view, segment - 1]], 0)
+    return wp.uint16(class_id)
+
+
+@wp.func
+def displacement_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3:
+    """Backward scene flow: displacement from the surface point to its position in the previous frame, each in the axes of its camera [m];
+    NaN: unknown."""
+    cameras, motions = shot.views.cameras, layer.motions
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
-    segment = int(gbuffer.segment[view, row, column])
-    if segment == Segment.NOTHING or follows == 0:
+    segment = int(shot.gbuffer.segment[view, row, column])
+    if segment == Segment.NOTHING or layer.follows[shot.views.world[view]] == 0:
         return unknown
     table = motions.known.shape[1] - 1
     body = table
     if segment != Segment.TABLE:
-        body = body_of(segment, instances)
+        body = body_of(segment, shot.views.instances)
     if motions.known[view, body] == 0:
         if body == table:
             return wp.vec3(0.0, 0.0, 0.0)
         return unknown
-    depth = gbuffer.depth[view, row, column]
+    depth = shot.gbuffer.depth[view, row, column]
     # One component after the other: their order decides which product is fused with the difference below, and so the last bits.
     x = depth * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))[0]
     y = depth * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))[1]
@@ -284,70 +248,36 @@ def point_displacement(
     return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]
 
 
-@kernel_of_views
-def render_scene_flow_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # State:
-    snapshot: Snapshots,
-    # In:
-    motions: BodyMotions,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    scene_flow_out: wp.array3d[wp.vec3],  # (view, row, column) [m]
-):
-    """Backward scene flow: displacement of the surface point to the previous frame, in the camera's axes [m]; NaN: unknown.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    displacement = point_displacement(
-        motions, gbuffer, views.cameras, view, row, column, snapshot.follows[views.world[view]], views.instances
-    )
-    scene_flow_out[view, row, column] = displacement
-
-
-@kernel_of_views
-def render_flow_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # State:
-    snapshot: Snapshots,
-    # In:
-    motions: BodyMotions,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    flow_out: wp.array3d[wp.vec2],  # (view, row, column) [px]
-):
+@wp.func
+def flow_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec2:
     """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike;
     through a lens, the difference of both places.
 
-    NaN where the displacement d is unknown, and where the point was behind the camera. Launched over view, pixel (tile order, from flat
-    index `first` on).
+    NaN where the displacement d is unknown, and where the point was behind the camera.
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
-    intrinsics = views.cameras.intrinsics[view]
-    ray = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    d = point_displacement(motions, gbuffer, views.cameras, view, row, column, snapshot.follows[views.world[view]], views.instances)
-    depth = gbuffer.depth[view, row, column] + d[2]
+    cameras = shot.views.cameras
+    intrinsics = cameras.intrinsics[view]
+    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    d = displacement_at(scene, layer, shot, view, row, column)
+    depth = shot.gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:
         flow = wp.vec2(intrinsics[0] * (d[0] - ray[0] * d[2]) / depth, intrinsics[1] * (d[1] - ray[1] * d[2]) / depth)
-        lens = lens_of(views.cameras, view)
+        lens = lens_of(cameras, view)
         if lens >= 0:
             shift = wp.vec2(flow[0] / intrinsics[0], flow[1] / intrinsics[1])
-            now, jacobian = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
+            now, jacobian = distort(cameras.lenses, lens, wp.vec2(ray[0], ray[1]))
             change = jacobian * shift
             if wp.length_sq(shift) > SMALL_SHIFT:
-                before, _ = distort(views.cameras.lenses, lens, wp.vec2(ray[0], ray[1]) + shift)
+                before, _ = distort(cameras.lenses, lens, wp.vec2(ray[0], ray[1]) + shift)
                 change = before - now
             flow = wp.vec2(intrinsics[0] * change[0], intrinsics[1] * change[1])
-    flow_out[view, row, column] = flow
+    return flow
+
+
+render_normals_kernel = kernel_of_layer(normal_at, "normals", wp.vec3)
+render_albedo_kernel = kernel_of_layer(albedo_at, "albedo", wp.vec3ub)
+render_nocs_kernel = kernel_of_layer(nocs_at, "nocs", wp.vec3)
+render_classes_kernel = kernel_of_layer(class_at, "classes", wp.uint16)
+render_scene_flow_kernel = kernel_of_layer(displacement_at, "scene_flow", wp.vec3)
+render_flow_kernel = kernel_of_layer(flow_at, "flow", wp.vec2)

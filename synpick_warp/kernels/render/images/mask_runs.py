@@ -14,6 +14,32 @@ BELOW_SHIFT = wp.constant(wp.uint32(8))
 """Position of the id below a boundary in its word; the id above it is the lowest byte."""
 
 
+@wp.struct
+class Boundaries:
+    """Run boundaries of the segmentation ids and amodal masks of a batch of views, and their counts. A count may exceed the capacity of its
+    list; the list is then truncated. See `FrameBatch`.
+    """
+
+    boundary_count: wp.array[int]
+    """(view): run boundaries of the ids, including those beyond the capacity of `boundaries`."""
+    boundaries: wp.array3d[wp.uint32]
+    """(view, field, boundary): position, and values above and below, of each run boundary of the ids."""
+    run_count: wp.array2d[int]
+    """(view, instance): run boundaries of each amodal mask, including those beyond the capacity of `runs`."""
+    runs: wp.array2d[wp.uint32]
+    """(view, run): positions of the run boundaries of the amodal masks, mask by mask."""
+
+
+@wp.struct
+class BoundaryCounts:
+    """Run boundaries of each column of the ids, and of each lane of a mask. Scratch between the two passes."""
+
+    column_count: wp.array2d[int]
+    """(view, column)."""
+    lane_count: wp.array3d[int]
+    """(view, instance, lane)."""
+
+
 @wp.func
 def read_id(instance_image: wp.array3d[wp.uint8], view: int, row: int, column: int) -> wp.uint32:
     """Segmentation id of a pixel; 0 in the rows above and below the image."""
@@ -27,12 +53,11 @@ def count_boundaries_kernel(
     # In:
     instance_image: wp.array3d[wp.uint8],  # (view, row, column)
     # Out:
-    column_count_out: wp.array2d[int],  # (view, column)
+    counts_out: BoundaryCounts,
 ):
     """Count run boundaries per column: rows, from the first to the one below the image, whose id differs from the row above.
 
-    First pass of a stream compaction; `column_count_out` receives each column's count, `list_boundaries_kernel` sums them to offsets.
-    Launched over view, column.
+    First pass of a stream compaction, whose counts `list_boundaries_kernel` sums to offsets. Launched over view, column.
     """
     view, column = wp.tid()
     count = int(0)
@@ -42,39 +67,37 @@ def count_boundaries_kernel(
         if below != above:
             count += 1
         above = below
-    column_count_out[view, column] = count
+    counts_out.column_count[view, column] = count
 
 
 @wp.kernel
 def list_boundaries_kernel(
     # In:
     instance_image: wp.array3d[wp.uint8],  # (view, row, column)
-    column_count: wp.array2d[int],  # (view, column)
+    counts: BoundaryCounts,
     # Out:
-    boundary_count_out: wp.array[int],  # (view)
-    boundaries_out: wp.array3d[wp.uint32],  # (view, field, boundary)
+    runs_out: Boundaries,
 ):
     """Write the run boundaries of the segmentation ids as a list sorted by column, then row: second pass of a stream compaction.
 
-    `boundaries_out` receives two fields per boundary: its position, and the ids above and below. `boundary_count_out` receives the number
-    of boundaries, including those beyond the list's capacity, which are not written. Launched over view, column.
+    Launched over view, column.
     """
     view, column = wp.tid()
     rows = instance_image.shape[1]
     index = int(0)
     for before in range(column):
-        index += column_count[view, before]
+        index += counts.column_count[view, before]
     above = wp.uint32(0)
     for row in range(rows + 1):
         below = read_id(instance_image, view, row, column)
         if below != above:
-            if index < boundaries_out.shape[2]:
-                boundaries_out[view, 0, index] = wp.uint32(column * (rows + 1) + row)
-                boundaries_out[view, 1, index] = above | (below << BELOW_SHIFT)
+            if index < runs_out.boundaries.shape[2]:
+                runs_out.boundaries[view, 0, index] = wp.uint32(column * (rows + 1) + row)
+                runs_out.boundaries[view, 1, index] = above | (below << BELOW_SHIFT)
             index += 1
         above = below
-    if column == column_count.shape[1] - 1:
-        boundary_count_out[view] = index
+    if column == counts.column_count.shape[1] - 1:
+        runs_out.boundary_count[view] = index
 
 
 @wp.struct
@@ -106,20 +129,14 @@ def lane_columns(mask: Mask, lanes: int) -> int:
 
 
 @wp.kernel
-def count_runs_kernel(
-    # In:
-    masks: InstanceMasks,
-    # Out:
-    lane_count_out: wp.array3d[int],  # (view, instance, lane)
-    run_count_inout: wp.array2d[int],  # (view, instance)
-):
+def count_runs_kernel(masks: InstanceMasks, counts_out: BoundaryCounts, runs_inout: Boundaries):
     """Count the run boundaries of each amodal mask: first pass of a stream compaction, in which a lane has consecutive columns of a mask.
 
-    `run_count_inout` is increased by the sums over the lanes. Launched over view, instance, lane.
+    `run_count` is increased by the sums over the lanes. Launched over view, instance, lane.
     """
     view, instance, lane = wp.tid()
     mask = read_mask(masks, view, instance)
-    share = lane_columns(mask, lane_count_out.shape[2])
+    share = lane_columns(mask, counts_out.lane_count.shape[2])
     count = int(0)
     for column in range(lane * share, wp.min((lane + 1) * share, mask.columns)):
         last = wp.uint32(0)
@@ -127,20 +144,12 @@ def count_runs_kernel(
             walk = next_changes(masks, view, mask, band, column, last)
             count += wp.bit_count(walk.changes)
             last = walk.last
-    lane_count_out[view, instance, lane] = count
-    wp.atomic_add(run_count_inout, view, instance, count)
+    counts_out.lane_count[view, instance, lane] = count
+    wp.atomic_add(runs_inout.run_count, view, instance, count)
 
 
 @wp.kernel
-def list_runs_kernel(
-    # In:
-    masks: InstanceMasks,
-    rows: int,
-    lane_count: wp.array3d[int],  # (view, instance, lane)
-    run_count: wp.array2d[int],  # (view, instance)
-    # Out:
-    runs_out: wp.array2d[wp.uint32],  # (view, boundary)
-):
+def list_runs_kernel(masks: InstanceMasks, rows: int, counts: BoundaryCounts, runs_inout: Boundaries):
     """Write the positions of the run boundaries of a view's amodal masks, mask by mask: second pass of a stream compaction.
 
     They alternate between a run's first pixel and the pixel below its last; what exceeds the capacity is not written. `rows`: of the image.
@@ -150,10 +159,10 @@ def list_runs_kernel(
     mask = read_mask(masks, view, instance)
     index = int(0)
     for before in range(instance):
-        index += run_count[view, before]
+        index += runs_inout.run_count[view, before]
     for before in range(lane):
-        index += lane_count[view, instance, before]
-    share = lane_columns(mask, lane_count.shape[2])
+        index += counts.lane_count[view, instance, before]
+    share = lane_columns(mask, counts.lane_count.shape[2])
     for column in range(lane * share, wp.min((lane + 1) * share, mask.columns)):
         last = wp.uint32(0)
         for band in range(mask.rows // ROWS + 1):
@@ -161,9 +170,9 @@ def list_runs_kernel(
             position = (mask.left + column) * (rows + 1) + mask.top + band * ROWS
             while walk.changes != wp.uint32(0):
                 others = walk.changes & (walk.changes - wp.uint32(1))
-                if index < runs_out.shape[1]:
+                if index < runs_inout.runs.shape[1]:
                     # The bits below the lowest one that is set.
-                    runs_out[view, index] = wp.uint32(position + wp.bit_count((walk.changes ^ others) - wp.uint32(1)))
+                    runs_inout.runs[view, index] = wp.uint32(position + wp.bit_count((walk.changes ^ others) - wp.uint32(1)))
                 index += 1
                 walk.changes = others
             last = walk.last

@@ -4,7 +4,7 @@ order."""
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream, Tone
-from synpick_warp.kernels.render.images.antialias import ShadedImage, resolve_radiance
+from synpick_warp.kernels.render.images.antialias import resolve_radiance
 from synpick_warp.kernels.render.images.camera_effects import (
     BLUR_REACH,
     EffectParameters,
@@ -13,14 +13,14 @@ from synpick_warp.kernels.render.images.camera_effects import (
     channel_magnification,
     color_gains,
     corner_slope,
+    shot_key,
     vignette_factor,
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, AnyCameras, AnyViews, ImageGrid, in_image, loop_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, in_image, loop_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.rng import view_key
-from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -57,12 +57,9 @@ def encode_display(linear: float, tone: int) -> wp.uint8:
 @kernel_of_views
 def postprocess_kernel(
     # Scene:
-    grid: ImageGrid,
     lights: Lights,
-    # State:
-    snapshot: Frames,
     # In:
-    views: AnyViews,
+    shot: AnyShot,
     image: ShadedImage,
     tone: int,
     first: int,
@@ -73,10 +70,10 @@ def postprocess_kernel(
 
     `color_out` receives red, green, blue bytes. Launched over view, pixel (tile order, from flat index `first` on).
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
+    view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+    if not in_image(shot.grid, row, column):
         return
-    world = views.world[view]
+    world, snapshot = shot.views.world[view], shot.snapshot
     value = (
         lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world]) * resolve_radiance(image, view, row, column)
     )
@@ -85,11 +82,10 @@ def postprocess_kernel(
 
 @wp.func
 def filter_lens(
+    shot: AnyShot,
+    intrinsics: wp.vec4,
     image: ShadedImage,
     parameters: EffectParameters,
-    cameras: AnyCameras,
-    intrinsics: wp.vec4,
-    grid: ImageGrid,
     view: int,
     row: int,
     column: int,
@@ -101,6 +97,7 @@ def filter_lens(
     The channel is magnified by `channel_magnification`: it is resampled at the inverse position, between two pixels, with Gaussian
     weights; coordinates are clamped to the image. The first pass, along the row, reads resolved radiance and applies the vignette.
     """
+    grid, cameras = shot.grid, shot.views.cameras
     size = grid.height
     center = intrinsics[3]
     position = float(row) + PIXEL_CENTER
@@ -143,11 +140,9 @@ def filter_lens(
 
 @kernel_of_views
 def filter_lens_rows_kernel(
-    # Scene:
-    grid: ImageGrid,
     # In:
     effects: wp.array[EffectParameters],  # (view)
-    views: AnyViews,
+    shot: AnyShot,
     image: ShadedImage,
     first: int,
     # Out:
@@ -157,13 +152,13 @@ def filter_lens_rows_kernel(
 
     `radiance_out` receives linear radiance before exposure. Launched over view, pixel (tile order, from flat index `first` on).
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
+    view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+    if not in_image(shot.grid, row, column):
         return
-    intrinsics = views.cameras.intrinsics[view]
+    intrinsics = shot.views.cameras.intrinsics[view]
     value = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
-        value[channel] = filter_lens(image, effects[view], views.cameras, intrinsics, grid, view, row, column, channel, 1)
+        value[channel] = filter_lens(shot, intrinsics, image, effects[view], view, row, column, channel, 1)
     radiance_out[view, row, column] = value
 
 
@@ -182,14 +177,11 @@ class PostProcessSettings:
 @kernel_of_views
 def postprocess_effects_kernel(
     # Scene:
-    grid: ImageGrid,
     lights: Lights,
-    # State:
-    snapshot: Frames,
     # In:
     settings: PostProcessSettings,
     effects: wp.array[EffectParameters],  # (view)
-    views: AnyViews,
+    shot: AnyShot,
     image: ShadedImage,
     first: int,
     # Out:
@@ -202,24 +194,24 @@ def postprocess_effects_kernel(
     here. Noise is that of the random number stream (seed, episode, frame, camera, COLOR_NOISE). `color_out` receives red, green, blue
     bytes. Launched over view, pixel (tile order, from flat index `first` on).
     """
+    grid, cameras, snapshot = shot.grid, shot.views.cameras, shot.snapshot
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    world = views.world[view]
-    camera = views.camera[view]
-    intrinsics = views.cameras.intrinsics[view]
+    world = shot.views.world[view]
+    intrinsics = cameras.intrinsics[view]
     parameters = effects[view]
     value = resolve_radiance(image, view, row, column)
     if settings.lens_filter != 0:
         for channel in range(3):
-            value[channel] = filter_lens(image, parameters, views.cameras, intrinsics, grid, view, row, column, channel, 0)
+            value[channel] = filter_lens(shot, intrinsics, image, parameters, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
-        ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
+        ray = loop_ray(cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
         value *= vignette_factor(parameters[Effect.VIGNETTE], ray, corner)
     value *= lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world])
     value = wp.cw_mul(value, color_gains(parameters))
-    key = view_key(settings.seed, snapshot.episode[world], snapshot.frame[world], camera, Stream.COLOR_NOISE)
+    key = shot_key(settings.seed, shot, view, Stream.COLOR_NOISE)
     value = add_sensor_noise(value, parameters, key, row * grid.width + column)
     color = wp.vec3ub(
         encode_display(value[0], settings.tone), encode_display(value[1], settings.tone), encode_display(value[2], settings.tone)

@@ -10,7 +10,7 @@ a pixel come from costs summed over a block instead of along paths: the penaltie
 import warp as wp
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.kernels.render.images.depth_sensor import SensorParameters
+from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, clamp_index, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -35,6 +35,20 @@ WARP = 32
 """Threads that share a path on a GPU."""
 NO_MATCH = wp.constant(-1)
 """Disparity of a pixel without a match."""
+
+
+@wp.struct
+class MatchingScratch:
+    """Scratch of matching: a slot for each view that is matched at a time."""
+
+    census: wp.array4d[wp.uint32]
+    """(slot, eye, row, column)."""
+    cost: wp.array4d[wp.uint16]
+    """(slot, row, column, disparity): sum of the costs of all paths."""
+    right_match: wp.array3d[int]
+    """(slot, row, column): index of the cheapest disparity of right images; NO_MATCH: none."""
+    disparity: wp.array3d[int]
+    """(slot, row, column): of left images [px/FRACTIONS]; NO_MATCH: none."""
 
 
 @wp.func
@@ -148,36 +162,25 @@ def follow_path(census: wp.array4d[wp.uint32], slot: int, lowest: int, line: int
 
 @kernel_of_views
 def sum_path_costs_kernel(
-    # In:
     sensor: SensorParameters,
     views: AnyViews,
-    census: wp.array4d[wp.uint32],  # (slot, eye, row, column)
     first_view: int,
     direction: int,
     lines: int,
     lanes: int,
     first: int,
-    # Out:
-    cost_inout: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
+    matching_inout: MatchingScratch,
 ):
     """Add the costs of all paths in one direction, see `follow_path`. Launched over slot, line, lane (from flat index `first` on)."""
     path = (wp.tid() + first) // lanes
     slot = path // lines
-    follow_path(census, slot, first_disparity(sensor, views, first_view + slot), path % lines, direction, cost_inout)
+    lowest = first_disparity(sensor, views, first_view + slot)
+    follow_path(matching_inout.census, slot, lowest, path % lines, direction, matching_inout.cost)
 
 
 @kernel_of_views
 def match_right_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    sensor: SensorParameters,
-    views: AnyViews,
-    cost: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
-    first_view: int,
-    first: int,
-    # Out:
-    right_match_out: wp.array3d[int],  # (slot, row, column)
+    grid: ImageGrid, sensor: SensorParameters, views: AnyViews, first_view: int, first: int, matching_inout: MatchingScratch
 ):
     """Index of the cheapest disparity of each pixel of right images. Launched over slot, pixel (tile order, from flat index `first` on)."""
     slot, row, column = tile_pixel(grid, wp.tid() + first)
@@ -186,12 +189,12 @@ def match_right_kernel(
     shift = column + first_disparity(sensor, views, first_view + slot)
     best = int(NO_MATCH)
     least = int(1 << 20)
-    for index in range(wp.min(cost.shape[3], grid.width - shift)):
-        value = int(cost[slot, row, shift + index, index])
+    for index in range(wp.min(matching_inout.cost.shape[3], grid.width - shift)):
+        value = int(matching_inout.cost[slot, row, shift + index, index])
         if value < least:
             least = value
             best = index
-    right_match_out[slot, row, column] = best
+    matching_inout.right_match[slot, row, column] = best
 
 
 @wp.func_native("""
@@ -233,18 +236,7 @@ def sub_pixel(before: int, here: int, after: int) -> int:
 
 @kernel_of_views
 def match_left_kernel(
-    # Scene:
-    grid: ImageGrid,
-    # In:
-    sensor: SensorParameters,
-    views: AnyViews,
-    cost: wp.array4d[wp.uint16],  # (slot, row, column, disparity)
-    right_match: wp.array3d[int],  # (slot, row, column)
-    census: wp.array4d[wp.uint32],  # (slot, eye, row, column)
-    first_view: int,
-    first: int,
-    # Out:
-    disparity_out: wp.array3d[int],  # (slot, row, column) [px/FRACTIONS]
+    grid: ImageGrid, sensor: SensorParameters, views: AnyViews, first_view: int, first: int, matching_inout: MatchingScratch
 ):
     """Sub-pixel disparity of each pixel of left images, NO_MATCH where there is none.
 
@@ -254,7 +246,8 @@ def match_left_kernel(
     slot, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    disparity_out[slot, row, column] = NO_MATCH
+    matching_inout.disparity[slot, row, column] = NO_MATCH
+    cost, census = matching_inout.cost, matching_inout.census
     count = cost.shape[3]
     best = int(0)
     least = int(1 << 20)
@@ -267,7 +260,7 @@ def match_left_kernel(
     partner = column - lowest - best
     if best == 0 or best == count - 1 or partner < 0:
         return
-    if wp.abs(right_match[slot, row, partner] - best) > MAX_DIFFERENCE:
+    if wp.abs(matching_inout.right_match[slot, row, partner] - best) > MAX_DIFFERENCE:
         return
     for index in range(count):
         if wp.abs(index - best) > 1 and int(cost[slot, row, column, index]) * (100 - UNIQUENESS) < least * 100:
@@ -275,7 +268,8 @@ def match_left_kernel(
     disparity = lowest + best
     before = block_cost(census, slot, row, column, disparity - 1)
     after = block_cost(census, slot, row, column, disparity + 1)
-    disparity_out[slot, row, column] = FRACTIONS * disparity + sub_pixel(before, block_cost(census, slot, row, column, disparity), after)
+    here = block_cost(census, slot, row, column, disparity)
+    matching_inout.disparity[slot, row, column] = FRACTIONS * disparity + sub_pixel(before, here, after)
 
 
 @wp.func

@@ -8,13 +8,11 @@ cup of 100 mm height, a load of 1 kg.
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.images.layers import hit_surface
-from synpick_warp.kernels.render.lighting.materials import AnySurfaces
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies
+from synpick_warp.kernels.render.images.layers import LayerScene, hit_surface, kernel_of_layer
+from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes
 from synpick_warp.kernels.render.visibility.ray_bodies import first_ray_record, read_ray_body
 from synpick_warp.kernels.render.visibility.records import read_record
-from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.render.visibility.wide_bvh import query_any_hit, query_closest_hit
 from synpick_warp.kernels.rng import TAU
 
@@ -41,16 +39,6 @@ GRAVITY = wp.constant(9.8)
 
 
 @wp.struct
-class SuctionScene:
-    """Radius of the suction cup, and centres of mass of the catalog's objects. Constant."""
-
-    radius: float
-    """[m]"""
-    center_of_mass: wp.array[wp.vec3]
-    """(entry): in the object's frame [m]."""
-
-
-@wp.struct
 class PlacedCup:
     """Suction cup set on a surface point: the object, the point, and the cup's axis and two tangents, in the object's frame."""
 
@@ -67,36 +55,26 @@ class PlacedCup:
 
 
 @wp.func
-def place_cup(
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    obj_id: wp.array[int],  # (entry)
-    view: int,
-    row: int,
-    column: int,
-) -> PlacedCup:
-    """Cup on the surface point that a pixel shows, if that belongs to an instance with a label."""
+def place_cup(scene: AnyScene, shot: AnyShot, obj_id: wp.array[int], view: int, row: int, column: int) -> PlacedCup:
+    """Cup on the surface point that a pixel shows, if that belongs to an instance with a label; `obj_id` as in `LayerScene`."""
     cup = PlacedCup()
     cup.body = -1
-    segment = int(gbuffer.segment[view, row, column])
-    if segment == Segment.NOTHING or segment > views.instances:
+    segment = int(shot.gbuffer.segment[view, row, column])
+    if segment == Segment.NOTHING or segment > shot.views.instances:
         return cup
     body = segment - 1
-    mesh = bodies.mesh[view, body]
+    mesh = shot.bodies.mesh[view, body]
     if obj_id[mesh] < 0:
         return cup
-    barycentric = gbuffer.barycentric[view, row, column]
-    surface = hit_surface(meshes, surfaces, views.cameras, bodies, gbuffer, view, row, column, views.instances)
-    normal = wp.transpose(views.cameras.to_world[view]) * surface.normal
+    barycentric = shot.gbuffer.barycentric[view, row, column]
+    normal = wp.transpose(shot.views.cameras.to_world[view]) * hit_surface(scene, shot, view, row, column).normal
     across = wp.vec3(0.0, 1.0, 0.0)
     if wp.abs(normal[0]) + wp.abs(normal[1]) > PARALLEL:
         across = wp.normalize(wp.vec3(-normal[1], normal[0], 0.0))
-    rotation = bodies.rotation[view, body]
+    rotation = shot.bodies.rotation[view, body]
+    triangle = shot.gbuffer.triangle[view, row, column]
     cup.body = body
-    cup.point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
+    cup.point = wp.mesh_eval_position(scene.meshes.id[mesh], triangle, barycentric[0], barycentric[1])
     cup.axis = rotation * normal
     cup.across = rotation * across
     cup.along = wp.cross(cup.axis, cup.across)
@@ -143,9 +121,10 @@ def seal_score(meshes: Meshes, mesh: int, cup: PlacedCup, radius: float) -> floa
 
 
 @wp.func
-def is_obstructed(meshes: Meshes, table: Table, bodies: ViewBodies, view: int, cup: PlacedCup, radius: float, instances: int) -> bool:
+def is_obstructed(scene: AnyScene, shot: AnyShot, view: int, cup: PlacedCup, radius: float) -> bool:
     """Whether another object, the bin or the table reaches into the cylinder above the cup, from CLEARANCE to CUP_HEIGHT; the gripper does
     not count."""
+    meshes, table, bodies, instances = scene.meshes, scene.table, shot.bodies, shot.views.instances
     to_world = wp.transpose(bodies.world_rotation[view, cup.body])
     point = bodies.position[view, cup.body] + to_world * cup.point
     axis = to_world * cup.axis
@@ -179,69 +158,45 @@ def wrench_score(cup: PlacedCup, center: wp.vec3, weight: wp.vec3, radius: float
     return 1.0 - wp.min(bending / (STIFFNESS * wp.PI * radius), 1.0)
 
 
-@kernel_of_views
-def render_suction_seal_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    grid: ImageGrid,
-    obj_id: wp.array[int],  # (entry)
-    suction: SuctionScene,
-    table: Table,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    suction_seal_out: wp.array3d[float],  # (view, row, column)
-):
-    """Seal map: `seal_score` of a cup at each pixel; 0 if something else is in the cup's way, and without instance or label.
+@wp.func
+def obstructed_seal(scene: AnyScene, shot: AnyShot, view: int, cup: PlacedCup, radius: float) -> float:
+    """`seal_score` of a cup on a pixel's surface; 0 if something else is in its way."""
+    score = seal_score(scene.meshes, shot.bodies.mesh[view, cup.body], cup, radius)
+    if score > 0.0 and is_obstructed(scene, shot, view, cup, radius):
+        score = 0.0
+    return score
 
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
+
+@wp.func
+def loaded_wrench(layer: LayerScene, shot: AnyShot, view: int, cup: PlacedCup) -> float:
+    """`wrench_score` of a cup on a pixel's surface under a load of 1 kg at the object's centre of mass."""
+    center = layer.suction.center_of_mass[shot.bodies.mesh[view, cup.body]]
+    weight = shot.bodies.world_rotation[view, cup.body] * wp.vec3(0.0, 0.0, -GRAVITY)
+    return wrench_score(cup, center, weight, layer.suction.radius)
+
+
+@wp.func
+def seal_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> float:
+    """Seal map: `obstructed_seal` of a cup at each pixel; 0 without instance or label."""
     score = float(0.0)
-    cup = place_cup(meshes, surfaces, bodies, gbuffer, views, obj_id, view, row, column)
+    cup = place_cup(scene, shot, layer.obj_id, view, row, column)
     if cup.body >= 0:
-        score = seal_score(meshes, bodies.mesh[view, cup.body], cup, suction.radius)
-        if score > 0.0 and is_obstructed(meshes, table, bodies, view, cup, suction.radius, views.instances):
-            score = 0.0
-    suction_seal_out[view, row, column] = score
+        score = obstructed_seal(scene, shot, view, cup, layer.suction.radius)
+    return score
 
 
-@kernel_of_views
-def render_suction_wrench_kernel(
-    # Scene:
-    meshes: Meshes,
-    surfaces: AnySurfaces,
-    grid: ImageGrid,
-    obj_id: wp.array[int],  # (entry)
-    suction: SuctionScene,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    suction_wrench_out: wp.array3d[float],  # (view, row, column)
-):
-    """Wrench map: `wrench_score` of a cup at each pixel under a load of 1 kg at the object's centre of mass; 0 without instance or label.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
-        return
+@wp.func
+def wrench_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> float:
+    """Wrench map: `loaded_wrench` of a cup at each pixel; 0 without instance or label."""
     score = float(0.0)
-    cup = place_cup(meshes, surfaces, bodies, gbuffer, views, obj_id, view, row, column)
+    cup = place_cup(scene, shot, layer.obj_id, view, row, column)
     if cup.body >= 0:
-        center = suction.center_of_mass[bodies.mesh[view, cup.body]]
-        weight = bodies.world_rotation[view, cup.body] * wp.vec3(0.0, 0.0, -GRAVITY)
-        score = wrench_score(cup, center, weight, suction.radius)
-    suction_wrench_out[view, row, column] = score
+        score = loaded_wrench(layer, shot, view, cup)
+    return score
+
+
+render_suction_seal_kernel = kernel_of_layer(seal_at, "suction_seal", float)
+render_suction_wrench_kernel = kernel_of_layer(wrench_at, "suction_wrench", float)
 
 
 @wp.kernel(enable_backward=False, module="unique")

@@ -3,17 +3,12 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.environment import (
-    lamp_center,
-    lamp_irradiance,
-    sh_irradiance,
-)
+from synpick_warp.kernels.render.lighting.environment import lamp_center, lamp_irradiance, sh_irradiance
 from synpick_warp.kernels.render.lighting.materials import Surface, map_table, sample_base_color
 from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.camera import camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,16 +17,15 @@ HORIZON = wp.constant(0.02)
 
 
 @wp.func
-def floor_radiance(
-    scene: RandomizedScene, drop: float, bodies: ViewBodies, cameras: AnyCameras, view: int, light: int, direction: wp.vec3
-) -> wp.vec3:
+def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance of the floor, `drop` [m] below the table, along a unit direction in the world, which points down: diffuse, in unoccluded
     light.
     """
+    cameras = shot.views.cameras
     center = wp.vec3(cameras.center[view])
     distance = wp.max(center[2] - scene.table.height + drop, 0.0) / -direction[2]
     surface = Surface()
-    surface.row = scene.surfaces.row[view, bodies.mesh.shape[1] + 1]
+    surface.row = scene.surfaces.row[view, shot.bodies.mesh.shape[1] + 1]
     width = distance / cameras.intrinsics[view][0]
     surface = map_table(scene.surfaces, surface, center + distance * direction, -direction, width)
     irradiance = sh_irradiance(scene.lights, light, wp.vec3(0.0, 0.0, 1.0))
@@ -41,31 +35,18 @@ def floor_radiance(
 
 
 @kernel_of_views
-def shade_floor_kernel(
-    # Scene:
-    scene: RandomizedScene,
-    grid: ImageGrid,
-    drop: float,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    first: int,
-    # Out:
-    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
-):
+def shade_floor_kernel(scene: RandomizedScene, drop: float, shot: AnyShot, first: int, image_inout: ShadedImage):
     """Show the floor where a pixel shows nothing and its ray points down. It is seen only: it has no depth, and reflects no light.
 
     The last material of each view is that of the floor, which is `drop` [m] below the table. Launched over view, pixel (tile order, from
     flat index `first` on).
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column) or views.world[view] < 0:
+    view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+    cameras, world = shot.views.cameras, shot.views.world[view]
+    if not in_image(shot.grid, row, column) or world < 0:
         return
-    if int(gbuffer.segment[view, row, column]) == Segment.NOTHING:
-        direction = wp.normalize(views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0)))
+    if int(shot.gbuffer.segment[view, row, column]) == Segment.NOTHING:
+        direction = wp.normalize(cameras.to_world[view] * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0)))
         if direction[2] < -HORIZON:
-            sky = snapshot.light[views.world[view]]
-            radiance_inout[view, row, column] = floor_radiance(scene, drop, bodies, views.cameras, view, sky, direction)
+            radiance = floor_radiance(scene, drop, shot, view, shot.snapshot.light[world], direction)
+            image_inout.radiance[view, row, column] = radiance

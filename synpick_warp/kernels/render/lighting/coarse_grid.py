@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyCameras, ImageGrid, camera_ray, hit_position
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, read_hit
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, ImageGrid, camera_ray, hit_position
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, read_hit
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE
 
@@ -163,14 +163,15 @@ class CoarseSurface:
 
 
 @wp.func
-def coarse_surface(cameras: AnyCameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, row: int, column: int) -> CoarseSurface:
+def coarse_surface(coarse: CoarseGrid, shot: AnyShot, view: int, row: int, column: int) -> CoarseSurface:
     """Surface that a coarse pixel shows: hit, position, direction to the camera and footprint, read from the G-buffer at its
     middle pixel.
     """
+    cameras = shot.views.cameras
     pixel = middle_pixel(coarse, row, column)
     ray = camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     surface = CoarseSurface()
-    surface.hit = read_hit(gbuffer, view, pixel[0], pixel[1])
+    surface.hit = read_hit(shot.gbuffer, view, pixel[0], pixel[1])
     surface.position = hit_position(cameras, view, ray, surface.hit.depth)
     surface.outgoing = -wp.normalize(cameras.to_world[view] * ray)
     surface.width = float(coarse.size) * surface.hit.depth / cameras.intrinsics[view][0]

@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
 from synpick_warp.kernels.render.lighting.color import pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, MovingBodies, mean_projected_area
 from synpick_warp.kernels.render.visibility.camera import AnyViews
-from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, body_of
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.state import Frames
 
@@ -126,7 +126,7 @@ def lag_limit(
     meshes: Meshes,
     history: LightHistory,
     moving: MovingBodies,
-    views: AnyViews,
+    shot: AnyShot,
     view: int,
     row: int,
     column: int,
@@ -139,12 +139,12 @@ def lag_limit(
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
-    slot = views.world[view] * history.cameras + views.slot[view]
+    slot = shot.views.world[view] * history.cameras + shot.views.slot[view]
     if int(history.segment[slot, row, column]) != segment:
         return 0
     frames = int(MAX_FRAMES)
     if segment != Segment.TABLE:
-        frames = moving.drift_frames[view, body_of(segment, views.instances)]
+        frames = moving.drift_frames[view, body_of(segment, shot.views.instances)]
     if frames == 0:
         return 0
     enough = float(history.max_paths << MAX_PERIOD_BITS)

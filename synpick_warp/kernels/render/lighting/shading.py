@@ -4,6 +4,8 @@
 triangle a pixel. The light is gathered once, and silhouettes are left to anti-aliasing.
 """
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment
@@ -33,11 +35,10 @@ from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shad
 from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, hit_position, in_image, loop_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.camera import hit_position, in_image, loop_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -57,6 +58,16 @@ class Sky:
     """Index of the environment map."""
     yaw: float
     """Rotation of the map about +z, counter-clockwise [rad]."""
+
+
+@wp.struct
+class DenoisedLight:
+    """Light of a batch of views for shading: that of coarse pixels, and the lamps' shadows."""
+
+    coarse: CoarseGrid
+    ratios: RatioImages
+    shadow_grid: CoarseGrid
+    shadows: LampShadows
 
 
 @wp.struct
@@ -106,31 +117,16 @@ def shade_surface(
 
 @wp.func
 def gather_light(
-    scene: AnyScene,
-    cameras: AnyCameras,
-    intrinsics: wp.vec4,
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    sky: Sky,
-    gbuffer: GBuffer,
-    ratios: RatioImages,
-    shadows: LampShadows,
-    edges: wp.array3d[wp.vec3],
-    view: int,
-    row: int,
-    column: int,
-    normal: wp.vec3,
+    scene: AnyScene, shot: AnyShot, denoised: DenoisedLight, sky: Sky, image: ShadedImage, view: int, row: int, column: int, normal: wp.vec3
 ) -> PixelLight:
-    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric `normal` in camera space.
-
-    `intrinsics` are those of the view; `edges` is that of `upsample_shadows`.
-    """
-    segment = gbuffer.segment[view, row, column]
-    plane = tangent_plane(cameras, intrinsics, view, row, column, segment, gbuffer.depth[view, row, column], normal)
+    """Upsample the denoised light and the lamps' shadows to a pixel whose surface has the geometric `normal` in camera space."""
+    cameras = shot.views.cameras
+    segment, depth = shot.gbuffer.segment[view, row, column], shot.gbuffer.depth[view, row, column]
+    plane = tangent_plane(cameras, cameras.intrinsics[view], view, row, column, segment, depth, normal)
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
-        result.lamps = upsample_shadows(shadows, edges, shadow_grid, view, row, column, plane)
-    result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
+        result.lamps = upsample_shadows(denoised.shadows, image.radiance, denoised.shadow_grid, view, row, column, plane)
+    result.ratios = upsample_ratios(denoised.ratios, denoised.coarse, view, row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result
 
@@ -180,36 +176,18 @@ def move_weights(center: wp.vec3, orientation: float, areas: wp.vec3) -> tuple[w
 
 
 @wp.func
-def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> Sky:
-    """Environment of a world, from the arrays over all worlds."""
-    sky = Sky()
-    sky.light = light[world]
-    sky.yaw = light_yaw[world]
-    return sky
-
-
-@wp.func
 def shade_pixel(
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    sky: Sky,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    ratios: RatioImages,
-    shadows: LampShadows,
-    edges: wp.array3d[wp.vec3],
-    views: AnyViews,
-    view: int,
-    row: int,
-    column: int,
-    samples_per_axis: int,
+    scene: AnyScene, shot: AnyShot, denoised: DenoisedLight, image: ShadedImage, view: int, row: int, column: int, samples_per_axis: int
 ) -> wp.vec3:
     """Radiance of a pixel; background pixels show the environment map.
 
     A pixel of a body is the mean of `samples_per_axis`² shading samples of its triangle, all in the light at the pixel's center. Kernels
-    pass a constant, so that the compiler removes the loop if there is one sample. `edges` is that of `upsample_shadows`.
+    pass a constant, so that the compiler removes the loop if there is one sample.
     """
+    views, bodies, gbuffer = shot.views, shot.bodies, shot.gbuffer
+    sky = Sky()
+    sky.light = shot.snapshot.light[views.world[view]]
+    sky.yaw = shot.snapshot.light_yaw[views.world[view]]
     intrinsics = views.cameras.intrinsics[view]
     to_world = views.cameras.to_world[view]
     middle_ray = loop_ray(views.cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
@@ -228,9 +206,7 @@ def shade_pixel(
         position = hit_position(views.cameras, view, middle_ray, gbuffer.depth[view, row, column])
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
     normal = wp.transpose(to_world) * surface.face_normal
-    light = gather_light(
-        scene, views.cameras, intrinsics, coarse, shadow_grid, sky, gbuffer, ratios, shadows, edges, view, row, column, normal
-    )
+    light = gather_light(scene, shot, denoised, sky, image, view, row, column, normal)
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
@@ -250,75 +226,23 @@ def shade_pixel(
     return total / float(samples)
 
 
-@kernel_of_views(cuda_max_registers=SHADE_REGISTERS)
-def shade_kernel(
-    # Scene:
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    ratios: RatioImages,
-    shadows: LampShadows,
-    views: AnyViews,
-    first: int,
-    # Out:
-    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
-):
-    """Shade each pixel at its center, in the upsampled denoised light; background pixels show the environment map.
+def kernel_of_shading(name: str, samples_per_axis: int, registers: int) -> Any:
+    """Kernel of `shade_pixel`. Before, `radiance` holds the visible fractions of lamps at shadow edges, see `filter_shadow_edges_kernel`.
+    Launched over view, pixel (tile order, from flat index `first` on)."""
 
-    Before, `radiance` holds the visible fractions of lamps at shadow edges, see `filter_shadow_edges_kernel`. Launched over view, pixel
-    (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(coarse.image, wp.tid() + first)
-    if in_image(coarse.image, row, column):
-        sky = world_sky(snapshot.light, snapshot.light_yaw, views.world[view])
-        radiance_inout[view, row, column] = shade_pixel(
-            scene, coarse, shadow_grid, sky, bodies, gbuffer, ratios, shadows, radiance_inout, views, view, row, column, 1
-        )
+    @kernel_of_views(name=name, cuda_max_registers=registers)
+    def shade_pixels_kernel(scene: AnyScene, shot: AnyShot, denoised: DenoisedLight, first: int, image_inout: ShadedImage):
+        """`shade_pixel` of each pixel."""
+        view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+        if in_image(shot.grid, row, column):
+            image_inout.radiance[view, row, column] = shade_pixel(
+                scene, shot, denoised, image_inout, view, row, column, wp.static(samples_per_axis)
+            )
+
+    return shade_pixels_kernel
 
 
-@kernel_of_views(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
-def shade_samples_kernel(
-    # Scene:
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    ratios: RatioImages,
-    shadows: LampShadows,
-    views: AnyViews,
-    first: int,
-    # Out:
-    radiance_inout: wp.array3d[wp.vec3],  # (view, row, column)
-):
-    """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel.
-
-    Launched over view, pixel (tile order, from flat index `first` on).
-    """
-    view, row, column = tile_pixel(coarse.image, wp.tid() + first)
-    if in_image(coarse.image, row, column):
-        sky = world_sky(snapshot.light, snapshot.light_yaw, views.world[view])
-        radiance_inout[view, row, column] = shade_pixel(
-            scene,
-            coarse,
-            shadow_grid,
-            sky,
-            bodies,
-            gbuffer,
-            ratios,
-            shadows,
-            radiance_inout,
-            views,
-            view,
-            row,
-            column,
-            SAMPLES_PER_AXIS,
-        )
+shade_kernel = kernel_of_shading("shade_kernel", 1, SHADE_REGISTERS)
+"""Shade each pixel at its center, in the upsampled denoised light."""
+shade_samples_kernel = kernel_of_shading("shade_samples_kernel", int(SAMPLES_PER_AXIS), SAMPLE_SHADE_REGISTERS)
+"""The same, but bodies with several shading samples a pixel."""

@@ -8,15 +8,15 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, unit_heading
+from synpick_warp.kernels.render.lighting.environment import lamp_direction, unit_heading
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, Table, ViewBodies, read_hit
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, ShadedImage, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -82,24 +82,20 @@ def list_edge_cells_kernel(coarse: CoarseGrid, views: AnyViews, first: int, shad
 
 
 @wp.func
-def pixel_plane(
-    meshes: Meshes, bodies: ViewBodies, gbuffer: GBuffer, views: AnyViews, view: int, row: int, column: int
-) -> tuple[Plane, wp.vec3]:
-    """Tangent plane at a pixel that shows a surface, and the surface's geometric normal in the world."""
-    outward = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
-    local = wp.transpose(views.cameras.to_world[view]) * normal
+def pixel_plane(meshes: Meshes, shot: AnyShot, view: int, row: int, column: int) -> Plane:
+    """Tangent plane at a pixel that shows a surface."""
+    gbuffer, cameras = shot.gbuffer, shot.views.cameras
+    outward = cameras.to_world[view] * camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    local = wp.transpose(cameras.to_world[view]) * visible_normal(meshes, shot, view, read_hit(gbuffer, view, row, column), outward)
     segment, depth = gbuffer.segment[view, row, column], gbuffer.depth[view, row, column]
-    return tangent_plane(views.cameras, views.cameras.intrinsics[view], view, row, column, segment, depth, local), normal
+    return tangent_plane(cameras, cameras.intrinsics[view], view, row, column, segment, depth, local)
 
 
 @kernel_of_views
 def list_edge_pixels_kernel(
     meshes: Meshes,
     coarse: CoarseGrid,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
+    shot: AnyShot,
     threads: int,
     first: int,
     shadows_inout: LampShadows,
@@ -111,14 +107,14 @@ def list_edge_pixels_kernel(
     does not read the counts, so a fixed number of `threads` strides over the listed pixels of the shadow grid of each chunk.
     """
     view, chunk, start = list_place(lists_inout, wp.tid() + first, threads)
-    if view >= views.count:
+    if view >= shot.views.count:
         return
     square = coarse.size * coarse.size
     for index in range(start, square * lists_inout.count[view, chunk, CELLS], threads):
         row, column = listed_pixel(coarse, lists_inout.cell, view, chunk, index)
         if in_image(coarse.image, row, column):
-            if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
-                plane, _normal = pixel_plane(meshes, bodies, gbuffer, views, view, row, column)
+            if int(shot.gbuffer.segment[view, row, column]) != Segment.NOTHING:
+                plane = pixel_plane(meshes, shot, view, row, column)
                 steepness = all_steepness(find_shadow_taps(shadows_inout, coarse, view, row, column, plane))
                 if steepness != wp.uint32(0):
                     shadows_inout.edge[view, row, column] = steepness
@@ -128,33 +124,22 @@ def list_edge_pixels_kernel(
 
 @wp.func
 def trace_pixel_edges(
-    meshes: Meshes,
-    table: Table,
-    coarse: CoarseGrid,
-    lights: Lights,
-    which: int,
-    heading: wp.vec2,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    steepness: wp.uint32,
-    view: int,
-    row: int,
-    column: int,
+    scene: PathScene, coarse: CoarseGrid, shot: AnyShot, which: int, heading: wp.vec2, steep: wp.uint32, view: int, row: int, column: int
 ) -> wp.uint32:
-    """Trace the rays of a pixel to the lamps whose `steepness` is above 0; packed as in `LampShadows.edge`."""
-    direction_to_surface = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
-    outward = views.cameras.to_world[view] * direction_to_surface
-    normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, row, column), views.instances, outward)
-    position = hit_position(views.cameras, view, direction_to_surface, gbuffer.depth[view, row, column])
+    """Trace the rays of a pixel to the lamps whose steepness, packed in `steep`, is above 0; packed as in `LampShadows.edge`."""
+    lights, gbuffer, cameras = scene.lights, shot.gbuffer, shot.views.cameras
+    direction_to_surface = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    outward = cameras.to_world[view] * direction_to_surface
+    normal = visible_normal(scene.meshes, shot, view, read_hit(gbuffer, view, row, column), outward)
+    position = hit_position(cameras, view, direction_to_surface, gbuffer.depth[view, row, column])
     result = wp.uint32(0)
     for lamp in range(lights.lamps[which]):
-        if (steepness >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS) != wp.uint32(0):
+        if (steep >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS) != wp.uint32(0):
             free = coarse.rays
             if wp.dot(normal, lamp_direction(lights, which, lamp, heading)) > 0.0:
                 for ray in range(coarse.rays):
                     direction = point_direction(lights, which, heading, lamp, coarse.rays, ray, row, column)
-                    if is_shadowed(meshes, table, bodies, view, views.instances, position, normal, direction):
+                    if is_shadowed(scene, shot, view, position, normal, direction):
                         free -= 1
             result |= wp.uint32(1 + free) << wp.uint32(4 * lamp)
     return result
@@ -162,18 +147,7 @@ def trace_pixel_edges(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_edges_kernel(
-    meshes: Meshes,
-    table: Table,
-    coarse: CoarseGrid,
-    lights: Lights,
-    snapshot: Frames,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    lists: EdgeLists,
-    views: AnyViews,
-    threads: int,
-    first: int,
-    shadows_inout: LampShadows,
+    scene: PathScene, coarse: CoarseGrid, shot: AnyShot, lists: EdgeLists, threads: int, first: int, shadows_inout: LampShadows
 ):
     """Adaptive sampling: trace shadow rays from each listed pixel to each lamp whose shadow is steep; the results replace the steepness in
     `edge`.
@@ -183,37 +157,27 @@ def trace_shadow_edges_kernel(
     on); `threads` as in `list_edge_pixels_kernel`.
     """
     view, chunk, start = list_place(lists, wp.tid() + first, threads)
-    if view >= views.count:
+    if view >= shot.views.count:
         return
-    world = views.world[view]
-    which = snapshot.light[world]
-    heading = unit_heading(snapshot.light_yaw[world])
+    world = shot.views.world[view]
+    which = shot.snapshot.light[world]
+    heading = unit_heading(shot.snapshot.light_yaw[world])
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
-        steepness = shadows_inout.edge[view, row, column]
-        shadows_inout.edge[view, row, column] = trace_pixel_edges(
-            meshes, table, coarse, lights, which, heading, bodies, gbuffer, views, steepness, view, row, column
-        )
+        steep = shadows_inout.edge[view, row, column]
+        shadows_inout.edge[view, row, column] = trace_pixel_edges(scene, coarse, shot, which, heading, steep, view, row, column)
 
 
 @kernel_of_views
 def filter_shadow_edges_kernel(
-    # Scene:
-    meshes: Meshes,
+    scene: PathScene,
     coarse: CoarseGrid,
-    lights: Lights,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
+    shot: AnyShot,
     lists: EdgeLists,
     shadows: LampShadows,
-    views: AnyViews,
     threads: int,
     first: int,
-    # Out:
-    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
+    image_out: ShadedImage,
 ):
     """Filter the traced edges: each listed pixel of `radiance` receives the visible fractions of the lamps, see `filter_edge`, packed by
     `pack_fractions`; they lie there until the pixel is shaded, which saves memory.
@@ -221,11 +185,11 @@ def filter_shadow_edges_kernel(
     Launched over view, chunk, thread (flat, from `first` on); `threads` as in `list_edge_pixels_kernel`.
     """
     view, chunk, start = list_place(lists, wp.tid() + first, threads)
-    if view >= views.count:
+    if view >= shot.views.count:
         return
-    lamps = lights.lamps[snapshot.light[views.world[view]]]
+    lamps = scene.lights.lamps[shot.snapshot.light[shot.views.world[view]]]
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
-        plane, _normal = pixel_plane(meshes, bodies, gbuffer, views, view, row, column)
-        fractions = filter_edge(shadows, coarse, gbuffer, lamps, view, row, column, plane)
-        radiance_out[view, row, column] = pack_fractions(fractions)
+        plane = pixel_plane(scene.meshes, shot, view, row, column)
+        fractions = filter_edge(shadows, coarse, shot.gbuffer, lamps, view, row, column, plane)
+        image_out.radiance[view, row, column] = pack_fractions(fractions)

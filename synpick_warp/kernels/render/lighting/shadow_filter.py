@@ -15,23 +15,34 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     unpack_normal,
 )
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_share
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
-from synpick_warp.kernels.render.lighting.shadows import rays_bits, rays_depth, rays_normal, rays_segment, spread_bits, visible_normal
-from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, read_hit
+from synpick_warp.kernels.render.lighting.shadows import (
+    STRATA_PERIOD,
+    ShadowRays,
+    rays_bits,
+    rays_depth,
+    rays_normal,
+    rays_segment,
+    spread_bits,
+    visible_normal,
+)
+from synpick_warp.kernels.render.visibility.camera import camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, read_hit
 from synpick_warp.kernels.render.visibility.records import read_uint64, write_record, write_uint64
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-REACH = wp.constant(2)
+FILTER_RADIUS = wp.constant(int(STRATA_PERIOD) // 2)
 """Largest offset of the filter's taps [pixels of the shadow grid]; those at this offset count half, so that each part of a lamp, which
-returns after four pixels, has the same weight."""
+returns after STRATA_PERIOD pixels, has the same weight."""
+STEEPNESS_DISTANCE = wp.constant(2)
+"""Distance of the pixels around a pixel by which steepness is measured [pixels of the shadow grid]."""
 MIN_STEEPNESS = wp.constant(0.65)
 MAX_STEEPNESS = wp.constant(0.9)
-"""Difference of a lamp's visible fractions on both sides of a pixel, REACH away, up to which the filter is right, and from which on rays
-from the pixels replace it. Between them both are blended."""
+"""Difference of a lamp's visible fractions on both sides of a pixel, STEEPNESS_DISTANCE away, up to which the filter is right, and from
+which on rays from the pixels replace it. Between them both are blended."""
 FULL_SHARE = wp.constant(0.2)
 """Share of a lamp in the light of an open surface that faces up, below which its shadow counts as less steep: its edge is
 too faint to be missed."""
@@ -44,7 +55,8 @@ MIN_COSINE = wp.constant(0.87)
 """Minimum cosine of the angle between the normals of one surface. Lamps behind a surface count as unblocked, and must not light one that
 bends towards them, such as the bevel between a wall and the floor."""
 MIN_SUPPORT = wp.constant(4)
-"""Minimum number of the eight pixels around a pixel, REACH away, on its surface; with fewer, its fractions come from too few rays."""
+"""Minimum number of the eight pixels around a pixel, STEEPNESS_DISTANCE away, on its surface; with fewer, its fractions come from too few
+rays."""
 EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
 """Bytes 0, 2, 4, 6, each with room for a sum in 16 bits."""
 SEGMENT_BITS = wp.constant(wp.uint32(0xFF))
@@ -134,17 +146,16 @@ def lamp_fractions(even: wp.uint64, odd: wp.uint64, weight: int, lamps: int, ray
 
 
 @wp.func
-def grid_plane(
-    meshes: Meshes, coarse: CoarseGrid, bodies: ViewBodies, gbuffer: GBuffer, views: AnyViews, view: int, row: int, column: int
-) -> Plane:
+def grid_plane(meshes: Meshes, coarse: CoarseGrid, shot: AnyShot, view: int, row: int, column: int) -> Plane:
     """Tangent plane at the middle pixel of a pixel of the shadow grid, which must show a surface."""
+    gbuffer, cameras = shot.gbuffer, shot.views.cameras
     pixel = middle_pixel(coarse, row, column)
     segment = gbuffer.segment[view, pixel[0], pixel[1]]
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
-    ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-    normal = visible_normal(meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances, ray)
-    local = wp.transpose(views.cameras.to_world[view]) * normal
-    return tangent_plane(views.cameras, views.cameras.intrinsics[view], view, pixel[0], pixel[1], segment, depth, local)
+    ray = cameras.to_world[view] * camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+    normal = visible_normal(meshes, shot, view, read_hit(gbuffer, view, pixel[0], pixel[1]), ray)
+    local = wp.transpose(cameras.to_world[view]) * normal
+    return tangent_plane(cameras, cameras.intrinsics[view], view, pixel[0], pixel[1], segment, depth, local)
 
 
 @wp.func
@@ -170,22 +181,7 @@ def grid_shows(coarse: CoarseGrid, rays: wp.array3d[wp.uint64], plane: Plane, pi
 
 
 @kernel_of_views
-def filter_shadows_kernel(
-    # Scene:
-    meshes: Meshes,
-    coarse: CoarseGrid,
-    lights: Lights,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    views: AnyViews,
-    first: int,
-    # Out:
-    shadows_out: LampShadows,
-):
+def filter_shadows_kernel(scene: PathScene, coarse: CoarseGrid, shot: AnyShot, traced: ShadowRays, first: int, shadows_out: LampShadows):
     """Tent-edged mean filter of shadow rays: `fractions` receives the visible fraction of each lamp over 5 x 5 pixels on one surface.
 
     Pixels count if they are on the same body and near one tangent plane. Nothing is written in views under a map without lamps and where no
@@ -194,16 +190,17 @@ def filter_shadows_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    which = snapshot.light[views.world[view]]
+    lights, rays = scene.lights, traced.packed
+    which = shot.snapshot.light[shot.views.world[view]]
     if lights.lamps[which] == 0 or int(rays_segment(rays[view, row, column])) == Segment.NOTHING:
         return
-    plane = grid_plane(meshes, coarse, bodies, gbuffer, views, view, row, column)
+    plane = grid_plane(scene.meshes, coarse, shot, view, row, column)
     pixel = middle_pixel(coarse, row, column)
     even = wp.uint64(0)
     odd = wp.uint64(0)
     total = int(0)
     # Not unrolled.
-    reach = int(REACH)
+    reach = int(FILTER_RADIUS)
     for down in range(-reach, reach + 1):
         for right in range(-reach, reach + 1):
             if grid_shows(coarse, rays, plane, pixel, view, row + down, column + right):
@@ -312,31 +309,19 @@ def mark_edges(coarse: CoarseGrid, near_edge: wp.array3d[wp.uint8], view: int, r
 
 @kernel_of_views
 def measure_steepness_kernel(
-    # Scene:
-    meshes: Meshes,
-    coarse: CoarseGrid,
-    lights: Lights,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    rays: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
-    views: AnyViews,
-    first: int,
-    # Out:
-    shadows_inout: LampShadows,
+    scene: PathScene, coarse: CoarseGrid, shot: AnyShot, traced: ShadowRays, first: int, shadows_inout: LampShadows
 ):
-    """Steepness of each lamp's shadow, the range of its fractions over nine pixels, REACH apart, on one surface: `record` is written.
+    """Steepness of each lamp's shadow, the range of its fractions over nine pixels, STEEPNESS_DISTANCE apart, on one surface.
 
-    `near_edge` is set around pixels whose shadow is steep, and around those whose right and lower neighbours are not all on the same
-    surface: pixels of the image between them may find no pixel of the shadow grid on their own surface. Launched over view, pixel of the
-    shadow grid (tile order, from flat index `first` on).
+    `record` is written. `near_edge` is set around pixels whose shadow is steep, and around those whose right and lower neighbours are not
+    all on the same surface: pixels of the image between them may find no pixel of the shadow grid on their own surface. Launched over view,
+    pixel of the shadow grid (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    which = snapshot.light[views.world[view]]
+    lights, rays = scene.lights, traced.packed
+    which = shot.snapshot.light[shot.views.world[view]]
     if lights.lamps[which] == 0:
         return
     index = flat_index(coarse.grid, view, row, column)
@@ -344,15 +329,15 @@ def measure_steepness_kernel(
         write_record(shadows_inout.record, index, wp.vec4())
         mark_edges(coarse, shadows_inout.near_edge, view, row, column, 1)
         return
-    plane = grid_plane(meshes, coarse, bodies, gbuffer, views, view, row, column)
+    plane = grid_plane(scene.meshes, coarse, shot, view, row, column)
     pixel = middle_pixel(coarse, row, column)
     own = read_uint64(shadows_inout.fractions, index)
     extremes = FractionRange(wp.uint32(own), wp.uint32(own), wp.uint32(own >> wp.uint64(32)), wp.uint32(own >> wp.uint64(32)))
     support = int(0)
     around = int(9)
     for tap in range(around):
-        down = REACH * (tap // 3 - 1)
-        right = REACH * (tap % 3 - 1)
+        down = STEEPNESS_DISTANCE * (tap // 3 - 1)
+        right = STEEPNESS_DISTANCE * (tap % 3 - 1)
         if grid_shows(coarse, rays, plane, pixel, view, row + down, column + right):
             extremes = extend_range(extremes, read_uint64(shadows_inout.fractions, index + down * coarse.grid.width + right))
             support += 1

@@ -12,11 +12,11 @@ from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, middle_
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, rotate_heading, unit_heading
 from synpick_warp.kernels.render.lighting.history import LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, AnyViews, camera_ray, hit_position, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, read_hit
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, body_of, face_normal, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -48,6 +48,14 @@ EVERY_BYTE = wp.constant(wp.uint64(0x0101010101010101))
 """1 in each byte."""
 CARRY_BITS = wp.constant(wp.uint64(0x7F7F7F7F7F7F7F7F))
 """Added to bytes of at most 0x80, this sets their highest bit if they are not 0."""
+
+
+@wp.struct
+class ShadowRays:
+    """Traced shadow rays on the shadow grid."""
+
+    packed: wp.array3d[wp.uint64]
+    """(view, shadow_row, shadow_column): the lamps' visibility bits, depth, segmentation id and normal, packed by `pack_rays`."""
 
 
 @wp.func
@@ -185,25 +193,24 @@ def faces_lamp(lights: Lights, which: int, heading: wp.vec2, ray: int, normal: w
 
 
 @wp.func
-def visible_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, instances: int, ray: wp.vec3) -> wp.vec3:
+def visible_normal(meshes: Meshes, shot: AnyShot, view: int, hit: Hit, ray: wp.vec3) -> wp.vec3:
     """Geometric unit normal of a hit, in the world, on the side from which a `ray` comes (its direction, in the world)."""
-    normal = face_normal(meshes, bodies, view, hit, instances)
+    normal = face_normal(meshes, shot, view, hit)
     return wp.where(wp.dot(normal, ray) > 0.0, -normal, normal)
 
 
 @wp.func
-def is_shadowed(
-    meshes: Meshes, table: Table, bodies: ViewBodies, view: int, tote: int, position: wp.vec3, normal: wp.vec3, direction: wp.vec3
-) -> bool:
-    """Shadow test: whether a unit `direction`, in the world, points below the surface or is blocked; `tote`: row of its body, -1: none."""
+def is_shadowed(scene: PathScene, shot: AnyShot, view: int, position: wp.vec3, normal: wp.vec3, direction: wp.vec3) -> bool:
+    """Shadow test: whether a unit `direction`, in the world, points below the surface or is blocked."""
     if wp.dot(normal, direction) <= 0.0:
         return True
-    return is_blocked(meshes, table, bodies, view, tote, position + RAY_OFFSET * normal, direction, FAR)
+    start = position + RAY_OFFSET * normal
+    return is_blocked(scene.meshes, scene.table, shot.bodies, view, shot.views.instances, start, direction, FAR)
 
 
 @wp.func
 def last_rays(
-    history: LightHistory, moving: MovingBodies, views: AnyViews, view: int, slot: int, row: int, column: int, segment: int
+    history: LightHistory, moving: MovingBodies, shot: AnyShot, view: int, slot: int, row: int, column: int, segment: int
 ) -> tuple[bool, int]:
     """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
 
@@ -213,7 +220,7 @@ def last_rays(
     if history.max_paths == 0 or moving.holds[view] == 0:
         return False, 0
     last = int(history.shadows[slot, row, column])
-    if last >> 8 != segment or is_refreshed(row, column, history.frame[slot]) or not is_calm(moving, view, segment, views.instances):
+    if last >> 8 != segment or is_refreshed(row, column, history.frame[slot]) or not is_calm(moving, view, segment, shot.views.instances):
         return False, 0
     return True, last & ALL_RAYS
 
@@ -234,22 +241,13 @@ def changed_rays(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_rays_kernel(
-    # Scene:
-    meshes: Meshes,
-    table: Table,
+    scene: PathScene,
     coarse: CoarseGrid,
-    lights: Lights,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
+    shot: AnyShot,
     moving: MovingBodies,
     first: int,
-    # Out:
     history_inout: LightHistory,
-    rays_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    rays_out: ShadowRays,
 ):
     """Shadow rays from the middle pixels of the shadow grid, traced or reused from the last frame; writes `rays_out` and the history.
 
@@ -258,24 +256,25 @@ def trace_shadow_rays_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    world = views.world[view]
-    which = snapshot.light[world]
+    lights, gbuffer, cameras = scene.lights, shot.gbuffer, shot.views.cameras
+    world = shot.views.world[view]
+    which = shot.snapshot.light[world]
     rays = lights.lamps[which] * lights.lamp_rays[which]
     if rays == 0:
         return
     pixel = middle_pixel(coarse, row, column)
     segment = int(gbuffer.segment[view, pixel[0], pixel[1]])
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
-    slot = world * history_inout.cameras + views.slot[view]
+    slot = world * history_inout.cameras + shot.views.slot[view]
     free, packed_normal = int(ALL_RAYS), int(0)
     if segment != Segment.NOTHING:
-        camera_direction = camera_ray(views.cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-        position = hit_position(views.cameras, view, camera_direction, depth)
-        heading = unit_heading(snapshot.light_yaw[world])
+        camera_direction = camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+        position = hit_position(cameras, view, camera_direction, depth)
+        heading = unit_heading(shot.snapshot.light_yaw[world])
         hit = read_hit(gbuffer, view, pixel[0], pixel[1])
-        normal = visible_normal(meshes, bodies, view, hit, views.instances, views.cameras.to_world[view] * camera_direction)
-        packed_normal = pack_normal(wp.transpose(views.cameras.to_world[view]) * normal)
-        known, last = last_rays(history_inout, moving, views, view, slot, row, column, segment)
+        normal = visible_normal(scene.meshes, shot, view, hit, cameras.to_world[view] * camera_direction)
+        packed_normal = pack_normal(wp.transpose(cameras.to_world[view]) * normal)
+        known, last = last_rays(history_inout, moving, shot, view, slot, row, column, segment)
         traced = int(ALL_RAYS)
         if known:
             free = last
@@ -286,8 +285,8 @@ def trace_shadow_rays_kernel(
                 free |= bit
                 if faces_lamp(lights, which, heading, ray, normal):
                     direction = ray_direction(lights, which, heading, ray, row, column)
-                    if is_shadowed(meshes, table, bodies, view, views.instances, position, normal, direction):
+                    if is_shadowed(scene, shot, view, position, normal, direction):
                         free -= bit
     if history_inout.max_paths > 0:
         history_inout.shadows[slot, row, column] = pack_last(segment, free)
-    rays_out[view, row, column] = pack_rays(free, depth, segment, packed_normal)
+    rays_out.packed[view, row, column] = pack_rays(free, depth, segment, packed_normal)

@@ -1,9 +1,14 @@
 """G-buffer: segmentation id, triangle, barycentric coordinates and depth of each pixel; and the structs of geometry it refers to."""
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, LensViews, Views
+from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
 from synpick_warp.kernels.render.visibility.wide_bvh import WideBvh
+from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -127,6 +132,40 @@ class GBuffer:
 
 
 @wp.struct
+class ShotData:
+    """Batch of views of one image size: their worlds and cameras, the bodies in front of each, and what their pixels show."""
+
+    grid: ImageGrid
+    snapshot: Frames
+    """Frame and light of each world."""
+    bodies: ViewBodies
+    gbuffer: GBuffer
+    views: Views
+
+
+LensShot = variant_of(ShotData, "LensShot", views=LensViews)
+"""Batch of views, where some cameras are distorted."""
+AnyShot = Any
+"""`ShotData`, or `LensShot`: kernels are compiled for each; see `variants`."""
+VARIANTS["shot"] = ShotData, LensShot
+
+
+@wp.struct
+class ShadedImage:
+    """Linear radiance of a batch of views before post-processing, and for each pixel a resolve code: 0, it keeps its radiance, else packed
+    selectors of the pixels whose radiance its samples average.
+    """
+
+    radiance: wp.array3d[wp.vec3]
+    """Linear radiance (view, row, column) before exposure; of anti-aliased pixels, that of the pixel's centre."""
+    resolve: wp.array3d[wp.uint32]
+    """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
+    SOURCE_BITS that select the pixel whose radiance it takes, see `images.antialias.source_offset`."""
+    samples: int
+    """Number of coverage samples per anti-aliased pixel: 4, 8 or 16, distributed equally over its quadrants."""
+
+
+@wp.struct
 class Hit:
     """Closest hit of one ray: segmentation id (0: nothing), triangle, barycentric weights, and depth [m], planar of a camera ray, along the
     ray of any other.
@@ -190,9 +229,9 @@ def triangle_normal(meshes: Meshes, mesh: int, triangle: int) -> wp.vec3:
 
 
 @wp.func
-def face_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, instances: int) -> wp.vec3:
+def face_normal(meshes: Meshes, shot: AnyShot, view: int, hit: Hit) -> wp.vec3:
     """Geometric unit normal of a hit in the world; its sign is that of the triangle's winding, not towards the ray."""
     if hit.segment == Segment.TABLE:
         return wp.vec3(0.0, 0.0, 1.0)
-    body = body_of(hit.segment, instances)
-    return wp.transpose(bodies.world_rotation[view, body]) * triangle_normal(meshes, bodies.mesh[view, body], hit.triangle)
+    body = body_of(hit.segment, shot.views.instances)
+    return wp.transpose(shot.bodies.world_rotation[view, body]) * triangle_normal(meshes, shot.bodies.mesh[view, body], hit.triangle)

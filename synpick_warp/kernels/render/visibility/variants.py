@@ -25,10 +25,11 @@ def variant_of(struct: Any, name: str, **members: Any) -> Any:
     return wp.struct(type(name, (), body))
 
 
-def kernel_of_views(function: Callable[..., None] | None = None, **options: Any) -> Any:
-    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel."""
+def kernel_of_views(function: Callable[..., None] | None = None, *, name: str = "", **options: Any) -> Any:
+    """Decorate a kernel with parameters of `VARIANTS`, as `wp.kernel` does; the result is the plain kernel. `name`: of a closure."""
     if function is None:
-        return lambda decorated: kernel_of_views(decorated, **options)
+        return lambda decorated: kernel_of_views(decorated, name=name, **options)
+    function.__qualname__ = name or function.__qualname__
     template: Any = wp.kernel(function, **options)
     _parameters[template] = {name: VARIANTS[name] for name, given in template.func.__annotations__.items() if given is Any}
     kernel = wp.overload(template, {name: plain for name, (plain, _) in _parameters[template].items()})

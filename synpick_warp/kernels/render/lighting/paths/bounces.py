@@ -16,10 +16,8 @@ from synpick_warp.kernels.render.lighting.paths.queues import (
     requeue_path,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import TERMINATED, AnyScene, PathRules, extend_path, next_vertex
-from synpick_warp.kernels.render.visibility.camera import AnyViews
-from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -29,9 +27,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def extend_queued_paths_kernel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Frames,
-    bodies: ViewBodies,
-    views: AnyViews,
+    shot: AnyShot,
     rules: PathRules,
     stage: int,
     first: int,
@@ -54,15 +50,12 @@ def extend_queued_paths_kernel(
         return
     path, pixel = read_path(queues_inout, first_record(queues_inout, view, region, slot))
     view, row, column = interleaved_pixel(coarse, (view * regions + region) * REGION_PIXELS + pixel.offset)
-    world = views.world[view]
-    context = make_context(
-        scene, coarse, rules, views, view, row, column, snapshot.episode[world], snapshot.light[world], snapshot.light_yaw[world]
-    )
-    vertex = next_vertex(scene, bodies, rules, context, path)
-    path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, path, vertex)
+    context = make_context(scene, coarse, rules, shot, view, row, column)
+    vertex = next_vertex(scene, shot, rules, context, path)
+    path = extend_path(scene, shot, rules, context, pixel.number, pixel.diffuse, path, vertex)
     if path.bounce == TERMINATED:
         cell = flat_index(coarse.grid, view, row, column)
-        history_slot = world * history_inout.cameras + views.slot[view]
+        history_slot = shot.views.world[view] * history_inout.cameras + shot.views.slot[view]
         finish_path(scene, rules, context, coarse_light_out, history_inout, cell, history_slot, row, column, pixel, path.radiance)
     else:
         requeue_path(queues_inout, view, region, stage + 1, slot, path, pixel)

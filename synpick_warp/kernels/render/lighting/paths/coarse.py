@@ -5,6 +5,8 @@ Their ratio, the visibility ratio, varies slowly over a surface even where it be
 ratio, and each pixel multiplies it by its own unoccluded light (after Heitz, Hill and McGuire, 2018).
 """
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
@@ -40,12 +42,11 @@ from synpick_warp.kernels.render.lighting.paths.tracing import (
     next_vertex,
 )
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
-from synpick_warp.kernels.render.visibility.camera import AnyViews, in_image
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.camera import in_image
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot
 from synpick_warp.kernels.render.visibility.records import write_record
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.state import Frames
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, SINGLE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -59,38 +60,27 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 
 
 @wp.func
-def make_context(
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    rules: PathRules,
-    views: AnyViews,
-    view: int,
-    row: int,
-    column: int,
-    episode: int,
-    light: int,
-    yaw: float,
-) -> PathContext:
+def make_context(scene: AnyScene, coarse: CoarseGrid, rules: PathRules, shot: AnyShot, view: int, row: int, column: int) -> PathContext:
     """Path-tracing context of a coarse pixel: its view, environment maps, random number stream and rotation of sample points.
 
     `shift` is a Cranley-Patterson rotation of the sample sequence that grows with `row` and `column`. All images of an episode use one
-    stream; see `first_path_index`. The first surface is lit by the map without its lamps: row `light` + number of maps of
-    `Lights.radiance`. `yaw` is in radians.
+    stream; see `first_path_index`. The first surface is lit by the map without its lamps: its row plus the number of maps of
+    `Lights.radiance`.
     """
+    world = shot.views.world[view]
     context = PathContext()
     context.view = view
-    context.instances = views.instances
-    context.light = light
-    context.first_light = light + scene.lights.maps
-    context.yaw = yaw
-    context.key = stream_key(rules.seed, episode, 0, Stream.PATHS)
+    context.light = shot.snapshot.light[world]
+    context.first_light = context.light + scene.lights.maps
+    context.yaw = shot.snapshot.light_yaw[world]
+    context.key = stream_key(rules.seed, shot.snapshot.episode[world], 0, Stream.PATHS)
     context.shift = wp.vec2(SHIFT_RANGE * float(row) / float(coarse.grid.height), SHIFT_RANGE * float(column) / float(coarse.grid.width))
     return context
 
 
 @wp.func
 def average_paths(
-    scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, samples: int, first: Vertex, width: float, pixel: PathPixel
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, samples: int, first: Vertex, width: float, pixel: PathPixel
 ) -> SplitRadiance:
     """Monte Carlo mean of the reflected light over `samples` paths of a coarse pixel, each limited by the firefly clamp (`clamp_path`).
 
@@ -104,8 +94,8 @@ def average_paths(
     while sample < samples:
         vertex = first
         if path.bounce > 0:
-            vertex = next_vertex(scene, bodies, rules, context, path)
-        path = extend_path(scene, bodies, rules, context, pixel.number + sample, pixel.diffuse, path, vertex)
+            vertex = next_vertex(scene, shot, rules, context, path)
+        path = extend_path(scene, shot, rules, context, pixel.number + sample, pixel.diffuse, path, vertex)
         if path.bounce == TERMINATED:
             light = clamp_path(path.radiance, pixel.unoccluded, lamplit, pixel.specular_limit, rules.firefly_clamp)
             sum.diffuse += light.diffuse
@@ -217,10 +207,7 @@ def make_path_pixel(
 def trace_pixel(
     scene: AnyScene,
     coarse: CoarseGrid,
-    snapshot: Frames,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
+    shot: AnyShot,
     lists: PathLists,
     rules: PathRules,
     thread: int,
@@ -245,110 +232,63 @@ def trace_pixel(
     view, row, column = interleaved_pixel(coarse, index)
     if not in_image(coarse.grid, row, column):
         return
-    world = views.world[view]
-    slot = world * history.cameras + views.slot[view]
+    slot = shot.views.world[view] * history.cameras + shot.views.slot[view]
     samples = new_paths(rules, history, slot, known)
     if queued != (samples == 1 and regions > 0):
         return
     cell = flat_index(coarse.grid, view, row, column)
-    surface = coarse_surface(views.cameras, coarse, gbuffer, view, row, column)
+    surface = coarse_surface(coarse, shot, view, row, column)
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
         return
-    vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
-    write_guide(guide_out, views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)
-    context = make_context(
-        scene, coarse, rules, views, view, row, column, snapshot.episode[world], snapshot.light[world], snapshot.light_yaw[world]
-    )
+    vertex = make_vertex(scene, shot, view, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    write_guide(guide_out, shot.views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)
+    context = make_context(scene, coarse, rules, shot, view, row, column)
     beginning = wp.where(known > 0, rules.first_samples, samples)
     number = first_path_index(beginning, row, column, path_number(history_frame(history, slot, known), bits), known > 0)
     pixel = make_path_pixel(scene, rules, context, vertex, index, surface.hit.segment, known, number)
     if queued:
-        path = extend_path(scene, bodies, rules, context, pixel.number, pixel.diffuse, init_path(surface.width), vertex)
+        path = extend_path(scene, shot, rules, context, pixel.number, pixel.diffuse, init_path(surface.width), vertex)
         if path.bounce == TERMINATED:
             finish_path(scene, rules, context, coarse_light_out, history, cell, slot, row, column, pixel, path.radiance)
         else:
             queue_path(queues, view, (index // REGION_PIXELS) % regions, path, pixel)
     else:
-        paths = average_paths(scene, bodies, rules, context, samples, vertex, surface.width, pixel)
+        paths = average_paths(scene, shot, rules, context, samples, vertex, surface.width, pixel)
         exposure = scene.lights.exposure[context.light]
         finish_pixel(coarse_light_out, history, exposure, cell, slot, row, column, pixel, paths, samples)
 
 
-@kernel_of_views(cuda_max_registers=COARSE_PATH_REGISTERS)
-def trace_coarse_paths_kernel(
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    snapshot: Frames,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    lists: PathLists,
-    rules: PathRules,
-    first: int,
-    queues_inout: PathQueues,
-    history_inout: LightHistory,
-    guide_out: Guide,
-    coarse_light_out: CoarseLight,
-):
-    """Coarse path pass: paths from the middle pixel of each coarse pixel; their mean light, the unoccluded light, and the guide image.
+def kernel_of_paths(name: str, queued: bool, registers: int) -> Any:
+    """Kernel of `trace_pixel`, whose argument `queued` is a constant. Launched over view, coarse pixel (interleaved or listed order, from
+    flat index `first` on)."""
 
-    With a history only coarse pixels in `lists` are traced, with `new_paths` paths each, and their light is accumulated over frames. The
-    lamps' direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left to
-    `start_paths_kernel`. Launched over view, coarse pixel (interleaved or listed order, from flat index `first` on).
-    """
-    trace_pixel(
-        scene,
-        coarse,
-        snapshot,
-        bodies,
-        gbuffer,
-        views,
-        lists,
-        rules,
-        wp.tid() + first,
-        queues_inout,
-        history_inout,
-        guide_out,
-        coarse_light_out,
-        False,
-    )
+    @kernel_of_views(name=name, cuda_max_registers=registers)
+    def trace_pixels_kernel(
+        scene: AnyScene,
+        coarse: CoarseGrid,
+        shot: AnyShot,
+        lists: PathLists,
+        rules: PathRules,
+        first: int,
+        queues_inout: PathQueues,
+        history_inout: LightHistory,
+        guide_out: Guide,
+        coarse_light_out: CoarseLight,
+    ):
+        """`trace_pixel` of each coarse pixel."""
+        thread = wp.tid() + first
+        trace_pixel(scene, coarse, shot, lists, rules, thread, queues_inout, history_inout, guide_out, coarse_light_out, queued)
+
+    return trace_pixels_kernel
 
 
-@kernel_of_views(cuda_max_registers=SINGLE_PATH_REGISTERS)
-def start_paths_kernel(
-    scene: AnyScene,
-    coarse: CoarseGrid,
-    snapshot: Frames,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    views: AnyViews,
-    lists: PathLists,
-    rules: PathRules,
-    first: int,
-    queues_inout: PathQueues,
-    history_inout: LightHistory,
-    guide_out: Guide,
-    coarse_light_out: CoarseLight,
-):
-    """Wavefront path tracing, first stage: trace the first bounce of the path of each coarse pixel that has a single one.
+trace_coarse_paths_kernel = kernel_of_paths("trace_coarse_paths_kernel", False, COARSE_PATH_REGISTERS)
+"""Coarse path pass: paths from the middle pixel of each coarse pixel; their mean light, the unoccluded light, and the guide image.
 
-    Paths that terminate are stored as by `trace_coarse_paths_kernel`; others are queued for `extend_queued_paths_kernel`. Launched over
-    view, coarse pixel, as `trace_coarse_paths_kernel`.
-    """
-    trace_pixel(
-        scene,
-        coarse,
-        snapshot,
-        bodies,
-        gbuffer,
-        views,
-        lists,
-        rules,
-        wp.tid() + first,
-        queues_inout,
-        history_inout,
-        guide_out,
-        coarse_light_out,
-        True,
-    )
+With a history only coarse pixels in `lists` are traced, with `new_paths` paths each, and their light is accumulated over frames. The lamps'
+direct light is left out, see `shadows`. Where there are queues, coarse pixels with a single path are left to `start_paths_kernel`."""
+start_paths_kernel = kernel_of_paths("start_paths_kernel", True, SINGLE_PATH_REGISTERS)
+"""Wavefront path tracing, first stage: trace the first bounce of the path of each coarse pixel that has a single one.
+
+Paths that terminate are stored as by `trace_coarse_paths_kernel`; others are queued for `extend_queued_paths_kernel`."""

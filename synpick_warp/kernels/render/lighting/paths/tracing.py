@@ -32,11 +32,10 @@ from synpick_warp.kernels.render.lighting.sampling import (
     scrambled_point,
 )
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
-from synpick_warp.kernels.render.visibility.camera import AnyViews, ImageGrid, camera_ray, hit_position, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
+from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, ShadedImage, Table, body_of
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views, variant_of
 from synpick_warp.kernels.rng import mix, stream_key
-from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
@@ -101,8 +100,6 @@ class PathContext:
     """Constants of all paths of one pixel: its view, its light, its stream of random numbers."""
 
     view: int
-    instances: int
-    """Instance capacity of a world."""
     first_light: int
     """Environment map for the first surface, row of `Lights.radiance`; `coarse` takes the one without lamps, whose light is added apart."""
     light: int
@@ -158,21 +155,14 @@ class Path:
 
 @wp.func
 def make_vertex(
-    scene: AnyScene,
-    bodies: ViewBodies,
-    view: int,
-    instances: int,
-    hit: Hit,
-    position: wp.vec3,
-    outgoing: wp.vec3,
-    width: float,
-    min_roughness: float,
+    scene: AnyScene, shot: AnyShot, view: int, hit: Hit, position: wp.vec3, outgoing: wp.vec3, width: float, min_roughness: float
 ) -> Vertex:
     """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
+    bodies = shot.bodies
     surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
     at = position
     if hit.segment != Segment.TABLE:
-        body = body_of(hit.segment, instances)
+        body = body_of(hit.segment, shot.views.instances)
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
     else:
         # Exactly on the table: far away, float32 rounding moves a hit off its plane by more than RAY_OFFSET.
@@ -236,7 +226,7 @@ def sample_point(context: PathContext, index: int, dimension: int) -> wp.vec2:
 
 @wp.func
 def sample_direct_light(
-    scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
 ) -> EnvironmentSample:
     """Next-event estimation: sample a direction of the map and test it by a shadow ray.
 
@@ -251,7 +241,7 @@ def sample_direct_light(
     weight = mis_weight(rules.strategy, LIGHT_SAMPLING, sample.pdf, brdf_pdf(vertex.brdf, result.direction)) / sample.pdf
     if weight <= 0.0 or wp.dot(result.direction, vertex.brdf.normal) <= 0.0:
         return result
-    if is_blocked(scene.meshes, scene.table, bodies, context.view, -1, vertex.origin, result.direction, FAR):
+    if is_blocked(scene.meshes, scene.table, shot.bodies, context.view, -1, vertex.origin, result.direction, FAR):
         return result
     result.radiance = weight * environment_radiance(scene.lights, light, sample.direction)
     return result
@@ -274,23 +264,14 @@ def init_path(width: float) -> Path:
 
 
 @wp.func
-def next_vertex(scene: AnyScene, bodies: ViewBodies, rules: PathRules, context: PathContext, path: Path) -> Vertex:
+def next_vertex(scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, path: Path) -> Vertex:
     """Build the vertex at the last hit of a path that goes on."""
-    return make_vertex(
-        scene, bodies, context.view, context.instances, path.hit, path.position, -path.direction, path.width, rules.min_roughness
-    )
+    return make_vertex(scene, shot, context.view, path.hit, path.position, -path.direction, path.width, rules.min_roughness)
 
 
 @wp.func
 def extend_path(
-    scene: AnyScene,
-    bodies: ViewBodies,
-    rules: PathRules,
-    context: PathContext,
-    index: int,
-    first_diffuse: wp.vec3,
-    path: Path,
-    vertex: Vertex,
+    scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path, vertex: Vertex
 ) -> Path:
     """Scatter path `index` once at its last `vertex`: add the direct light there, then move the path to the next hit or terminate it.
 
@@ -303,7 +284,7 @@ def extend_path(
     result = path
     result.bounce = TERMINATED
     dimension = 1 + DIMENSIONS_PER_BOUNCE * bounce
-    direct = sample_direct_light(scene, bodies, rules, context, light, vertex, sample_point(context, index, dimension))
+    direct = sample_direct_light(scene, shot, rules, context, light, vertex, sample_point(context, index, dimension))
     if wp.max(direct.radiance) > 0.0:
         value = evaluate_brdf(scene.surfaces.albedo, vertex.brdf, direct.direction)
         throughput = extend_throughput(path.throughput, value, vertex.brdf.diffuse, bounce)
@@ -324,7 +305,7 @@ def extend_path(
         scale = scale / survival
     throughput.diffuse = throughput.diffuse * scale
     throughput.specular = throughput.specular * scale
-    hit = trace_ray(scene.meshes, scene.table, bodies, context.view, context.instances, vertex.origin, direction)
+    hit = trace_ray(scene.meshes, scene.table, shot.bodies, context.view, shot.views.instances, vertex.origin, direction)
     if hit.segment == Segment.NOTHING:
         radiance = escaped_radiance(scene, rules, context, light, direction, pdf)
         result.radiance = add_light(result.radiance, throughput, radiance, bounce)
@@ -341,25 +322,13 @@ def extend_path(
 
 
 @kernel_of_views
-def trace_paths_kernel(
-    # Scene:
-    scene: AnyScene,
-    grid: ImageGrid,
-    # State:
-    snapshot: Frames,
-    # In:
-    bodies: ViewBodies,
-    views: AnyViews,
-    rules: PathRules,
-    first: int,
-    # Out:
-    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
-):
+def trace_paths_kernel(scene: AnyScene, shot: AnyShot, rules: PathRules, first: int, image_out: ShadedImage):
     """Path-traced reference: mean radiance of N paths per pixel, with stratified start points in the pixel (box filter).
 
     Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again. Launched
     over view, pixel (tile order, from flat index `first` on).
     """
+    grid, snapshot, views = shot.grid, shot.snapshot, shot.views
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -367,7 +336,6 @@ def trace_paths_kernel(
     world = views.world[view]
     context = PathContext()
     context.view = view
-    context.instances = views.instances
     context.first_light = snapshot.light[world]
     context.light = snapshot.light[world]
     context.yaw = snapshot.light_yaw[world]
@@ -378,7 +346,7 @@ def trace_paths_kernel(
     for index in range(rules.samples):
         offset = scrambled_point(context.key, index, 0) - wp.vec2(0.5, 0.5)
         ray = camera_ray(views.cameras, view, row, column, offset)
-        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
+        hit = trace_camera_ray(scene.meshes, shot.bodies, view, tile_of(grid, row, column), ray, views.instances)
         hit = hit_table(scene.table, views.cameras, view, ray, hit)
         direction = wp.normalize(views.cameras.to_world[view] * ray)
         if hit.segment == Segment.NOTHING:
@@ -386,12 +354,12 @@ def trace_paths_kernel(
         else:
             start = hit_position(views.cameras, view, ray, hit.depth)
             width = footprint * hit.depth
-            vertex = make_vertex(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
+            vertex = make_vertex(scene, shot, view, hit, start, -direction, width, 0.0)
             diffuse = vertex.brdf.diffuse
             path = init_path(width)
             while path.bounce != TERMINATED:
                 if path.bounce > 0:
-                    vertex = next_vertex(scene, bodies, rules, context, path)
-                path = extend_path(scene, bodies, rules, context, index, diffuse, path, vertex)
+                    vertex = next_vertex(scene, shot, rules, context, path)
+                path = extend_path(scene, shot, rules, context, index, diffuse, path, vertex)
             total += wp.cw_mul(diffuse, path.radiance.diffuse + path.radiance.indirect) + path.radiance.specular
-    radiance_out[view, row, column] = total / float(rules.samples)
+    image_out.radiance[view, row, column] = total / float(rules.samples)
