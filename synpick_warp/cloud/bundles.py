@@ -21,7 +21,6 @@ from synpick_warp.dataset.commit.writing import list_lines
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter
 from synpick_warp.exporters.formats import indexed_files
-from synpick_warp.exporters.registry import index_lines
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.inputs.paths import make_folder, path_inside
 
@@ -42,7 +41,7 @@ def make_bundle(folder: Path, episode: int, settings: ExportSettings, kinds: Seq
     with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
         for name, lines in list_lines(entry).items():
             _add(archive, f"{LINES}/{name}/0", lines)
-        for name, lines in index_lines(kinds, folder, settings, names):
+        for name, lines in (line for kind in kinds for line in kind.index_lines(folder, settings, names)):
             _add(archive, f"{LINES}/{name}", lines)
         for name in filter(indexed_files(settings.layout.formats).fullmatch, names):
             _add(archive, name, (folder / name).read_bytes())

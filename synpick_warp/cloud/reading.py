@@ -38,7 +38,7 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.commit.verify import CheckPart, Verdict, check_part
+from synpick_warp.dataset.commit.verify import Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
 from synpick_warp.system.inputs.files import read_file
@@ -195,7 +195,7 @@ def _verify_entry(copier: Copier, entry: Path) -> tuple[int, list[int]]:
             return 0, []
         raise DatasetError(f"{copier.store.url}/{entry}.json or .sha256 is missing; resume the bake")
     folder, names = copier.folder, copier.fetch_files(entry, check=False)
-    checked = check_part(folder, CheckPart(entry))
+    checked = check_part(folder, entry)
     if checked.problem:
         raise DatasetError(checked.problem)
     listed = (read_entry(folder, entry) or {}).get("episodes", [])

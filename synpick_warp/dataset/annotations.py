@@ -47,12 +47,9 @@ MAX_SYMMETRIES = 1024
 
 
 def camera_schema(*required: str, **types: Any) -> Any:
-    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], lens.
-
-    Args:
-        required: Keys that must be there; those of other programs may lack any.
-        types: Types of further keys, or of these, in place of the usual ones.
-    """
+    """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], lens. Keys that
+    are not `required` may be missing, as files of other programs lack any; `types` are those of further keys, or of these, in place of the
+    usual ones."""
     fields = [(key, kind) if key in required else (key, kind | UnsetType, UNSET) for key, kind in (_CAMERA | types).items()]
     return msgspec.defstruct("CameraEntry", fields, kw_only=True, gc=False)
 
@@ -145,13 +142,6 @@ class EpisodeRow(Struct, gc=False):
     ending: str
 
 
-class EpisodeEntry(Struct, gc=False):
-    """Schema of an episode's manifest entry, as far as it is read back: row and attempts."""
-
-    row: EpisodeRow
-    attempts: list[dict[str, Any]] = []
-
-
 VIEW_SCHEMAS: dict[str, Any] = {"camera": camera_schema("cam_K", "depth_scale"), "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 GRAPH_SCHEMA = dict[Key, GraphEntry]
@@ -161,13 +151,9 @@ MASK_SCHEMA = dict[Key, RunLengths]
 
 
 def check_json(data: bytes, schema: Any, source: object) -> Any:
-    """Check JSON against a schema; returns its content as dictionaries, lists and numbers, with keys that the schema does not name.
-
-    Keys of the outermost object become integers if the schema has them so.
-
-    Raises:
-        DatasetError: In one line: not JSON, or not of this schema.
-    """
+    """Check JSON against a schema; returns its content as dictionaries, lists and numbers, with keys that the schema does not name. Keys of
+    the outermost object become integers if the schema has them so. Raises DatasetError, of one line, if it is no JSON, or not of this
+    schema."""
     decode_json(data, schema, source, DatasetError, ADVICE)
     by_index = getattr(schema, "__origin__", None) is dict and schema.__args__[0] is Key
     return decode_json(data, dict[int, Any] if by_index else Any, source, DatasetError, ADVICE)
@@ -179,11 +165,7 @@ def read_checked(path: Path, schema: Any) -> Any:
 
 
 def check_content(content: Any, schema: type[_Content], source: object) -> _Content:
-    """Check decoded JSON against a schema; returns it as the schema's types.
-
-    Raises:
-        DatasetError: In one line: it is not of this schema.
-    """
+    """Check decoded JSON against a schema; returns it as the schema's types, or raises DatasetError, of one line."""
     try:
         return msgspec.convert(content, schema)
     except (ValueError, RecursionError) as fault:

@@ -51,12 +51,9 @@ class PickTables:
 
     @property
     def picks(self) -> np.recarray:
-        """Grasp trials, a record array with the columns of `views.picks.COLUMNS`, sorted by state, candidate and repeat.
-
-        Raises:
-            DatasetError: The data set has no picks, a table is damaged or has a value that its columns do not allow, or pyarrow is not
-                installed.
-        """
+        """Grasp trials, a record array with the columns of `views.picks.COLUMNS`, sorted by state, candidate and repeat. Raises
+        DatasetError if the data set has no picks, a table is damaged or has a value that its columns do not allow, or pyarrow is not
+        installed."""
         return self._pick_tables[0]
 
     @property
@@ -87,7 +84,8 @@ class PickTables:
         episode = cast("Episode", self)
         places = [self.folder / name for name in pick_files(self.index)]
         trials, states = (_read(place, columns) for place, columns in zip(places, (COLUMNS, STATES), strict=True))
-        _refuse(places[1], states, _check_states(states, len(episode), len(episode.cameras)))
+        for name, count, of in (("frame", len(episode), "episode"), ("camera", len(episode.cameras), "data set")):
+            _refuse(places[1], states, iter([_Fault(name, states[name] >= count, f"0 to {count - 1}, the {name}s of the {of}")]))
         _refuse(places[0], trials, _check_trials(trials, states))
         _refuse(places[1], states, _check_counts(states, trials))
         return trials, states
@@ -143,12 +141,6 @@ def _check_columns(columns: Sequence[PickColumn], rows: np.recarray) -> Iterator
         elif column.undefined:
             right |= np.isnan(values)
         yield _Fault(column.name, ~(right.all(axis=1) | (ended & (column.name in _MEASURED))), allowed)
-
-
-def _check_states(states: np.recarray, frames: int, cameras: int) -> Iterator[_Fault]:
-    """Yield faults of states: other frames and cameras than there are."""
-    yield _Fault("frame", states["frame"] >= frames, f"0 to {frames - 1}, the frames of the episode")
-    yield _Fault("camera", states["camera"] >= cameras, f"0 to {cameras - 1}, the cameras of the data set")
 
 
 def _check_counts(states: np.recarray, trials: np.recarray) -> Iterator[_Fault]:

@@ -158,10 +158,7 @@ class Views:
 
 def collate(samples: Sequence[Sample]) -> dict[str, Any]:
     """Collate samples to a batch: arrays of equal shape become one tensor, those with a row per instance or candidate a list of tensors.
-
-    Raises:
-        ImportError: PyTorch is not installed.
-    """
+    Raises ImportError if PyTorch is not installed."""
     import torch  # pyright: ignore[reportMissingImports]
 
     batch: dict[str, Any] = {}

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.dataset.splits import DataLayout, episode_range
-from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
+from synpick_warp.dataset.annotations import ADVICE, EpisodeRow, Key, ModelInfo, check_content, read_checked
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums, read_entry
 from synpick_warp.dataset.commit.plausibility import check_frames
 from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
@@ -75,8 +75,7 @@ class Episode(PickTables):
     @cached_property
     def _record(self) -> dict[str, Any] | None:
         """Entry of the episode in the manifest; None: the data set has none."""
-        path = self._data_set.folder / f"{episode_entry(self.index)}.json"
-        return read_checked(path, EpisodeEntry) if path.exists() else None
+        return read_entry(self._data_set.folder, episode_entry(self.index))
 
     @cached_property
     def _context(self) -> GroupContext:
@@ -112,11 +111,7 @@ class Episode(PickTables):
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Attributes in the trajectory store: as `row`, and light.
-
-        Raises:
-            DatasetError: The data set has no trajectories.
-        """
+        """Attributes in the trajectory store: as `row`, and light. Raises DatasetError if the data set has no trajectories."""
         self._data_set.require_store()
         return read_attributes(self.group)
 
@@ -159,7 +154,7 @@ class Episode(PickTables):
         if self._data_set.found is not None:
             return ()
         if self._record is not None:
-            return tuple(self._record.get("attempts", ()))
+            return tuple(self._record["attempts"])
         if "record" not in self.attempt_arrays:
             raise DatasetError(f"{self.group} has no array attempts/record; {ADVICE}")
         lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
@@ -168,11 +163,8 @@ class Episode(PickTables):
 
     @cached_property
     def tracks(self) -> Tracks:
-        """Every instance over cameras and time: poses, visibility and boxes as arrays, by instance id.
-
-        Raises:
-            DatasetError: The data set has no images.
-        """
+        """Every instance over cameras and time: poses, visibility and boxes as arrays, by instance id. Raises DatasetError if the data set
+        has no images."""
         from synpick_warp.dataset.tracks import Tracks
 
         return Tracks(self.views(), self._data_set.camera_count, len(self))
@@ -230,23 +222,15 @@ class DataSet(Mapping[int, Episode]):
     """
 
     def __init__(self, folder: Path, episodes: range | None = None, split: str | None = None) -> None:
-        """
-        Args:
-            folder: Folder of the data set.
-            episodes: Indices of the episodes to show; None: all.
-            split: Split to show, of a data set from another source; None: all.
-        """
+        """Open a folder, to show these episodes, or of a data set from another source this split; None: all."""
         self.folder = folder
         self._store = folder / STORE
         self._only, self._found_split = episodes, split
 
     @cached_property
     def found(self) -> ForeignScenes | None:
-        """Scenes that were found in the folder of a data set from another source; None: the data set is of a bake.
-
-        Raises:
-            DatasetError: Neither did a bake write it nor has it BOP scenes.
-        """
+        """Scenes that were found in the folder of a data set from another source; None: the data set is of a bake. Raises DatasetError if
+        neither did a bake write it nor has it BOP scenes."""
         if (self.folder / MANIFEST_FILE).is_file() or self.has_store:
             return None
         from synpick_warp.dataset.bop.foreign import ForeignScenes
@@ -261,12 +245,8 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def config(self) -> Config:
-        """All settings of the bake.
-
-        Raises:
-            ConfigError: They are missing, or this version cannot read them.
-            DatasetError: The data set is from another source.
-        """
+        """All settings of the bake. Raises ConfigError if they are missing, or this version cannot read them, and DatasetError if the data
+        set is from another source."""
         if self.found is not None:
             raise DatasetError(f"{self.folder} has no settings: it is from another source than synpick-warp bake")
         from synpick_warp.configs.files.load import load_config
@@ -275,21 +255,15 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of the trajectory store: seed, step, steps per tick, names of light maps, ...
-
-        Raises:
-            DatasetError: The data set has no trajectories.
-        """
+        """Attributes of the trajectory store: seed, step, steps per tick, names of light maps, ... Raises DatasetError if the data set has
+        no trajectories."""
         self.require_store()
         return read_attributes(self._store)
 
     @cached_property
     def objects(self) -> tuple[ObjectInfo, ...]:
-        """Object table with physical properties, by catalog index; of the trajectory store.
-
-        Raises:
-            DatasetError: The data set has no trajectories; `models_info` has sizes.
-        """
+        """Object table with physical properties, by catalog index; of the trajectory store. Raises DatasetError if the data set has no
+        trajectories; `models_info` has sizes."""
         self.require_store()
         return read_objects(self._store, self._constants)
 
@@ -299,22 +273,16 @@ class DataSet(Mapping[int, Episode]):
         return GroupContext(files=lambda: self.listed_files(CONSTANTS))
 
     def listed_files(self, entry: Path) -> frozenset[Path]:
-        """Files of the trajectory store that a manifest entry lists; none if the data set has no such entry.
-
-        Raises:
-            DatasetError: The list is damaged.
-        """
+        """Files of the trajectory store that a manifest entry lists; none if the data set has no such entry. Raises DatasetError if the
+        list is damaged."""
         if not (self.folder / f"{entry}.json").exists():
             return frozenset()
         return frozenset(self.folder / name for name in read_checksums(self.folder, entry) if name.startswith(f"{STORE}/"))
 
     @cached_property
     def models_info(self) -> dict[int, dict[str, Any]]:
-        """Object id -> its entry of BOP's models_info.json: diameter, box and symmetries [mm].
-
-        Raises:
-            DatasetError: The data set has no models, as it has neither the format bop nor shards.
-        """
+        """Object id -> its entry of BOP's models_info.json: diameter, box and symmetries [mm]. Raises DatasetError if the data set has no
+        models, as it has neither the format bop nor shards."""
         from synpick_warp.dataset.bop.models import INFO, models_folder
 
         return read_checked(self.folder / models_folder(self.folder) / INFO, dict[Key, ModelInfo])
@@ -408,11 +376,7 @@ class DataSet(Mapping[int, Episode]):
         return named or {self.config.bop.split: self}
 
     def split(self, name: str) -> DataSet:
-        """Data set reduced to the episodes of one split.
-
-        Raises:
-            DatasetError: There is no such split.
-        """
+        """Data set reduced to the episodes of one split. Raises DatasetError if there is no such split."""
         if name not in self.splits:
             raise DatasetError(f"{self.folder} has no split {format_value(name)}; splits: {', '.join(self.splits) or 'none'}")
         return self.splits[name]
@@ -440,11 +404,8 @@ class DataSet(Mapping[int, Episode]):
         return [] if self.found is not None else part_files(None if self._scenes is None else self.camera_count)
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
-        """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
-
-        Raises:
-            DatasetError: The data set has no images.
-        """
+        """Files of the scene that a camera recorded in an episode: its folder, or else its shards. Raises DatasetError if the data set has
+        no images."""
         return self._index().files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
 
     def _has_files(self, index: int) -> bool:

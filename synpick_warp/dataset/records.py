@@ -63,7 +63,7 @@ class IndicesEntry(Entry):
 
 
 class BinRecord(msgspec.Struct):
-    """Schema of the record of an episode's bin; see `views.bins.bin_record`."""
+    """Schema of the record of an episode's bin; see `views.frames.bin_record`."""
 
     name: str
     position: Vector
@@ -211,18 +211,7 @@ def _check_name(key: str, value: str, allowed: tuple[str, ...]) -> None:
 
 
 def read_record(path: Path, schema: type[_Schema], advice: str) -> tuple[_Schema, dict[str, Any]]:
-    """Read and validate a JSON file.
-
-    Args:
-        path: The file.
-        schema: Its type.
-        advice: What to do if it is damaged.
-
-    Returns:
-        The content as `schema`, and as it stands in the file, with unknown keys and the order of keys.
-
-    Raises:
-        DatasetError: It cannot be read, or is damaged.
-    """
+    """Read and validate a JSON file; returns its content as `schema`, and as it stands in the file, with unknown keys and the order of
+    keys. Raises DatasetError, with `advice`, if it cannot be read, or is damaged."""
     data = read_file(path, MAX_JSON, DatasetError)
     return decode_json(data, schema, path, DatasetError, advice), decode_json(data, dict[str, Any], path, DatasetError, advice)

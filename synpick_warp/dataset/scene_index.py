@@ -18,15 +18,9 @@ if TYPE_CHECKING:
 
 
 class SceneIndex:
-    """Scene folders and shards of a data set by episode and camera."""
+    """Scene folders and shards of a data set by episode and camera; `sizes`: width and height of each camera's images [px]."""
 
     def __init__(self, folder: Path, layout: DataLayout, sizes: tuple[Size, ...]) -> None:
-        """
-        Args:
-            folder: Folder of the data set.
-            layout: Its layout.
-            sizes: Width and height of each camera's images [px].
-        """
         self._folder, self._sizes, self._layout = folder, sizes, layout
 
     @cached_property
@@ -36,11 +30,8 @@ class SceneIndex:
         return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
 
     def files(self, episode: int, camera: int) -> SceneFiles:
-        """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
-
-        Raises:
-            DatasetError: The data set has no images of it.
-        """
+        """Files of the scene that a camera recorded in an episode: its folder, or else its shards. Raises DatasetError if the data set has
+        no images of it."""
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
         from synpick_warp.exporters.bop.shards.tar_files import find_shards
 

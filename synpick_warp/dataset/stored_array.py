@@ -1,8 +1,8 @@
-"""Zarr arrays of a trajectory store: metadata are checked before zarr sees the array, and its faults are one error class.
+"""Zarr arrays of a trajectory store: metadata are checked before a chunk is read, and all faults are one error class.
 
 Metadata may be edited or damaged, and memory, loops and code follow from them: so shape, type, chunks and codecs are compared with the
-schema and with what is stored. Compressed chunks that hold more than their place in the array (decompression bombs, CWE-409), unknown
-codecs and files that cannot be read are a DatasetError.
+schema and with what is stored. Compressed chunks that hold more than their place in the array (decompression bombs, CWE-409), other codecs
+and files that cannot be read are a DatasetError.
 
 Imports zarr, so import it when an array is opened.
 """
@@ -16,25 +16,25 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numcodecs.zstd
 import numpy as np
 import zarr
-from msgspec import Meta, Struct
-from zarr.codecs import ShardingCodec, ZstdCodec
+from zarr.codecs import BytesCodec, Crc32cCodec, ShardingCodec, ZstdCodec
 
 from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.trajectory import GROUP_FILE, MAX_METADATA, MAX_STEPS_PER_TICK, GroupContext
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import LABELS, TrajectoryArray
-from synpick_warp.system.inputs.files import check_regular_file, describe_bytes, read_file
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import check_regular_file, describe_bytes
 from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
 
+_KINDS = "biuf"
+"""Kinds of NumPy's types that are read: truth values and numbers."""
 _MAX_CHUNK_TICKS = 4096
 """As in `trajectory.chunk_ticks`: an array may have one chunk that is longer than itself."""
 _MAX_ARRAY = 2**36
@@ -48,83 +48,106 @@ _FEW_CHUNKS = 1000
 """Number of chunks that any array may have, in addition to one a row; every one takes Python a tenth of a millisecond."""
 _MAX_HEADER = 18
 """Largest header of a Zstandard frame [bytes]."""
-_SELECTIONS = (
-    "get_basic_selection",
-    "get_orthogonal_selection",
-    "get_mask_selection",
-    "get_coordinate_selection",
-    "get_block_selection",
-)
-"""The methods of an array that read chunks; indexing calls one of them."""
-
-_Sizes = list[Annotated[int, Meta(ge=1, lt=2**40)]]
 
 
-class _ChunkShape(Struct):
-    """Schema of a chunk grid's configuration in zarr.json."""
-
-    chunk_shape: _Sizes
+class StoredArray(zarr.Array):
+    """A read-only zarr array; reading raises DatasetError where zarr would raise an error of its own, except for a wrong index."""
 
 
-class _ChunkGrid(Struct):
-    """Schema of a regular chunk grid in zarr.json."""
+def _guard(name: str) -> Callable[..., Any]:
+    """Method of `zarr.Array` that raises DatasetError for any fault but IndexError."""
+    method = getattr(zarr.Array, name)
 
-    name: Literal["regular"]
-    configuration: _ChunkShape
+    @functools.wraps(method)
+    def guarded(self: StoredArray, *arguments: Any, **options: Any) -> Any:
+        try:
+            return method(self, *arguments, **options)
+        except (IndexError, DatasetError):
+            raise
+        except Exception as error:  # Codecs raise whatever their libraries raise.
+            raise _unreadable(Path(str(self.store_path).removeprefix("file://")), error) from None
 
-
-class _IndexCodec(Struct):
-    """Schema of a codec of a shard's index in zarr.json."""
-
-    name: Literal["bytes", "crc32c"]
-
-
-class _CodecSettings(Struct):
-    """Schema of a codec's configuration; only `sharding_indexed` has these keys."""
-
-    chunk_shape: _Sizes | None = None
-    codecs: list[_Codec] = []
-    index_codecs: list[_IndexCodec] = []
+    return guarded
 
 
-class _Codec(Struct):
-    """Schema of a codec in zarr.json, with its configuration."""
-
-    name: Literal["bytes", "zstd", "crc32c", "sharding_indexed"]
-    configuration: _CodecSettings | None = None
-
-
-class ArrayMetadata(Struct):
-    """Schema of an array's zarr.json: shape, type, chunks and codecs; others than these codecs and types are never loaded."""
-
-    zarr_format: Literal[3]
-    node_type: Literal["array"]
-    shape: Annotated[list[Annotated[int, Meta(ge=0, lt=2**40)]], Meta(max_length=8)]
-    data_type: Literal["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
-    chunk_grid: _ChunkGrid
-    codecs: list[_Codec]
+for _selection in ("basic", "orthogonal", "mask", "coordinate", "block"):  # Indexing calls one of these methods, which read chunks.
+    setattr(StoredArray, f"get_{_selection}_selection", _guard(f"get_{_selection}_selection"))
 
 
 def open_array(folder: Path, spec: TrajectoryArray | None, context: GroupContext) -> StoredArray:
-    """Open an array.
+    """Open an array of a schema (None: it is none of ours), which must agree with `context`.
 
-    Args:
-        folder: The array.
-        spec: Its schema; None: the array is none of ours.
-        context: What it must agree with.
-
-    Raises:
-        DatasetError: Its metadata does not fit, a file is missing or too large, or zarr cannot open it.
+    Raises DatasetError if its metadata does not fit, a file is missing or too large, or zarr cannot open it.
     """
-    path = folder / GROUP_FILE
-    metadata = decode_json(read_file(path, MAX_METADATA, DatasetError), ArrayMetadata, path, DatasetError, ADVICE)
-    _check_files(folder, check_layout(folder, metadata, spec, context.sizes()), context.files())
+    check_regular_file(folder / GROUP_FILE, MAX_METADATA, DatasetError)
     try:
-        opened = zarr.open_array(folder, mode="r").async_array
+        opened = zarr.open_array(folder, mode="r", zarr_format=3).async_array
         bounded = dataclasses.replace(opened.metadata, codecs=_bound_codecs(opened.metadata.codecs))
-        return StoredArray(type(opened)(bounded, opened.store_path, opened.config))
+        levels = _chunk_shapes(opened.metadata.chunk_grid, opened.metadata.codecs)
     except Exception as error:
         raise _unreadable(folder, error) from None
+    _check_shape(folder, opened.shape, opened.dtype, spec, context.sizes())
+    has_steps = spec is None or spec.dims[0] == "step"
+    _check_chunks(folder, opened.shape, levels, _MAX_CHUNK_TICKS * (MAX_STEPS_PER_TICK if has_steps else 1))
+    chunk, inner = math.prod(levels[0]), math.prod(levels[0]) // max(1, math.prod(levels[-1]))
+    # Data that zstd cannot compress grow by less than a hundredth; an index has 16 bytes a chunk.
+    _check_files(folder, chunk * opened.dtype.itemsize * 101 // 100 + 1024 * (inner + 1), context.files())
+    return StoredArray(type(opened)(bounded, opened.store_path, opened.config))
+
+
+def _check_shape(folder: Path, shape: tuple[int, ...], dtype: np.dtype, spec: TrajectoryArray | None, sizes: Mapping[str, int]) -> None:
+    """Compare type and shape with the schema (None: any) and the known `sizes` of dimensions; those that nothing determines with the
+    largest possible, or with what is stored."""
+    if dtype.kind not in _KINDS:
+        raise _fault(folder, f"is of type {dtype}; allowed: numbers and truth values")
+    names = tuple(f"dimension {axis}" for axis in range(len(shape))) if spec is None else spec.dims
+    expected = [len(LABELS[name]) if name in LABELS else sizes.get(name) for name in names]
+    wanted = dtype if spec is None else np.dtype(spec.dtype)
+    if len(shape) != len(names) or dtype != wanted or any(size not in (None, n) for size, n in zip(expected, shape, strict=True)):
+        known = " x ".join(name if size is None else str(size) for name, size in zip(names, expected, strict=True))
+        raise _fault(folder, f"is {dtype} of shape {' x '.join(map(str, shape))}; expected: {wanted} of shape {known}")
+    free = {name: given for name, size, given in zip(names, expected, shape, strict=True) if size is None}
+    most = {"instance": MAX_INSTANCES, "lift_tick": sizes.get("tick")}
+    size, stored = math.prod(shape) * dtype.itemsize, _stored_bytes(folder)
+    exceeds = any(given > (most.get(name) or given) for name, given in free.items())
+    if exceeds or size > _MAX_ARRAY or (free.keys() - most.keys() and size > _SMALL + _MAX_RATIO * stored):
+        there = " and ".join(f"{given:,} as {name}" for name, given in free.items()) or describe_bytes(size)
+        raise _fault(folder, f"states {there}, more than its {describe_bytes(stored)} can hold")
+    if spec is not None and spec.dims[0] == "step":
+        times = folder.parent / "time"
+        stored = _stored_bytes(times) if times.is_dir() else 0
+        if shape[0] > _FEW_STEPS + _STEPS_PER_BYTE * stored:
+            raise _fault(folder, f"states {shape[0]:,} steps, more than the {describe_bytes(stored)} of their times can hold")
+
+
+def _stored_bytes(folder: Path) -> int:
+    """Size of the files of an array [bytes]."""
+    return sum(entry.stat(follow_symlinks=False).st_size for entry in os.scandir(folder))
+
+
+def _chunk_shapes(grid: Any, codecs: Iterable[Any]) -> list[Sequence[int]]:
+    """Shapes of the chunks, from the files down to what is compressed together."""
+    inner = [_chunk_shapes(codec, codec.codecs) for codec in codecs if isinstance(codec, ShardingCodec)]
+    return [grid.chunk_shape, *(inner[0] if inner else ())]
+
+
+def _check_chunks(folder: Path, shape: Sequence[int], levels: Sequence[Sequence[int]], rows: int) -> None:
+    """Raise DatasetError if chunks, of shapes from the files down, are larger than the array, but for the end of the last one, or more than
+    one a row and _FEW_CHUNKS; `rows`: most rows of a chunk in an array that has less."""
+    extents = [max(1, size) for size in shape]
+    if any(len(level) != len(extents) or min(level, default=1) < 1 for level in levels):
+        raise _fault(folder, "has chunks of another shape")
+    if not extents:
+        return
+    innermost = levels[-1]
+    padded, most = [extents[0] + innermost[0], *extents[1:]], [max(rows, extents[0]), *extents[1:]]
+    for level, limits in [*((level, padded) for level in levels[:-1]), (innermost, most)]:
+        if any(size > limit for size, limit in zip(level, limits, strict=True)):
+            there = f"has chunks of {' x '.join(map(str, level))}"
+            raise _fault(folder, f"{there}, larger than its {' x '.join(map(str, shape))}")
+    count = math.prod(-(-size // part) for size, part in zip(extents, innermost, strict=True))
+    if count > extents[0] + _FEW_CHUNKS:
+        raise _fault(folder, f"has {count:,} chunks for {shape[0]:,} rows; allowed: one a row")
 
 
 def _check_files(folder: Path, largest: int, listed: Collection[Path]) -> None:
@@ -135,100 +158,8 @@ def _check_files(folder: Path, largest: int, listed: Collection[Path]) -> None:
     present = {folder / entry.name for entry in os.scandir(folder)}
     for path in sorted(path for path in listed if path.parent == folder and path not in present):
         raise DatasetError(f"there is no {path}, which the manifest lists; {ADVICE}")
-    for path in present:
-        check_regular_file(path, max(largest, MAX_METADATA) if path.name == GROUP_FILE else largest, DatasetError)
-
-
-def check_layout(folder: Path, metadata: ArrayMetadata, spec: TrajectoryArray | None, sizes: Mapping[str, int]) -> int:
-    """Check an array's type, shape, chunks and codecs against its schema (None: any) and the known `sizes` of dimensions.
-
-    Returns:
-        Largest size that a file of it may have [bytes].
-
-    Raises:
-        DatasetError: They do not fit the schema, or are too large for what is stored.
-    """
-    shape, dtype = tuple(metadata.shape), np.dtype(metadata.data_type)
-    has_steps = spec is None or spec.dims[0] == "step"
-    _check_extent(folder, _check_shape(folder, shape, dtype, spec, sizes), math.prod(shape) * dtype.itemsize, sizes.get("tick"))
-    if spec is not None and has_steps:
-        times = folder.parent / "time"
-        stored = _stored_bytes(times) if times.is_dir() else 0
-        if shape[0] > _FEW_STEPS + _STEPS_PER_BYTE * stored:
-            there = f"states {shape[0]:,} steps, more than the {describe_bytes(stored)} of their times can hold"
-            raise _fault(folder, there)
-    levels = _chunk_shapes(metadata)
-    _check_chunks(folder, shape, levels, _MAX_CHUNK_TICKS * (MAX_STEPS_PER_TICK if has_steps else 1))
-    chunk, inner = math.prod(levels[0]), math.prod(levels[0]) // max(1, math.prod(levels[-1]))
-    # Data that zstd cannot compress grow by less than a hundredth; an index has 16 bytes a chunk.
-    return chunk * dtype.itemsize * 101 // 100 + 1024 * (inner + 1)
-
-
-def _check_shape(
-    folder: Path, shape: tuple[int, ...], dtype: np.dtype, spec: TrajectoryArray | None, sizes: Mapping[str, int]
-) -> dict[str, int]:
-    """Compare type and shape with the schema; returns name and size of the dimensions whose sizes nothing determines."""
-    if spec is None:
-        return {f"dimension {axis}": size for axis, size in enumerate(shape)}
-    expected = tuple(len(LABELS[name]) if name in LABELS else sizes.get(name) for name in spec.dims)
-    fits = len(shape) == len(expected) and all(size in (None, given) for size, given in zip(expected, shape, strict=True))
-    if dtype != np.dtype(spec.dtype) or not fits:
-        wanted = " x ".join(name if size is None else str(size) for name, size in zip(spec.dims, expected, strict=True))
-        there = f"is {dtype.name} of shape {' x '.join(map(str, shape))}"
-        raise _fault(folder, f"{there}; expected: {np.dtype(spec.dtype).name} of shape {wanted}")
-    return {name: given for name, size, given in zip(spec.dims, expected, shape, strict=True) if size is None}
-
-
-def _check_extent(folder: Path, free: Mapping[str, int], size: int, ticks: int | None) -> None:
-    """Compare `free`, the sizes of dimensions that nothing determines, and the `size` of the array [bytes] with the largest possible, or
-    with what is stored; `ticks`: number of frames, if it is known."""
-    most = {"instance": MAX_INSTANCES, "lift_tick": ticks}
-    stored = _stored_bytes(folder)
-    exceeds = any(given > (most.get(name) or given) for name, given in free.items())
-    if exceeds or size > _MAX_ARRAY or (free.keys() - most.keys() and size > _SMALL + _MAX_RATIO * stored):
-        there = " and ".join(f"{given:,} as {name}" for name, given in free.items()) or describe_bytes(size)
-        raise _fault(folder, f"states {there}, more than its {describe_bytes(stored)} can hold")
-
-
-def _stored_bytes(folder: Path) -> int:
-    """Size of the files of an array [bytes]."""
-    return sum(entry.stat(follow_symlinks=False).st_size for entry in os.scandir(folder))
-
-
-def _chunk_shapes(metadata: ArrayMetadata) -> list[Sequence[int]]:
-    """Shapes of the chunks, from the files down to what is compressed together."""
-    levels: list[Sequence[int]] = [metadata.chunk_grid.configuration.chunk_shape]
-    codecs = metadata.codecs
-    while shards := [codec.configuration for codec in codecs if codec.configuration is not None and codec.configuration.chunk_shape]:
-        levels.append(shards[0].chunk_shape or ())
-        codecs = shards[0].codecs
-    return levels
-
-
-def _check_chunks(folder: Path, shape: Sequence[int], levels: Sequence[Sequence[int]], rows: int) -> None:
-    """Raise DatasetError if chunks are larger than the array, but for the end of the last one, or more than one a row and _FEW_CHUNKS.
-
-    Args:
-        folder: The array.
-        shape: Its shape.
-        levels: Shapes of its chunks, from the files down.
-        rows: Most rows of a chunk in an array that has less.
-    """
-    extents = [max(1, size) for size in shape]
-    if any(len(level) != len(extents) for level in levels):
-        raise _fault(folder, "has chunks of another shape")
-    if not extents:
-        return
-    most = [max(rows, extents[0]), *extents[1:]]
-    innermost = levels[-1]
-    padded = [extents[0] + innermost[0], *extents[1:]]
-    for level, limits in [*((level, padded) for level in levels[:-1]), (innermost, most)]:
-        if any(size > limit for size, limit in zip(level, limits, strict=True)):
-            there = f"has chunks of {' x '.join(map(str, level))}"
-            raise _fault(folder, f"{there}, larger than its {' x '.join(map(str, shape))}")
-    count = math.prod(-(-size // part) for size, part in zip(extents, innermost, strict=True))
-    if count > extents[0] + _FEW_CHUNKS:
-        raise _fault(folder, f"has {count:,} chunks for {shape[0]:,} rows; allowed: one a row")
+    for path in present - {folder / GROUP_FILE}:
+        check_regular_file(path, largest, DatasetError)
 
 
 def _fault(folder: Path, text: str) -> DatasetError:
@@ -239,10 +170,6 @@ def _fault(folder: Path, text: str) -> DatasetError:
 def _unreadable(folder: Path, error: Exception) -> DatasetError:
     """Error about an array that cannot be read, with the first 200 characters of the cause."""
     return _fault(folder, f"cannot be read: {' '.join(str(error).split())[:200] or type(error).__name__}")
-
-
-class StoredArray(zarr.Array):
-    """A read-only zarr array; reading raises DatasetError where zarr would raise an error of its own, except for a wrong index."""
 
 
 class _BoundedZstd(ZstdCodec):
@@ -276,33 +203,15 @@ def _content_size(header: bytes) -> int | None:
 
 
 def _bound_codecs(codecs: Iterable[Any]) -> tuple[Any, ...]:
-    """Replace zarr's Zstandard codec, in shards, too."""
+    """Replace zarr's Zstandard codec, in shards, too; raises ValueError for codecs of other kinds, which decompress without bounds."""
     bounded = []
     for codec in codecs:
         if isinstance(codec, ZstdCodec):
             bounded.append(_BoundedZstd(level=codec.level, checksum=codec.checksum))
-        elif isinstance(codec, ShardingCodec):
+        elif isinstance(codec, ShardingCodec) and all(isinstance(index, BytesCodec | Crc32cCodec) for index in codec.index_codecs):
             bounded.append(dataclasses.replace(codec, codecs=_bound_codecs(codec.codecs)))
-        else:
+        elif isinstance(codec, BytesCodec | Crc32cCodec):
             bounded.append(codec)
+        else:
+            raise ValueError(f"the codec {codec.to_dict()['name']} is not allowed here")
     return tuple(bounded)
-
-
-def _guard(name: str) -> Callable[..., Any]:
-    """Method of `zarr.Array` that raises DatasetError for any fault but IndexError."""
-    method = getattr(zarr.Array, name)
-
-    @functools.wraps(method)
-    def guarded(self: StoredArray, *arguments: Any, **options: Any) -> Any:
-        try:
-            return method(self, *arguments, **options)
-        except (IndexError, DatasetError):
-            raise
-        except Exception as error:  # Codecs raise whatever their libraries raise.
-            raise _unreadable(Path(str(self.store_path).removeprefix("file://")), error) from None
-
-    return guarded
-
-
-for _name in _SELECTIONS:
-    setattr(StoredArray, _name, _guard(_name))

@@ -43,15 +43,10 @@ class Track:
 
 
 class Tracks(Mapping[int, Track]):
-    """Tracks of an episode by instance id. All are made at once from the annotations of its views, in one pass."""
+    """Tracks of an episode by instance id. All are made at once from the annotations of all its views, which may come in any order, in one
+    pass."""
 
     def __init__(self, views: Iterable[View], cameras: int, frames: int) -> None:
-        """
-        Args:
-            views: All views of the episode, in any order.
-            cameras: Number of cameras C.
-            frames: Number of frames F.
-        """
         self._size = cameras, frames
         self._tracks: dict[int, Track] = {}
         for view in views:

@@ -80,15 +80,10 @@ class GroupContext:
 
 
 class Arrays(Mapping[str, "zarr.Array"]):
-    """Arrays of one zarr group by name, each opened on access: `arrays["pose"][10:20]` reads these rows only."""
+    """Arrays of one zarr group by name, each opened on access: `arrays["pose"][10:20]` reads these rows only; empty if there is no such
+    folder."""
 
     def __init__(self, folder: Path, schema: GroupSpec, context: GroupContext | None = None) -> None:
-        """
-        Args:
-            folder: Folder of the group; if there is none, the mapping is empty.
-            schema: Schema of the group.
-            context: What the arrays must agree with.
-        """
         self._folder, self._schema, self._context = folder, schema, context or GroupContext()
 
     def __getitem__(self, name: str) -> zarr.Array:
@@ -114,7 +109,7 @@ def read_objects(store: Path, context: GroupContext | None = None) -> tuple[Obje
     names = check_content(read_attributes(folder), _ObjectsAttributes, folder / GROUP_FILE).names
     files = (context or GroupContext()).files
     columns = _read_columns(Arrays(folder, OBJECTS, GroupContext(lambda: {"object": len(names)}, files)), OBJECTS, folder)
-    rows = [{name: _to_python(values[row]) for name, values in columns.items()} for row in range(len(names))]
+    rows = [{name: values[row] if values.ndim > 1 else values[row].item() for name, values in columns.items()} for row in range(len(names))]
     return tuple(ObjectInfo(name=name, **row) for name, row in zip(names, rows, strict=True))
 
 
@@ -138,11 +133,7 @@ def _read_columns(arrays: Arrays, schema: GroupSpec, folder: Path) -> dict[str, 
 
 
 def read_attributes(group: Path) -> dict[str, Any]:
-    """Read a zarr group's attributes, without zarr.
-
-    Raises:
-        DatasetError: The group's zarr.json is missing or damaged.
-    """
+    """Read a zarr group's attributes, without zarr. Raises DatasetError if the group's zarr.json is missing or damaged."""
     path = group / GROUP_FILE
     return decode_json(read_file(path, MAX_METADATA, DatasetError), _GroupMetadata, path, DatasetError, ADVICE).attributes
 
@@ -152,8 +143,3 @@ def read_array(array: zarr.Array) -> np.ndarray:
     import numpy as np
 
     return np.asarray(array[...])
-
-
-def _to_python(value: Any) -> Any:
-    """Convert a NumPy scalar to a Python number; arrays stay."""
-    return value.item() if value.ndim == 0 else value

@@ -37,11 +37,7 @@ class CameraMatrix(np.ndarray):
     """
 
     def __call__(self, convention: str = "synpick") -> np.ndarray:
-        """Matrix in the convention "synpick", "opencv" or "open3d".
-
-        Raises:
-            ValueError: There is no such convention.
-        """
+        """Matrix in the convention "synpick", "opencv" or "open3d". Raises ValueError if there is no such convention."""
         if convention not in PIXEL_CENTERS:
             raise ValueError(f"there is no convention {format_value(convention)}; conventions: {', '.join(PIXEL_CENTERS)}")
         matrix = np.array(self)
@@ -59,15 +55,7 @@ class View:
     def __init__(
         self, files: SceneFiles, episode: int, camera: int, frame: int, image_id: int | None = None, owner: Episode | None = None
     ) -> None:
-        """
-        Args:
-            files: The scene's files.
-            episode: Index of the episode.
-            camera: Index of the camera.
-            frame: Index of the frame in the episode.
-            image_id: BOP's im_id; None: the same.
-            owner: The episode, for its picks.
-        """
+        """View of the scene's files: `image_id` is BOP's im_id, None: the frame's index; `owner` the episode, for its picks."""
         self._files, self._owner = files, owner
         self.episode, self.camera, self.frame = episode, camera, frame
         self.image_id = frame if image_id is None else image_id
@@ -125,11 +113,8 @@ class View:
         return tuple(name for name in LAYERS if name in present)
 
     def layer(self, name: str) -> np.ndarray:
-        """Decode a layer; units and shapes as in `synpick_warp.views.layer_codec.decode_layer`.
-
-        Raises:
-            DatasetError: The data set has no such layer.
-        """
+        """Decode a layer; units and shapes as in `synpick_warp.views.layer_codec.decode_layer`. Raises DatasetError if the data set has no
+        such layer."""
         return read_layer(self._files, name, self.image_id)
 
     @cached_property
@@ -140,11 +125,7 @@ class View:
     @cached_property
     def lens(self) -> LensMap | None:
         """Projection through the camera's lens, with `project`, `unproject` and `undistortion_maps`, which are for `cv2.remap`; None: a
-        pinhole. Its `lens` has model and coefficients for OpenCV.
-
-        Raises:
-            DatasetError: Its values are none of a lens.
-        """
+        pinhole. Its `lens` has model and coefficients for OpenCV. Raises DatasetError if its values are none of a lens."""
         from synpick_warp.configs.calibration.lens import read_lens
 
         try:
@@ -244,10 +225,7 @@ class View:
     @cached_property
     def picks(self) -> np.recarray:
         """Trials of grasps from the state of this frame, in the columns of `synpick_warp.views.picks.COLUMNS`; none if it is no state.
-
-        Raises:
-            DatasetError: The data set has no picks.
-        """
+        Raises DatasetError if the data set has no picks."""
         if self._owner is None:
             raise DatasetError(f"{self._files.place} is read without its episode, which has the picks")
         trials = self._owner.picks
@@ -270,15 +248,9 @@ class View:
         return np.array([row[key] for row in getattr(self.records, record)], dtype=dtype)
 
     def project(self, points: np.ndarray, transform: np.ndarray | None = None) -> np.ndarray:
-        """Project points by the camera's matrix and, if it has one, its lens.
-
-        Args:
-            points: (..., 3) [m].
-            transform: Their frame to the camera frame (4, 4), such as a row of `object_to_camera`; None: they are in the camera frame.
-
-        Returns:
-            x to the right and y down (..., 2) [px]; pixel (row, column) covers x from column to column + 1.
-        """
+        """Project points (..., 3) [m], in the camera frame or in one that `transform` (4, 4) maps to it, such as a row of
+        `object_to_camera`, by the camera's matrix and, if it has one, its lens: x to the right and y down (..., 2) [px]; pixel (row,
+        column) covers x from column to column + 1."""
         points = np.asarray(points, np.float64)
         if transform is not None:
             points = points @ transform[:3, :3].T + transform[:3, 3]
@@ -319,11 +291,8 @@ def make_transform(rotation: Any, translation: Any) -> np.ndarray:
 
 
 def mean_by_candidate(picks: np.ndarray, name: str = "success") -> tuple[np.ndarray, np.ndarray]:
-    """Group trials by candidate: the first trial of each, and the mean of a column over its repeats.
-
-    Returns:
-        Index of the first trial of each candidate (candidate) int64, and means (candidate) float64.
-    """
+    """Group trials by candidate: the first trial of each, and the mean of a column over its repeats. Returns index of the first trial of
+    each candidate (candidate) int64, and means (candidate) float64."""
     _, first, which = np.unique(picks[["state", "candidate"]], return_index=True, return_inverse=True)
     return first, np.bincount(which, picks[name], len(first)) / np.bincount(which, minlength=len(first))
 
@@ -339,13 +308,8 @@ def find_pixels(view: View, picks: np.ndarray) -> np.ndarray:
 
 
 def graspable_map(view: View, picks: np.ndarray, hides: bool) -> np.ndarray:
-    """Sparse success map (H, W) float32: share of the trials at a pixel that held an object; NaN: not tried.
-
-    Args:
-        view: The view.
-        picks: Trials from its frame.
-        hides: Whether to leave out (NaN) grasp points that the view does not show: for other cameras than the candidates'.
-    """
+    """Sparse success map (H, W) float32: share of the trials, from the view's frame, at a pixel that held an object; NaN: not tried.
+    `hides`: whether to leave out (NaN) grasp points that the view does not show, for other cameras than the candidates'."""
     width, height = view.size
     result = np.full((height, width), np.nan, np.float32)
     if not len(picks):

@@ -147,7 +147,10 @@ class SceneFiles(ABC):
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """Suffix and content of an image's file; raises DatasetError unless its header states the scene's size. `name` as for `image`."""
         suffix, data, source = self._need(name, frame)
-        return suffix, _check_stated_size(data, self.image_size(frame), source)
+        if (stated := image_size(data)) != self.image_size(frame):
+            there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
+            raise DatasetError(f"{source} {there}")
+        return suffix, data
 
     def image_size(self, frame: int) -> tuple[int, int]:
         """Width and height of a frame's images [px]: of colour, or else depth, or else the first mask."""
@@ -170,15 +173,10 @@ class SceneFiles(ABC):
 
 
 class SceneFolder(SceneFiles):
-    """A BOP "scenewise" folder: one file per image and mask."""
+    """A BOP "scenewise" folder, such as DATA/train_pbr/000000: one file per image and mask. `suffix`: that of the files of one sensor, such
+    as "_cam1"; empty: the classic layout."""
 
     def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "") -> None:
-        """
-        Args:
-            folder: Scene folder, such as DATA/train_pbr/000000.
-            size: See `SceneFiles`.
-            suffix: Suffix of the files of one sensor, such as "_cam1"; empty: the classic layout.
-        """
         super().__init__(size)
         self.folder, self.suffix = folder, suffix
 
@@ -252,16 +250,10 @@ class SceneFolder(SceneFiles):
 
 
 class SceneShards(SceneFiles):
-    """Views with a key each: members of webdataset shards, whose index is read once, or files of the imagewise layout."""
+    """Views with a key each, which begins with the scene's index: members of webdataset shards, whose index is read once, or files in the
+    folder of the imagewise layout; `images`: members of the scene, None: those of the shards."""
 
     def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int] | None = None, images: KeyedImages | None = None) -> None:
-        """
-        Args:
-            shards: The scene's tar files; of the imagewise layout its folder.
-            scene: Index of the scene, with which keys begin.
-            size: See `SceneFiles`.
-            images: Members of the scene; None: those of the shards.
-        """
         super().__init__(size)
         self.shards, self.scene = tuple(shards), scene
         names = tuple(shard.name for shard in shards)
@@ -346,15 +338,6 @@ def _stem(frame: int, index: int | None) -> str:
     return f"{frame:06d}" if index is None else f"{frame:06d}_{index:06d}"
 
 
-def _check_stated_size(data: bytes, size: tuple[int, int], source: object) -> bytes:
-    """Return an image file's content; raises DatasetError if its header is no image's or states another size."""
-    stated = image_size(data)
-    if stated != size:
-        there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
-        raise DatasetError(f"{source} {there}")
-    return data
-
-
 def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int] | None, source: str) -> None:
     """Raise DatasetError unless run lengths fill their own height and width, which must be `size` (width, height; None: any)."""
     height, width = record["size"]
@@ -365,17 +348,8 @@ def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int] | None, s
 
 
 def check_planes(image: np.ndarray, channels: int | None, source: object, dtype: str = "") -> np.ndarray:
-    """Check channels and type of a decoded image; returns it.
-
-    Args:
-        image: (H, W[, C]).
-        channels: Number of channels C; None: the image has two dimensions.
-        source: File, for the message.
-        dtype: NumPy's name of the type; empty: any.
-
-    Raises:
-        DatasetError: The image has others.
-    """
+    """Check channels (None: the image has two dimensions) and type (NumPy's name; empty: any) of a decoded image (H, W[, C]); returns it,
+    or raises DatasetError about the `source`."""
     expected = () if channels is None else (channels,)
     if image.shape[2:] != expected or (dtype and image.dtype.name != dtype):
         kind = f" of type {dtype}" if dtype else ""
@@ -386,14 +360,7 @@ def check_planes(image: np.ndarray, channels: int | None, source: object, dtype:
 
 
 def decode_run_lengths(counts: Sequence[int], size: Sequence[int]) -> np.ndarray:
-    """Decode COCO's uncompressed run-length encoding (RLE): columns one after the other, runs of 0 and 1 in turn.
-
-    Args:
-        counts: Lengths of the runs [px]; the first is of 0.
-        size: Height and width [px].
-
-    Returns:
-        Mask (H, W) bool.
-    """
+    """Decode COCO's uncompressed run-length encoding (RLE): columns one after the other, runs of 0 and 1 in turn [px], the first of 0, in
+    an image of height and width [px]; returns the mask (H, W) bool."""
     values = np.arange(len(counts)) % 2 == 1
     return np.repeat(values, counts).reshape(size[1], size[0]).T

@@ -21,19 +21,12 @@ _MASKS = (".mask.json", ".mask_visib.json")
 
 
 def decode_view(key: str, data: bytes) -> np.ndarray | None:
-    """Decode one entry of a view.
+    """Decode one entry of a view, by its name after the view's key, such as ".depth.png".
 
-    Args:
-        key: Name of the entry after the view's key, such as ".depth.png".
-        data: Content of the entry.
-
-    Returns:
-        `rgb`: (H, W, 3) uint8, red first. `depth`: (H, W) uint16, in units of `depth_scale` mm of `camera.json`; 0: no surface.
-        `mask`, `mask_visib`: (N, H, W) bool, one for each entry of `gt.json`; (0, 0, 0) if it has none. Layers: values of
-        `layer_codec.decode_layer`. None: the entry is none of these.
-
-    Raises:
-        DatasetError: The entry is damaged; webdataset passes the error on, or calls the handler that `decode` was given.
+    Returns `rgb`: (H, W, 3) uint8, red first. `depth`: (H, W) uint16, in units of `depth_scale` mm of `camera.json`; 0: no surface. `mask`,
+    `mask_visib`: (N, H, W) bool, one for each entry of `gt.json`; (0, 0, 0) if it has none. Layers: values of `layer_codec.decode_layer`.
+    None: the entry is none of these. Raises DatasetError if the entry is damaged; webdataset passes the error on, or calls the handler that
+    `decode` was given.
     """
     if key.endswith(_MASKS):
         return _decode_masks(data, key)

@@ -48,7 +48,8 @@ class Needs:
     def of(cls, config: Config) -> Needs:
         """Needs by the settings of a bake. Errors: see `load_exporter_classes`."""
         classes = load_exporter_classes(config.bake.formats)
-        return cls(classes, slot_bytes(classes, ExportSettings.of(config)))
+        settings = ExportSettings.of(config)
+        return cls(classes, max((kind.slot_bytes(settings) for kind in classes), default=0))
 
     @property
     def physics(self) -> bool:
@@ -110,7 +111,6 @@ class Exporters:
             exporter.end_episode(end, count_down)
 
     def files(self, episode: int) -> list[Path]:
-        """Existing paths of an episode in all formats, sorted. See `Exporter`."""
         return sorted(path for exporter in self._all for path in exporter.files(episode))
 
     def close(self) -> None:
@@ -133,11 +133,6 @@ def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
         raise
 
 
-def slot_bytes(classes: Iterable[type[Exporter]], settings: ExportSettings) -> int:
-    """Maximum size of the images of any task in the pool's shared memory [B]."""
-    return max((exporter_class.slot_bytes(settings) for exporter_class in classes), default=0)
-
-
 def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> SharedFiles:
     """Names of constants, indices and folders of every format, each once."""
     all_names = [exporter_class.shared_files(layout) for exporter_class in classes]
@@ -145,14 +140,6 @@ def shared_files(classes: Iterable[type[Exporter]], layout: DataLayout) -> Share
         tuple(dict.fromkeys(name for names in group for name in names)) for group in zip(*all_names, strict=True)
     )
     return SharedFiles(constants, indices, folders)
-
-
-def index_lines(
-    classes: Iterable[type[Exporter]], out: Path, settings: ExportSettings, names: Sequence[str]
-) -> Iterator[tuple[str, bytes]]:
-    """Yield what an episode adds to index files of every format; see `Exporter.index_lines`."""
-    for exporter_class in classes:
-        yield from exporter_class.index_lines(out, settings, names)
 
 
 def finalize(

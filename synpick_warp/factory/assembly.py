@@ -53,8 +53,7 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
-from synpick_warp.views.bins import bin_record
-from synpick_warp.views.frames import most_words
+from synpick_warp.views.frames import bin_record, most_words
 
 NO_WRITERS = 0
 """Writer processes in the memory plan where nothing is written."""

@@ -15,7 +15,7 @@ from synpick_warp.configs.schema import Suction
 from synpick_warp.dataset.records import Attempt, InstanceObservation, RecordedObservation
 from synpick_warp.stages.arrays import WORD_BITS, unpack_words
 from synpick_warp.stages.stream import TickReport
-from synpick_warp.views.bins import name_bin
+from synpick_warp.views.frames import name_bin
 
 DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""

@@ -12,8 +12,7 @@ from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.attempts import EpisodeRecord, encode_line
 from synpick_warp.system.progress import Progress
-from synpick_warp.views.bins import name_bin
-from synpick_warp.views.frames import EpisodeEnd
+from synpick_warp.views.frames import EpisodeEnd, name_bin
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""

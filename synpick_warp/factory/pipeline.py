@@ -150,7 +150,8 @@ def _fill(
             assets = catalog, factory.cameras, factory.lights, factory.randomized
             with open_exporters(output.out, config, needs, pool, *assets) as exporters:
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights, factory.randomized), pool)
-                _Run(factory, exporters, needs.views, partial(output.commit, exporters, pool), summary, progress, stop, source.more).run()
+                commit = partial(commit_episode, output.out, exporters, pool)
+                _Run(factory, exporters, needs.views, commit, summary, progress, stop, source.more).run()
                 with scope("wait for writers"):
                     pool.wait()
         if deliver is not None:

@@ -144,7 +144,9 @@ def _known_view(arguments: bytes) -> dict[str, Any]:
 
 def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, Any]:
     pose = poses(episode, frame)
-    depths = np.stack([_depth(SIZES[OBJECT_IDS[i]], pose[i], camera) if OBJECT_IDS[i] >= 0 else _nothing(camera) for i in range(ROOM)])
+    depths = np.full((ROOM, 3 * camera.height, 3 * camera.width), np.inf)
+    for i in np.flatnonzero(OBJECT_IDS >= 0):
+        depths[i] = _depth(SIZES[OBJECT_IDS[i]], pose[i], camera)
     inner = depths[:, camera.height : 2 * camera.height, camera.width : 2 * camera.width]
     finger_pose = np.array([0.1 - 0.02 * frame, 0.05, 0.2, 0.0, 0.0, 0.0, 1.0])
     finger = _depth(FINGER_SIZE, finger_pose, camera)[camera.height : 2 * camera.height, camera.width : 2 * camera.width]
@@ -187,10 +189,6 @@ def _rays(camera: Camera) -> np.ndarray:
     y = np.arange(-camera.height, 2 * camera.height) + 0.5
     columns, rows = np.meshgrid((x - camera.matrix[0, 2]) / camera.matrix[0, 0], (y - camera.matrix[1, 2]) / camera.matrix[1, 1])
     return np.stack([columns, rows, np.ones_like(rows)], axis=-1)
-
-
-def _nothing(camera: Camera) -> np.ndarray:
-    return np.full((3 * camera.height, 3 * camera.width), np.inf)
 
 
 def _depth(size: tuple[float, ...], pose: np.ndarray, camera: Camera) -> np.ndarray:

@@ -1,11 +1,12 @@
 """Schema of the host-side batches from stages to exporters: rendered views with their amodal masks, simulation frames (ticks), and ends of
-episodes.
+episodes, with the records of their bins.
 
 A tick is one output frame of simulated time (`physics.steps_per_tick` physics steps); a view is one camera's image of it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
@@ -215,8 +216,29 @@ class EpisodeEnd:
         return range(self.frames) if self.image_ids is None else self.image_ids
 
 
+_DIGITS = 6
+"""Decimal places of the pose of a bin in records."""
+_FLAT = ("table", "pallet")
+"""Names of bins without walls."""
 WORD_BYTES = 4
 """Bytes of a word."""
+
+
+def bin_record(name: str, pose: np.ndarray) -> dict[str, Any]:
+    """Record of a bin: name, position [m] and yaw [rad] in the world, from its pose (7): x, y, z [m], quaternion x, y, z, w."""
+    x, y, z, _, _, sine, cosine = pose.astype(np.float64).tolist()
+    yaw = round(2.0 * math.atan2(sine, cosine), _DIGITS)
+    return {"name": name, "position": [round(part, _DIGITS) for part in (x, y, z)], "yaw": yaw}
+
+
+def name_bin(sentence: str, record: Mapping[str, Any] | None) -> str:
+    """Sentence on an episode's tote, said of the bin that it has; None: a tote that is always in its place."""
+    if record is None:
+        return sentence
+    name = record["name"]
+    if name in _FLAT:
+        sentence = sentence.replace("in the tote", "on the tote")
+    return sentence.replace("tote", name if name in ("tote", *_FLAT) else "bin")
 
 
 def most_words(width: int, height: int) -> int:

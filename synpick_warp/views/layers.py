@@ -37,15 +37,15 @@ class Layer:
 
     dtype: str
     """Type of the values, in device buffers, in `FrameBatch.layers` and as decoded: a NumPy name."""
-    components: int
-    """Components of a pixel's value (C): the values have shape (H, W, C), or (H, W) if 1."""
-    unit: str
     values: str
     """Meaning of the values, and of the value that stands for none."""
     encoding: str
     """Key of `layer_codec.CODECS`."""
     note: str
     """Meaning of the file's codes, for the notes of a data set."""
+    components: int = 1
+    """Components of a pixel's value (C): the values have shape (H, W, C), or (H, W) if 1."""
+    unit: str = ""
     kernel: str = ""
     """Kernel of a layer of another package, as "module:name", made by `kernel_of_layer` (`kernels/render/images/layers.py`)."""
 
@@ -54,7 +54,6 @@ _OWN = {
     "normals": Layer(
         dtype="float32",
         components=3,
-        unit="",
         values="Unit shading normal in the camera's axes, towards the camera; zero: no surface.",
         encoding="unit_vector",
         note=f"unit normals towards the camera, in its axes; red, green and blue are {ZERO_CODE} + {NORMAL_STEPS} times x, y and z; "
@@ -63,7 +62,6 @@ _OWN = {
     "albedo": Layer(
         dtype="uint8",
         components=3,
-        unit="",
         values="Base colour, sRGB, red first; zero: no surface.",
         encoding="raw",
         note="base colour without light, sRGB; black where no surface is.",
@@ -71,7 +69,6 @@ _OWN = {
     "nocs": Layer(
         dtype="float32",
         components=3,
-        unit="",
         values="Normalized object coordinates: (p - centre of the bounding box) / its diagonal + 0.5, in the model's axes; "
         "zero: no instance.",
         encoding="fraction",
@@ -80,8 +77,6 @@ _OWN = {
     ),
     "classes": Layer(
         dtype="uint16",
-        components=1,
-        unit="",
         values="Class id: obj_id of the visible instance; 0: no instance.",
         encoding="raw",
         note="obj_id; 0: no instance.",
@@ -109,7 +104,6 @@ _OWN = {
     ),
     "depth_sensor": Layer(
         dtype="uint16",
-        components=1,
         unit="depth_scale",
         values="Planar depth as a structured-light depth sensor measures it, in counts of the depth scale; 0: hole.",
         encoding="raw",
@@ -118,23 +112,18 @@ _OWN = {
     ),
     "ir_left": Layer(
         dtype="uint8",
-        components=1,
-        unit="",
         values="Infrared image of the left camera of a stereo pair, which is the view's own; linear.",
         encoding="raw",
         note="infrared image at this camera, the left one of a rectified stereo pair (`depth_sensor` in config.toml); linear.",
     ),
     "ir_right": Layer(
         dtype="uint8",
-        components=1,
-        unit="",
         values="Infrared image of the right camera, with the same intrinsics and rotation; linear.",
         encoding="raw",
         note="infrared image at the right camera: this one, moved by `depth_sensor.baseline` along its x axis; linear.",
     ),
     "depth_stereo": Layer(
         dtype="uint16",
-        components=1,
         unit="depth_scale",
         values="Planar depth by stereo matching of the infrared pair, in counts of the depth scale; 0: hole.",
         encoding="raw",
@@ -143,8 +132,6 @@ _OWN = {
     ),
     "suction_seal": Layer(
         dtype="float32",
-        components=1,
-        unit="",
         values="Seal score of a suction cup set on the pixel along its normal, 0 to 1; 0: no seal, something in the way, or no instance.",
         encoding="fraction",
         note=f"analytic seal score of a cup of `suction.radius` on the pixel, {MAX_CODE} times, as SuctionNet-1Billion defines it: how "
@@ -152,8 +139,6 @@ _OWN = {
     ),
     "suction_wrench": Layer(
         dtype="float32",
-        components=1,
-        unit="",
         values="Wrench score of a suction cup set on the pixel along its normal, 0 to 1; 0: too long a lever, or no instance.",
         encoding="fraction",
         note=f"analytic wrench score of the same cup, {MAX_CODE} times: 1 if the object's centre of mass hangs on its axis, 0 where 1 kg "

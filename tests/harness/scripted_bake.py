@@ -13,7 +13,7 @@ from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
-from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
+from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -110,7 +110,7 @@ def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool,
     split = DataLayout.of(output.config).split_of(episode)
     row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
-    exporters.end_episode(end, lambda: output.commit(exporters, pool, end))
+    exporters.end_episode(end, lambda: commit_episode(output.out, exporters, pool, end))
     return row
 
 

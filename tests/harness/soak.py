@@ -24,7 +24,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
-from synpick_warp.dataset.commit.writing import OutputFolder
+from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -88,7 +88,7 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
                     row = EpisodeOutcome(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
                     attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
                     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
-                    exporters.end_episode(end, partial(output.commit, exporters, pool, end))
+                    exporters.end_episode(end, partial(commit_episode, output.out, exporters, pool, end))
                 _remove_old(out, exporters, WORLDS * (first - KEPT))
             if (tick + 1) % max(1, ticks // SAMPLES) == 0:
                 pool.wait()

@@ -19,7 +19,7 @@ import numpy as np
 
 from synpick_warp.apps.conversion.source import StoredSceneFiles, StoredViewFiles
 from synpick_warp.apps.validation.comparison import MEASURED_DEPTH
-from synpick_warp.apps.validation.rendering import ObjectRenderer
+from synpick_warp.apps.validation.rendering import DepthPatch, ObjectRenderer
 from synpick_warp.codes import Ending
 from synpick_warp.configs.calibration.lens import read_lens
 from synpick_warp.configs.dataset.export import ExportSettings
@@ -140,16 +140,16 @@ def render_masks(
     for truth in gt:
         rotation, translation = (np.asarray(truth[name], np.float64) for name in ("cam_R_m2c", "cam_t_m2c"))
         patch = _renderer(root).render(int(truth["obj_id"]), rotation.reshape(3, 3), translation.reshape(3), matrix, size, lens)
-        window = np.s_[patch.top : patch.top + patch.depth.shape[0], patch.left : patch.left + patch.depth.shape[1]]
-        nearest[window] = np.minimum(nearest[window], patch.depth)
-        found.append((patch.depth, window))
-    return [_make_masks(depth, window, nearest, measured) for depth, window in found]
+        nearest[patch.window] = np.minimum(nearest[patch.window], patch.depth)
+        found.append(patch)
+    return [_make_masks(patch, nearest, measured) for patch in found]
 
 
-def _make_masks(depth: np.ndarray, window: Any, nearest: np.ndarray, measured: np.ndarray | None) -> tuple[np.ndarray, ...]:
-    """Amodal and visible mask (H, W) bool of an object. `depth`: rendered, in `window`; `nearest`: least of all objects; `measured`: the
-    depth image (None: there is none), in which 0 hides nothing. All in mm."""
+def _make_masks(patch: DepthPatch, nearest: np.ndarray, measured: np.ndarray | None) -> tuple[np.ndarray, ...]:
+    """Amodal and visible mask (H, W) bool of a rendered object. `nearest`: least depth of all objects; `measured`: depth image (None: there
+    is none), in which 0 hides nothing. All in mm."""
     amodal, visible = np.zeros((2, *nearest.shape), bool)
+    window, depth = patch.window, patch.depth
     amodal[window] = np.isfinite(depth)
     visible[window] = amodal[window] & (depth <= nearest[window])
     if measured is not None:

@@ -12,7 +12,7 @@ from synpick_warp.apps.conversion.source import ConversionSource, StoredContext
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
-from synpick_warp.dataset.commit.writing import OutputFolder, finalize_data_set
+from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.formats import Content, contents_of, convertible, find_format, format_names
@@ -77,7 +77,7 @@ def _convert_episodes(
     limit = AHEAD * max(1, len(pool.pids()))
 
     def commit(end: EpisodeEnd) -> None:
-        output.commit(exporters, pool, end)
+        commit_episode(output.out, exporters, pool, end)
         working[0] -= 1
         done[0] += 1
         report("episodes", done[0], total)

@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from synpick_warp.codes import Ending, Outcome, names
+from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
 from synpick_warp.configs.schema import Config
@@ -147,10 +147,6 @@ class StoredSceneFiles:
         return (self.view(self.files, self.scene, self.images[frame]) for frame in frames)
 
 
-_COPY_BYTES = 1 << 20
-"""Size of a copy block [B]."""
-
-
 class ConversionSource:
     """A baked data set that is converted. Reads its manifest and settings, and checks them."""
 
@@ -191,7 +187,7 @@ class ConversionSource:
             raise DatasetError(f"{place} is damaged: {there}; {ADVICE}")
         for end in map(self.episode_end, self.episodes):
             if Ending(end.ending).delivers:
-                check_trajectory(self.data[end.episode], end, len(store.lights), gripper=gripper)
+                check_trajectory(self.data[end.episode], len(store.lights), gripper=gripper)
 
     def scenes(self, end: EpisodeEnd) -> list[StoredSceneFiles]:
         """Files of the scene of each camera in an episode, in the order of cameras."""
@@ -219,30 +215,6 @@ class ConversionSource:
         check_frames(self.folder, DataLayout.of(self.config), index, row["frames"])
         lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
         return EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines)
-
-    def copy_constants(self, names: tuple[Path, ...], out: Path) -> None:
-        """Copy files that all episodes share, and those in folders of these names, to another data set; replaces what is there. Raises
-        DatasetError if a file is missing or no regular file, or the source has none of a name, and OSError if a file cannot be written."""
-        known = read_checksums(self.folder, CONSTANTS)
-        check_file_names(self.folder, CONSTANTS, known, DataLayout.of(self.config))
-        listed = [Path(name) for name in known]
-        for name in names:
-            files = [path for path in listed if path == name or name in path.parents]
-            if not files:
-                raise DatasetError(f"{self.folder} has no {name}; bake it with --formats bop or shards")
-            remove_folder(out / name)
-            for path in files:
-                (out / path).parent.mkdir(exist_ok=True)
-                self._copy(path, out / path)
-
-    def _copy(self, path: Path, target: Path) -> None:
-        """Copy a regular file of the data set to `target`; raises DatasetError if it cannot be read."""
-        try:
-            handle = open_regular(self.folder / path)
-        except OSError as error:
-            raise DatasetError(f"{self.folder / path} cannot be read: {error.strerror}; run `synpick-warp verify`") from None
-        with os.fdopen(handle, "rb") as source, target.open("wb") as file:
-            shutil.copyfileobj(source, file, _COPY_BYTES)
 
 
 class StoredContext(ExportContext):
@@ -287,12 +259,29 @@ class StoredContext(ExportContext):
     @property
     def names(self) -> dict[int, str]:
         """Names by obj_id, sorted: from the zarr store; without one from models and settings, else "obj_NNNNNN"."""
-        found = names_of(self._source.data)
-        return dict(sorted(found.items()))
+        return dict(sorted(names_of(self._source.data).items()))
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """Copy these files and folders from the source to the output folder; returns True."""
-        self._source.copy_constants(names, self.out)
+        """Copy these files, and those in folders of these names, from the source to the output folder, in place of what is there; returns
+        True. Raises DatasetError if a file is missing or no regular file, or the source has none of a name, and OSError if a file cannot be
+        written."""
+        folder = self._source.folder
+        known = read_checksums(folder, CONSTANTS)
+        check_file_names(folder, CONSTANTS, known, DataLayout.of(self._source.config))
+        listed = [Path(name) for name in known]
+        for name in names:
+            files = [path for path in listed if path == name or name in path.parents]
+            if not files:
+                raise DatasetError(f"{folder} has no {name}; bake it with --formats bop or shards")
+            remove_folder(self.out / name)
+            for path in files:
+                (self.out / path).parent.mkdir(exist_ok=True)
+                try:
+                    handle = open_regular(folder / path)
+                except OSError as error:
+                    raise DatasetError(f"{folder / path} cannot be read: {error.strerror}; run `synpick-warp verify`") from None
+                with os.fdopen(handle, "rb") as source, (self.out / path).open("wb") as file:
+                    shutil.copyfileobj(source, file)
         return True
 
 
@@ -302,7 +291,6 @@ GRIPPER = ("task", "attached")
 """Arrays of `ticks` that a format with states and commands of the gripper needs, too."""
 SETPOINT = "setpoint"
 """Array of `steps` that such a format needs."""
-_OUTCOMES = tuple(name.lower() for name in names(Outcome))
 
 
 class _Light(msgspec.Struct):
@@ -326,22 +314,9 @@ class _Attributes(msgspec.Struct):
     bin: _Bin | None = None
 
 
-class _Attempt(msgspec.Struct):
-    """Schema of a line of attempts.jsonl, as far as tasks and rewards are made of it; object None: nothing was seen."""
-
-    frame: Index
-    end_frame: Index
-    outcome: str
-    object_id: Index | None
-
-    def __post_init__(self) -> None:
-        if self.outcome not in _OUTCOMES:
-            raise ValueError(f"its outcome is none of {', '.join(_OUTCOMES)}")
-
-
-def check_trajectory(data: Episode, end: EpisodeEnd, lights: int, *, gripper: bool) -> None:
-    """Check that an episode's trajectory has what a format needs; `lights`: number of environment maps, `gripper`: whether states, commands
-    and attempts of the gripper are needed. Raises DatasetError if an attribute, array or key is missing or damaged."""
+def check_trajectory(data: Episode, lights: int, *, gripper: bool) -> None:
+    """Check that an episode's trajectory has what a format needs; `lights`: number of environment maps, `gripper`: whether states and
+    commands of the gripper are needed. Raises DatasetError if an attribute or array is missing or damaged."""
     light = check_content(data.attributes, _Attributes, data.group / GROUP_FILE).light
     if light.map >= lights:
         raise DatasetError(f"{data.group / GROUP_FILE} is damaged: light.map is {light.map}, the store has {lights} maps; {ADVICE}")
@@ -356,8 +331,6 @@ def check_trajectory(data: Episode, end: EpisodeEnd, lights: int, *, gripper: bo
                 f"{data.group} has no steps, whose setpoints are the actions of lerobot; bake zarr with trajectory.steps = true"
             )
         _require(data, data.steps, "steps", (SETPOINT,))
-        for line in end.attempts:
-            check_content(msgspec.json.decode(line), _Attempt, f"the manifest entry of episode {end.episode}")
 
 
 def _require(data: Episode, arrays: Arrays, group: str, wanted: tuple[str, ...]) -> None:

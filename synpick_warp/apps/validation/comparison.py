@@ -136,18 +136,15 @@ class ComparedView:
         view, matrix = self.view, self.matrix
         if matrix is None or view.size is None:
             return []
-        patches: list[DepthPatch | None] = []
-        for item in view.truths:
-            rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
-            usable = self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01
-            patches.append(self.renderer.render(item.obj_id, rotation, translation, matrix, view.size, self.lens) if usable else None)
+        patches: list[tuple[int, DepthPatch]] = []
         nearest = np.full((view.size[1], view.size[0]), np.inf, np.float32)
-        for patch in patches:
-            if patch is not None:
-                height, width = patch.depth.shape
-                part = nearest[patch.top : patch.top + height, patch.left : patch.left + width]
-                np.minimum(part, patch.depth, out=part)
-        found = [self._instance(index, patch, nearest) for index, patch in enumerate(patches) if patch is not None]
+        for index, item in enumerate(view.truths):
+            rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
+            if self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01:
+                patch = self.renderer.render(item.obj_id, rotation, translation, matrix, view.size, self.lens)
+                patches.append((index, patch))
+                nearest[patch.window] = np.minimum(nearest[patch.window], patch.depth)
+        found = (self._instance(index, patch, nearest) for index, patch in patches)
         return [item for item in found if item is not None]
 
     def render_other(self, item: Instance, obj_id: int) -> np.ndarray:

@@ -36,6 +36,11 @@ class DepthPatch:
     depth: np.ndarray
     """Planar depth (h, w) float32 [mm]; inf: the object is not there."""
 
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the crop in the image."""
+        return np.s_[self.top : self.top + self.depth.shape[0], self.left : self.left + self.depth.shape[1]]
+
 
 class ObjectRenderer:
     """Renders objects of a data set one by one, on the CPU."""

@@ -26,8 +26,6 @@ from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""
-
-
 CAMERA = camera_schema(cam_model=dict[str, Any], depth_scale=Length, cam_R_w2c=Matrix3)
 
 
@@ -79,7 +77,7 @@ class Category(Struct, gc=False):
 
 
 class Coco(Struct, gc=False):
-    """Schema of scene_gt_coco.json: images, annotations, categories."""
+    """Schema of scene_gt_coco.json."""
 
     images: list[CocoImage]
     annotations: list[Annotation]
@@ -280,34 +278,28 @@ class KeyedScene(KeyedImages):
         return records
 
     def record(self, name: str) -> RecordFile:
-        """Entries of one kind ("camera", "gt", "gt_info") of all views. See `FolderScene`."""
         return self._records[name]
 
     def coco(self, name: str) -> tuple[str, Any] | None:
-        """None: keyed layouts have no COCO file. See `FolderScene`."""
         return None
 
     def mask(self, kind: str, image: int, index: int) -> StoredMask | None:
-        """Mask of an instance, decoded from the view's run lengths; None: there is none. See `FolderScene`."""
         if self._masks is None or self._masks[0] != (kind, image):
             data = self.read(kind, image, None, MAX_JSON)
             file = self.file(kind, image)
             runs = {} if data is None else decode_json(data, dict[str, Segmentation], file, DatasetError)
             self._masks = (kind, image), runs
-        runs = self._masks[1].get(str(index))
-        return None if runs is None else crop_mask(decode_runs(runs, self.file(kind, image, index)), self.file(kind, image, index))
+        runs, file = self._masks[1].get(str(index)), self.file(kind, image, index)
+        if runs is None:
+            return None
+        height, width = runs.size
+        if isinstance(runs.counts, str) or max(runs.size) > MAX_SIDE or sum(runs.counts) != height * width:
+            raise DatasetError(f"{file}: the runs do not cover the image of {width} x {height} pixels")
+        return crop_mask(decode_run_lengths(runs.counts, runs.size), file)
 
 
 CheckedScene = FolderScene | KeyedScene
 """Files of one scene of one sensor, as validation reads them: what does not fit a schema is a fault, not an error."""
-
-
-def decode_runs(runs: Segmentation, file: str) -> np.ndarray:
-    """Decode run lengths (H, W) bool; raises DatasetError if they are compressed, or do not cover the image."""
-    height, width = runs.size
-    if isinstance(runs.counts, str) or max(runs.size) > MAX_SIDE or sum(runs.counts) != height * width:
-        raise DatasetError(f"{file}: the runs do not cover the image of {width} x {height} pixels")
-    return decode_run_lengths(runs.counts, runs.size)
 
 
 def open_scene(layout: Layout, ref: SceneRef) -> CheckedScene:

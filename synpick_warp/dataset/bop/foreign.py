@@ -25,8 +25,6 @@ from synpick_warp.system.inputs.image_files import decode_picture
 
 _SCENE_OFFSET = 10**6
 """Added to the episodes of each further split, where splits have scenes of the same index, so that every episode has its own."""
-
-
 HIDDEN_BOX = [-1, -1, -1, -1]
 UNKNOWN: dict[str, Any] = {
     "bbox_obj": HIDDEN_BOX,
@@ -93,14 +91,9 @@ class ForeignScene(SceneFiles):
 
 
 class ForeignFolder(ForeignScene, SceneFolder):
-    """Scene folder of one sensor."""
+    """Scene folder of one sensor, with the suffix of its files, such as "_cam1"; empty: the classic layout."""
 
     def __init__(self, listing: Listing, sensor: str) -> None:
-        """
-        Args:
-            listing: The scene folder.
-            sensor: Suffix of the sensor's files, such as "_cam1"; empty: the classic layout.
-        """
         super().__init__(listing.path(""), None, sensor)
         self._images = FolderImages(listing, sensor)
 
@@ -146,32 +139,22 @@ def to_color(image: np.ndarray) -> np.ndarray:
 
 
 def measure_info(visible: Sequence[np.ndarray], amodal: Sequence[np.ndarray] | None) -> list[dict[str, Any]]:
-    """Measure pixel counts, visible fraction and boxes.
-
-    Args:
-        visible: Mask of each instance's visible part (H, W) bool.
-        amodal: Mask of its silhouette within the image; None: there are none, and what is measured in them stays unknown.
-
-    Returns:
-        An entry for each instance; `px_count_valid`, which needs depth, is that of all pixels.
-    """
-    silhouettes = [None] * len(visible) if amodal is None else amodal
-    return [_measure(*pair) for pair in zip(visible, silhouettes, strict=True)]
-
-
-def _measure(visible: np.ndarray, amodal: np.ndarray | None) -> dict[str, Any]:
-    """Record of scene_gt_info.json from masks (H, W) bool; without an amodal one (None) only what is visible is known."""
-    seen = int(np.count_nonzero(visible))
-    entry = UNKNOWN | {"bbox_visib": _box(visible), "px_count_visib": seen}
-    if amodal is None:
-        return entry
-    everything = int(np.count_nonzero(amodal))
-    return entry | {
-        "bbox_obj": _box(amodal) if seen else HIDDEN_BOX,
-        "px_count_all": everything,
-        "px_count_valid": everything,
-        "visib_fract": min(1.0, seen / everything) if everything else 0.0,
-    }
+    """Measure pixel counts, visible fraction and boxes of each instance from masks (H, W) bool of its visible part, and of its silhouette
+    within the image; without these (None), what is measured in them stays unknown. `px_count_valid`, which needs depth, is that of all
+    pixels."""
+    entries = []
+    for index, mask in enumerate(visible):
+        seen = int(np.count_nonzero(mask))
+        entries.append(UNKNOWN | {"bbox_visib": _box(mask), "px_count_visib": seen})
+        if amodal is not None:
+            every = int(np.count_nonzero(amodal[index]))
+            entries[-1] |= {
+                "bbox_obj": _box(amodal[index]) if seen else HIDDEN_BOX,
+                "px_count_all": every,
+                "px_count_valid": every,
+                "visib_fract": min(1.0, seen / every) if every else 0.0,
+            }
+    return entries
 
 
 def _box(mask: np.ndarray) -> list[int]:
@@ -190,14 +173,7 @@ class ForeignScenes:
     """
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """
-        Args:
-            folder: The data set.
-            split: Only this split; None: all.
-
-        Raises:
-            DatasetError: There are no scenes.
-        """
+        """Find the scenes of a data set, or of one of its splits; raises DatasetError if there are none."""
         self._folder, self._split = folder, split
         self.layout = Layout(folder)
         if not self.layout.keyed and not self.layout.scenes():
@@ -268,11 +244,7 @@ class ForeignScenes:
         yield from self._scenes
 
     def files(self, episode: int, camera: int) -> SceneFiles:
-        """Files of the scene that a camera recorded.
-
-        Raises:
-            DatasetError: The scene has no such sensor.
-        """
+        """Files of the scene that a camera recorded. Raises DatasetError if the scene has no such sensor."""
         refs = self._scenes[episode]
         suffix = f"_{self.sensors[camera]}" if self.sensors else ""
         # Scenes of one camera stand beside scenes of several sensors in no data set that is known; if they do, they are the first camera's.

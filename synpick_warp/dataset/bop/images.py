@@ -65,15 +65,10 @@ class SceneImages(ABC):
 
 
 class FolderImages(SceneImages):
-    """Images of one sensor in a scene folder."""
+    """Images of one sensor in a scene folder, by the suffix of its files, such as "_cam1", empty: the classic layout; `digits`: least
+    number of digits of indices in file names, of which BOP has six."""
 
     def __init__(self, listing: Listing, sensor: str, digits: int = 1) -> None:
-        """
-        Args:
-            listing: The scene folder.
-            sensor: Suffix of the sensor's files, such as "_cam1"; empty: the classic layout.
-            digits: Least number of digits of indices in file names; BOP has six.
-        """
         self.listing, self.sensor, self._digits = listing, sensor, digits
         self._indices: dict[str, dict[Index, str]] = {}
 
@@ -135,20 +130,11 @@ class KeyedImages(SceneImages):
     """Images of a scene in shards or in the imagewise layout. All masks of an image are one JSON file, of run lengths (COCO's RLE)."""
 
     def __init__(self, listing: Listing, ref: SceneRef) -> None:
-        """
-        Args:
-            listing: Folder of the shards or files.
-            ref: The scene.
-        """
         self.listing, self.ref = listing, ref
 
     @cached_property
     def members(self) -> Mapping[tuple[int, str], Member]:
-        """Members of the scene by (image, content), such as (3, "rgb.jpg").
-
-        Raises:
-            DatasetError: A shard is damaged.
-        """
+        """Members of the scene by (image, content), such as (3, "rgb.jpg"). Raises DatasetError if a shard is damaged."""
         found: dict[tuple[int, str], Member] = {}
         for shard in self.ref.shards:
             path = self.listing.path(shard)

@@ -70,15 +70,7 @@ class Listing:
 
 
 def list_folder(root: Path, place: str = "") -> Listing:
-    """List a folder of a data set.
-
-    Args:
-        root: The data set.
-        place: The folder, relative to the root.
-
-    Raises:
-        DatasetError: It cannot be listed.
-    """
+    """List a folder of a data set, by its path relative to the root; raises DatasetError if it cannot be listed."""
     files, folders, outside, special = set(), set(), [], []
     try:
         with os.scandir(root / place) as entries:
@@ -132,10 +124,8 @@ class Layout:
     """Detected layout of a data set."""
 
     def __init__(self, folder: Path) -> None:
-        """
-        Raises:
-            DatasetError: The folder does not exist, cannot be listed, has nothing of a BOP data set, or is a scene or split of one.
-        """
+        """Raises DatasetError if the folder does not exist, cannot be listed, has nothing of a BOP data set, or is a scene or split of
+        one."""
         if not folder.is_dir():
             raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")
         self.root = folder

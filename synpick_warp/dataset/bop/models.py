@@ -33,20 +33,9 @@ def models_folder(folder: Path) -> str:
 
 
 def find_models(folder: Path, object_ids: Iterable[int], purpose: str) -> dict[int, tuple[Path, FileModelInfo]]:
-    """Find the models of objects.
-
-    Args:
-        folder: The data set.
-        object_ids: Objects that are needed.
-        purpose: What they are needed for, for the message: "poses are evaluated".
-
-    Returns:
-        obj_id -> PLY file [mm], and its entry of models_info.json; sorted.
-
-    Raises:
-        DatasetError: The data set has no models, or an object has none.
-        CatalogError: models_info.json is damaged, or lacks an object.
-    """
+    """Find the models of objects: obj_id -> PLY file [mm], and its entry of models_info.json; sorted. `purpose`, such as "poses are
+    evaluated", is for messages. Raises DatasetError if the data set has no models, or an object has none, and CatalogError if
+    models_info.json is damaged, or lacks an object."""
     models = models_folder(folder)
     info = path_inside(folder, f"{models}/{INFO}", folder, DatasetError)
     if not info.is_file():
@@ -81,7 +70,8 @@ def object_names(dataset: Path, object_ids: set[int], rows: Sequence[ObjectRow] 
             with path.open("rb") as file:
                 comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
         size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
-        fits = (row.name for row in rows if row.id == object_id and _fits(row.diameter, size, tolerance))
+        # A row without a diameter matches any.
+        fits = (row.name for row in rows if row.id == object_id and abs(size - (row.diameter or size)) <= tolerance * row.diameter)
         name = comment[1].decode(errors="replace") if comment else next(fits, "")
         if name:
             names[object_id] = name
@@ -97,8 +87,3 @@ def names_of(data: DataSet) -> dict[int, str]:
         return {}
     known = object_names(data.folder, set(data.models_info), config.object_rows, config.objects.diameter_tolerance)
     return {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
-
-
-def _fits(expected: float, size: float, tolerance: float) -> bool:
-    """Whether a model's diameter matches that of a row in the object table [m]; a row without one matches any."""
-    return expected == 0.0 or abs(size - expected) <= tolerance * expected

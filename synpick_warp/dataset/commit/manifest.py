@@ -79,54 +79,27 @@ FREE_SETTINGS = (
 compared by content, not by the name of their file or folder. A device of another type computes the same episodes up to rounding."""
 
 
-YOUNGER_SETTINGS: dict[str, Any] = {
-    "bop.layout": CLASSIC,
-    "bop.keypoints": 0,
-    "bop.graph": False,
-    "bop.rectified": False,
-    "arrangement.fill": WITHIN,
-    "arrangement.counts": (),
-    "arrangement.drop": COLUMN,
-    "settle.restless": 0.0,
-    "physics.match_all": False,
-    "physics.sleep": 0.0,
-    "depth_sensor.preset": "",
-    "depth_sensor.disparity_noise": 0.0,
-    "depth_sensor.max_disparity": 0.0,
-    "depth_sensor.noise_width": 1,
-    "depth_sensor.registration": 0.0,
-    "depth_sensor.projector": 0.5,
-    "depth_sensor.dot_spacing": 4.0,
-    "depth_sensor.dot_brightness": 2.0,
-    "depth_sensor.ambient": 0.25,
-    "depth_sensor.infrared_noise": 0.005,
-    "pick.forgive": False,
-    "pick.retry": SAME,
-    "perception.camera": "",
-    "perception.grasp_point": MASK,
-    "render.table_size": (0.0, 0.0),
-    "arrangement.upright": 0.0,
-    "effects.contrast": (0.0, 0.0),
-    "effects.saturation": (0.0, 0.0),
-    "camera": [],
-    "bin": [],
-    "objects.embedded": Objects().embedded,
-    "gripper.kind": SUCTION1,
-    "gripper.cups": (),
-    "gripper.valve": EACH,
-    "gripper.mesh_unit": "m",
-    "gripper.mesh_checksum": "",
-    "suction.vacuum": None,
-    "suction.flow": None,
-    "suction.compliance": None,
-    "objects.unit": AUTO_UNIT,
-    "objects.mass_volume": Objects().mass_volume,
-    "objects.symmetries": Objects().symmetries,
-    "objects.symmetry_tolerance": Objects().symmetry_tolerance,
+_YOUNGER: dict[str, dict[str, Any]] = {
+    "bop": {"layout": CLASSIC, "keypoints": 0, "graph": False, "rectified": False},
+    "arrangement": {"fill": WITHIN, "counts": (), "drop": COLUMN, "upright": 0.0},
+    "settle": {"restless": 0.0},
+    "physics": {"match_all": False, "sleep": 0.0},
+    "depth_sensor": {"preset": "", "disparity_noise": 0.0, "max_disparity": 0.0, "noise_width": 1, "registration": 0.0}
+    | {"projector": 0.5, "dot_spacing": 4.0, "dot_brightness": 2.0, "ambient": 0.25, "infrared_noise": 0.005},
+    "pick": {"forgive": False, "retry": SAME},
+    "perception": {"camera": "", "grasp_point": MASK},
+    "render": {"table_size": (0.0, 0.0)},
+    "effects": {"contrast": (0.0, 0.0), "saturation": (0.0, 0.0)},
+    "gripper": {"kind": SUCTION1, "cups": (), "valve": EACH, "mesh_unit": "m", "mesh_checksum": ""},
+    "suction": {"vacuum": None, "flow": None, "compliance": None},
+    "objects": {"unit": AUTO_UNIT}
+    | {name: getattr(Objects(), name) for name in ("embedded", "mass_volume", "symmetries", "symmetry_tolerance")},
+    "bins": {item.name: item.default for item in dataclasses.fields(Bins)},
+    "picks": {item.name: item.default for item in dataclasses.fields(Picks)},
+    "randomize": given_values(Randomize()),
 }
-YOUNGER_SETTINGS |= {f"bins.{item.name}": item.default for item in dataclasses.fields(Bins)}
-YOUNGER_SETTINGS |= {f"picks.{item.name}": item.default for item in dataclasses.fields(Picks)}
-YOUNGER_SETTINGS |= {f"randomize.{name}": value for name, value in given_values(Randomize()).items()}
+YOUNGER_SETTINGS: dict[str, Any] = {f"{section}.{name}": value for section, table in _YOUNGER.items() for name, value in table.items()}
+YOUNGER_SETTINGS |= {"camera": [], "bin": []}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 _YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
@@ -212,11 +185,7 @@ def encode_manifest(content: Mapping[str, Any]) -> bytes:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read a data set's manifest.
-
-    Raises:
-        DatasetError: There is none, it is of another format, damaged, or has been changed by hand.
-    """
+    """Read a data set's manifest. Raises DatasetError if there is none, it is of another format, damaged, or has been changed by hand."""
     path = path_inside(folder, MANIFEST_FILE, folder, DatasetError)
     if not os.path.lexists(path):
         raise DatasetError(f"{folder} has no {MANIFEST_FILE}; name the folder of a data set that synpick-warp baked")
@@ -233,12 +202,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
-    """Read config.toml, the settings of the last bake, and compare them with the manifest.
-
-    Raises:
-        ConfigError: It is not a file of settings.
-        DatasetError: It does not match the manifest.
-    """
+    """Read config.toml, the settings of the last bake, and compare them with the manifest. Raises ConfigError if it is not a file of
+    settings, and DatasetError if it does not match the manifest."""
     path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
     check_regular_file(path, MAX_TOML, DatasetError)
     settings = manifest["settings"]
@@ -302,22 +267,15 @@ def episode_entry(episode: int) -> Path:
 
 
 def committed_episodes(folder: Path) -> list[int]:
-    """Indices of the episodes that have a manifest entry, sorted.
-
-    Raises:
-        DatasetError: The folder of the entries is a link that leads out of the data set.
-    """
+    """Indices of the episodes that have a manifest entry, sorted. Raises DatasetError if the folder of the entries is a link that leads out
+    of the data set."""
     entries = path_inside(folder, str(ENTRIES), folder, DatasetError)
     names = (path.stem for path in entries.iterdir() if path.suffix == ".json") if entries.is_dir() else ()
     return sorted(int(name) for name in names if _EPISODE.fullmatch(name) and name == episode_entry(int(name)).name)
 
 
 def read_entry(folder: Path, entry: Path) -> dict[str, Any] | None:
-    """Read a manifest entry; None: there is none.
-
-    Raises:
-        DatasetError: It cannot be read, or is damaged.
-    """
+    """Read a manifest entry; None: there is none. Raises DatasetError if it cannot be read, or is damaged."""
     path = path_inside(folder, f"{entry}.json", folder, DatasetError)
     if not os.path.lexists(path):
         return None
@@ -334,11 +292,8 @@ def entry_advice(entry: Path) -> str:
 
 
 def read_checksums(folder: Path, entry: Path) -> dict[str, str]:
-    """Read the checksums of an entry's files: path relative to the data set -> SHA-256. The paths are inside the data set.
-
-    Raises:
-        DatasetError: The list is missing, does not match its entry, or is damaged.
-    """
+    """Read the checksums of an entry's files: path relative to the data set -> SHA-256. The paths are inside the data set. Raises
+    DatasetError if the list is missing, does not match its entry, or is damaged."""
     content = read_entry(folder, entry)
     path = path_inside(folder, f"{entry}.sha256", folder, DatasetError)
     lines = read_file(path, MAX_JSON, DatasetError)

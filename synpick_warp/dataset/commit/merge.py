@@ -62,16 +62,9 @@ class Merged(NamedTuple):
 
 
 def merge(parts: Sequence[Path], out: Path) -> Merged:
-    """Merge the committed episodes of several data sets into one. Files are hard links where the file system allows, else copies.
-
-    Args:
-        parts: Data sets of the same settings, versions, objects and lights.
-        out: Folder of the data set: new, or empty.
-
-    Raises:
-        DatasetError: A part is not a data set, or parts do not match.
-        OutputError: A file cannot be written.
-    """
+    """Merge the committed episodes of several data sets of the same settings, versions, objects and lights into one, in a new or empty
+    folder. Files are hard links where the file system allows, else copies. Raises DatasetError if a part is not a data set, or parts do not
+    match, and OutputError if a file cannot be written."""
     if (url := next(filter(None, map(store_url, parts)), None)) is not None:
         raise DatasetError(f"{url} is in an object store, where all of --shard fill one prefix; merge takes folders of this machine")
     manifest = read_manifest(parts[0])
@@ -104,11 +97,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
-    """Check that every part is another folder, and the output folder outside of them.
-
-    Raises:
-        DatasetError: Two parts are the same folder, or the output folder is one, within one, or around one.
-    """
+    """Check that every part is another folder, and the output folder outside of them. Raises DatasetError if two parts are the same folder,
+    or the output folder is one, within one, or around one."""
     known: dict[tuple[int, int], Path] = {}
     try:
         target = out.resolve()
@@ -125,11 +115,8 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
 
 
 def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
-    """Choose the part that each manifest entry is taken from, the first that has it: entry -> part.
-
-    Raises:
-        DatasetError: Parts differ in an entry, an entry or a checksum list is damaged, or no part has a committed episode.
-    """
+    """Choose the part that each manifest entry is taken from, the first that has it: entry -> part. Raises DatasetError if parts differ in
+    an entry, an entry or a checksum list is damaged, or no part has a committed episode."""
     sources: dict[Path, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
@@ -199,12 +186,9 @@ def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: byte
 
 
 def _link(source: Path, target: Path) -> None:
-    """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along.
-
-    Raises:
-        DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
-        OSError: The target cannot be written, or exists: it may be a hard link, so that it is never written to.
-    """
+    """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along. Raises DatasetError
+    if the source is missing, is a symbolic link or no regular file, or cannot be read, and OSError if the target cannot be written, or
+    exists: it may be a hard link, so that it is never written to."""
     make_folder(target.parent)
     try:
         handle = open_regular(source)
@@ -213,8 +197,11 @@ def _link(source: Path, target: Path) -> None:
     except OSError as error:
         raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
     with open(source, "rb", opener=lambda *_: handle) as file:
-        if os.fstat(handle).st_mode & _EXECUTE or not _hard_link(source, target):
-            _copy(file, target)
+        if not os.fstat(handle).st_mode & _EXECUTE:
+            with contextlib.suppress(OSError):  # Where links are not possible; `_copy` raises if the target exists.
+                os.link(source, target, follow_symlinks=False)
+                return
+        _copy(file, target)
 
 
 def _copy(source: BinaryIO, target: Path) -> None:
@@ -229,17 +216,6 @@ def _copy(source: BinaryIO, target: Path) -> None:
             os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(target)) from error
-
-
-def _hard_link(source: Path, target: Path) -> bool:
-    """Hard-link a file; returns whether the file system allows it. Raises FileExistsError."""
-    try:
-        os.link(source, target, follow_symlinks=False)
-    except FileExistsError:
-        raise
-    except OSError:
-        return False
-    return True
 
 
 def _read_blocks(source: BinaryIO) -> Iterator[bytes]:

@@ -41,17 +41,7 @@ def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
 
 
 def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: DataLayout) -> None:
-    """Check that a checksum list names only files that the formats of a data set write.
-
-    Args:
-        folder: The data set.
-        entry: Manifest entry of the list: of the constants, or of an episode.
-        names: Names in the list, relative to the data set.
-        layout: Layout of the data set.
-
-    Raises:
-        DatasetError: It names another file.
-    """
+    """Raise DatasetError unless a checksum list, of the constants or an episode, names only files that the formats of a data set write."""
     matches = _pattern(layout, entry).fullmatch
     foreign = next((name for name in names if not matches(name)), None)
     if foreign is not None:
@@ -61,16 +51,7 @@ def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: Da
 
 
 def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -> str:
-    """Name what lies beside the parts that indices are joined from and belongs to no committed episode.
-
-    Args:
-        folder: The data set.
-        layout: Its layout.
-        episodes: Its committed episodes.
-
-    Returns:
-        A sentence; empty: there is nothing.
-    """
+    """Name, in a sentence, what lies beside the parts that indices are joined from and belongs to no committed episode; empty: nothing."""
     strays = []
     known = set(episodes)
     for name in (name for name in format_names() if name in layout.formats):
@@ -86,17 +67,8 @@ def describe_strays(folder: Path, layout: DataLayout, episodes: Iterable[int]) -
 
 
 def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: int) -> None:
-    """Compare an episode's number of frames, if it is above _HARMLESS, with the sizes of its files in every format.
-
-    Args:
-        folder: The data set.
-        layout: Its layout; None: it has no settings, as a lone trajectory store.
-        episode: Index of the episode.
-        frames: Number of frames that its record states.
-
-    Raises:
-        DatasetError: A file is too small for that number.
-    """
+    """Compare the number of frames that an episode's record states, if it is above _HARMLESS, with the sizes of its files in every format;
+    raises DatasetError if one is too small. `layout` None: the data set has no settings, as a lone trajectory store."""
     for path, size, least in _sizes(folder, layout, episode) if frames > _HARMLESS else ():
         if size / least < frames:
             raise DatasetError(
@@ -106,11 +78,7 @@ def check_frames(folder: Path, layout: DataLayout | None, episode: int, frames: 
 
 
 def check_listed_frames(folder: Path, layout: DataLayout, row: Mapping[str, Any], names: Mapping[str, str]) -> None:
-    """Compare an episode's row with the images that its checksum list names.
-
-    Raises:
-        DatasetError: It counts more or fewer.
-    """
+    """Compare an episode's row with the images that its checksum list names. Raises DatasetError if it counts more or fewer."""
     episode, frames = row["episode"], row["frames"]
     scene, suffix = layout.scene(episode, 0)
     for place in (f"{layout.folder(episode)}/{scene:06d}/rgb{suffix}/", f"coco/images/{scene:06d}/"):

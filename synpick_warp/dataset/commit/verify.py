@@ -37,6 +37,8 @@ _ENTRIES_PER_PROCESS = 4
 """Minimum number of manifest entries per process for which each entry is a single task; fewer entries are split for load balancing."""
 _PARTS_PER_PROCESS = 4
 """Number of tasks per process into which an entry is split."""
+_Reader = Callable[[Path, Path], dict[str, str]]
+"""Reads the checksum list of an entry, as `read_checksums`."""
 
 
 class Verdict(NamedTuple):
@@ -46,15 +48,6 @@ class Verdict(NamedTuple):
     episodes: int
     files: int
     finished: bool
-
-
-class CheckPart(NamedTuple):
-    """Task: check one of `parts` equal parts of the files that a manifest entry lists."""
-
-    entry: Path
-    part: int = 0
-    """Index of the part."""
-    parts: int = 1
 
 
 class Checked(NamedTuple):
@@ -68,16 +61,9 @@ class Checked(NamedTuple):
 def verify(folder: Path, threads: int | None = None, report: Report = ignore_progress) -> Verdict:
     """Verify the checksum of every file of a data set, as recorded when it was written; stops at the first mismatch.
 
-    Order: settings, constants, episodes by index, indices; then, whether an episode that the indices list is missing.
-
-    Args:
-        folder: The data set.
-        threads: Maximum number of processes; None: one per core.
-        report: Receives the number of checked files.
-
-    Raises:
-        DatasetError: The folder is not a data set, or its manifest is damaged.
-        ProcessError: Processes cannot be started, or one died.
+    Order: settings, constants, episodes by index, indices; then, whether an episode that the indices list is missing. Takes at most
+    `threads` processes, None: one per core. Raises DatasetError if the folder is not a data set, or its manifest is damaged, and
+    ProcessError if processes cannot be started, or one died.
     """
     manifest = read_manifest(folder)
     episodes = committed_episodes(folder)
@@ -89,7 +75,8 @@ def verify(folder: Path, threads: int | None = None, report: Report = ignore_pro
         finished = indices is not None and indices["episodes"] == episodes
         entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])] if episodes or indices else []
         total, size = _count_files(folder, entries)
-        for checked in _check_entries(folder, entries, min(threads or count_cores(), _useful_processes(total, size))):
+        processes = max(1, total // _FILES_PER_PROCESS, size // _BYTES_PER_PROCESS)
+        for checked in _check_entries(folder, entries, min(threads or count_cores(), processes)):
             files += checked.files
             if checked.problem:
                 return Verdict(checked.problem, len(episodes), files, finished)
@@ -114,65 +101,38 @@ def _count_files(folder: Path, entries: Sequence[Path]) -> tuple[int, int]:
     return files, size
 
 
-def _useful_processes(files: int, size: int) -> int:
-    """Number of processes beyond which another one would take longer to start than it saves; at least 1."""
-    return max(1, files // _FILES_PER_PROCESS, size // _BYTES_PER_PROCESS)
-
-
 def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Iterator[Checked]:
     """Check the files of manifest entries, in parallel if `processes` > 1; yields the results in the order of the files."""
     parts = 1 if processes == 1 or len(entries) >= _ENTRIES_PER_PROCESS * processes else _PARTS_PER_PROCESS * processes
-    tasks = (partial(_Checker.check, task=CheckPart(entry, part, parts)) for entry in entries for part in range(parts))
-    return map_ordered(WorkerProgram(partial(_Checker, folder), "process that verifies"), tasks, processes)
+    tasks = (partial(check_part, folder, entry, part, parts) for entry in entries for part in range(parts))
+    return map_ordered(WorkerProgram(_cached_reader, "process that verifies"), tasks, processes)
 
 
-class _Checker:
-    """State of a process: the data set's folder, and the checksum list that was read last; successive parts are usually of one entry."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._read = lru_cache(maxsize=1)(read_checksums)
-
-    def check(self, task: CheckPart) -> Checked:
-        """Task: check a part of the files. See `check_part`."""
-        return check_part(self._folder, task, self._read)
+def _cached_reader() -> _Reader:
+    """State of a process: `read_checksums` with the list that it read last; successive parts are usually of one entry."""
+    return lru_cache(maxsize=1)(read_checksums)
 
 
-def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
-    """Check the checksums of a part of a manifest entry's files, up to the first problem.
+def check_part(folder: Path, entry: Path, part: int = 0, parts: int = 1, read: _Reader = read_checksums) -> Checked:
+    """Task: check the checksums of one of `parts` equal parts of the files of a manifest entry, up to the first problem.
 
     Part 0 also checks, before, that the list has the file names that the settings imply, and after, an episode's number of frames.
-
-    Args:
-        folder: The data set.
-        task: The part.
-        read: Reads the checksum list of an entry.
     """
+    checked = Checked(0, "")
     try:
-        known = read(folder, task.entry)
-        if task.part == 0 and task.entry != INDICES:
-            check_file_names(folder, task.entry, known, DataLayout.of(_read_config(folder)))
+        known, content = read(folder, entry), read_entry(folder, entry) or {}
+        layout = DataLayout.of(_read_config(folder)) if part == 0 and entry != INDICES else None
+        if layout is not None:
+            check_file_names(folder, entry, known, layout)
+        first, end = (len(known) * (part + step) // parts for step in (0, 1))
+        checked = check_files(folder, dict(islice(known.items(), first, end)), content.get("bytes"))
+        if layout is not None and entry != CONSTANTS and not checked.problem:
+            row = content["row"]
+            check_listed_frames(folder, layout, row, known)
+            check_frames(folder, layout, row["episode"], row["frames"])
     except (ConfigError, DatasetError) as error:
-        return Checked(0, str(error))
-    first, end = (len(known) * (task.part + step) // task.parts for step in (0, 1))
-    limit = (read_entry(folder, task.entry) or {}).get("bytes")
-    checked = check_files(folder, dict(islice(known.items(), first, end)), limit)
-    if task.part == 0 and not checked.problem:
-        return checked._replace(problem=_check_counts(folder, task.entry, known))
+        return checked._replace(problem=str(error))
     return checked
-
-
-def _check_counts(folder: Path, entry: Path, known: Mapping[str, str]) -> str:
-    """Compare an episode's number of frames with its files; returns the problem, or an empty string, as for entries of no episode."""
-    if entry in (CONSTANTS, INDICES):
-        return ""
-    try:
-        layout, row = DataLayout.of(_read_config(folder)), (read_entry(folder, entry) or {})["row"]
-        check_listed_frames(folder, layout, row, known)
-        check_frames(folder, layout, row["episode"], row["frames"])
-    except DatasetError as error:
-        return str(error)
-    return ""
 
 
 @lru_cache(maxsize=1)
@@ -182,14 +142,8 @@ def _read_config(folder: Path) -> Config:
 
 
 def check_files(folder: Path, known: Mapping[str, str], limit: int | None = None) -> Checked:
-    """Check files in the given order, up to the first problem; returns their number and the problem.
-
-    Args:
-        folder: The data set.
-        known: Expected SHA-256 of each file, by path relative to the data set.
-        limit: Largest size of a file [bytes], such as the sum of all; a larger file is a problem and not read: it may be a sparse
-            file of terabytes. None: any size.
-    """
+    """Check files, by path relative to the data set and SHA-256, in the given order, up to the first problem; returns their number and the
+    problem. A file larger than `limit` [bytes], such as the sum of all, is a problem and not read: it may be a sparse file of terabytes."""
     for number, (name, expected) in enumerate(known.items(), 1):
         if problem := _check_file(f"{folder}/{name}", expected, limit):  # Faster than Path's operator by a fifth of a small file's time.
             return Checked(number, f"{folder / name} {problem}")

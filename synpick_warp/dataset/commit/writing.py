@@ -92,17 +92,8 @@ class OutputFolder:
     """
 
     def __init__(self, out: Path, config: Config, episodes: Sequence[int]) -> None:
-        """Create and lock the folder, and compare its manifest with the settings.
-
-        Args:
-            out: Folder of the data set: new, empty, or of a bake with the same settings.
-            config: All settings.
-            episodes: Indices of the episodes that the bake must deliver, sorted.
-
-        Raises:
-            ConfigError: The folder was started with other settings.
-            OutputError: The folder cannot be used, or another bake uses it.
-        """
+        """Create and lock a folder that is new, empty, or of a bake with the same settings, for a bake that must deliver these episodes,
+        sorted. Raises ConfigError if it was started with other settings, and OutputError if it cannot be used, or another bake uses it."""
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
         self._layout = DataLayout.of(config)
@@ -154,19 +145,9 @@ class OutputFolder:
         """Whether all episodes are committed and the indices cover them."""
 
     def prepare(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
-        """Prepare the folder for the remaining episodes: remove incomplete ones and all indices; write manifest, settings and constants.
-
-        Complete constants stay as they are.
-
-        Args:
-            exporters: All exporters of the bake.
-            inputs: Content digests of objects, lights and textures.
-            pool: Writer processes.
-
-        Raises:
-            ConfigError: The data set was started with other objects or lights.
-            OutputError: The folder cannot be written.
-        """
+        """Prepare the folder for the remaining episodes: remove incomplete ones and all indices; write manifest, settings and constants,
+        unless these are complete. `inputs` are content digests of objects, lights and textures. Raises ConfigError if the data set was
+        started with other objects or lights, and OutputError if the folder cannot be written."""
         if self._known and (said := describe_inputs(inputs, self._known.get(INPUTS, {}))):
             raise ConfigError(f"{self.out} was started with other {said}; {_ADVICE}")
         self._exporters = exporters
@@ -184,18 +165,14 @@ class OutputFolder:
             (self.out / PARTIAL).mkdir()
             if not is_complete(self.out, CONSTANTS):
                 self._remove_constants()
-                paths = self._write_constants(exporters)
+                try:
+                    paths = exporters.write_constants()
+                except BaseException:
+                    with contextlib.suppress(OSError):
+                        self._remove_constants()
+                    raise
                 pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
-
-    def _write_constants(self, exporters: Exporters) -> list[Path]:
-        """Let the exporters write the constants; on an error, delete what was written."""
-        try:
-            return exporters.write_constants()
-        except BaseException:
-            with contextlib.suppress(OSError):
-                self._remove_constants()
-            raise
 
     def _remove_indices(self) -> None:
         """Remove the files that list all episodes, and their entry in the manifest."""
@@ -234,10 +211,6 @@ class OutputFolder:
         """Remove an entry of the manifest and its digests, if there."""
         for suffix in (".json", ".sha256"):
             (self.out / f"{entry}{suffix}").unlink(missing_ok=True)
-
-    def commit(self, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-        """Commit an episode to the folder. See `commit_episode`."""
-        commit_episode(self.out, exporters, pool, end)
 
     def _clean_up(self) -> None:
         """Remove the staging folder, after success or an error; a data set without committed episodes is removed entirely.
@@ -299,18 +272,9 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
 def finalize_data_set(
     out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool, episodes: Sequence[int] | None = None
 ) -> None:
-    """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes.
-
-    Args:
-        out: Folder of the data set.
-        settings: Its settings.
-        kinds: Exporters of its formats.
-        pool: Writer processes.
-        episodes: The committed ones, sorted, whose index lines are in LINES; None: those of the manifest, from their files.
-
-    Raises:
-        OutputError: A file cannot be written, or LINES are not of this call.
-    """
+    """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes, sorted,
+    whose index lines are in LINES; None: those of the manifest, from their files. Raises OutputError if a file cannot be written, or LINES
+    are not of this call."""
     if episodes is None and os.path.lexists(out / LINES):
         raise OutputError(f"{out / LINES} is where the lines of indices are joined; move it away")
     try:
@@ -327,11 +291,7 @@ def finalize_data_set(
 
 def build_lists(out: Path, picks: bool) -> list[Path]:
     """Write the list of episodes, and if episodes can pick (`may_pick`) the list of attempts, from the manifest entries, sorted by episode,
-    or of lines made in advance, if there are LINES.
-
-    Returns:
-        Paths of the lists, relative to the data set.
-    """
+    or of lines made in advance, if there are LINES. Returns paths of the lists, relative to the data set."""
     paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if picks else ()))]
     for path in paths:
         known = out / LINES / path / "0"
@@ -367,11 +327,7 @@ def _planned_end(out: Path) -> int:
 
 def _check_kinds(out: Path, shared: SharedFiles) -> None:
     """Reject what is no file or folder of a bake at the paths that it writes or deletes: symbolic links, which may point outside of the
-    data set, pipes and devices, files in place of folders, folders in place of files.
-
-    Raises:
-        OutputError: A path is of another kind.
-    """
+    data set, pipes and devices, files in place of folders, folders in place of files. Raises OutputError if a path is of another kind."""
     folders = [out / name for name in (ENTRIES, PARTIAL, *list_folders(out, shared.folders))]
     files = [out / name for name in (CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.indices)]
     children = [Path(child.path) for folder in folders if is_folder(folder) for child in os.scandir(folder) if not is_litter(child.name)]
@@ -389,11 +345,8 @@ def _check_kinds(out: Path, shared: SharedFiles) -> None:
 
 
 def lock_folder(out: Path) -> int:
-    """Lock a folder (flock); returns its open handle, which holds the lock. File systems without locks are used unlocked.
-
-    Raises:
-        OutputError: The folder stayed locked for LOCK_TIMEOUT.
-    """
+    """Lock a folder (flock); returns its open handle, which holds the lock. File systems without locks are used unlocked. Raises
+    OutputError if the folder stayed locked for LOCK_TIMEOUT."""
     handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     deadline = time.monotonic() + LOCK_TIMEOUT
     while True:

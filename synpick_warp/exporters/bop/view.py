@@ -24,8 +24,7 @@ from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries,
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.linear_algebra import matmul
-from synpick_warp.views.bins import bin_record
-from synpick_warp.views.frames import FrameBatch, most_words, unpack_mask
+from synpick_warp.views.frames import FrameBatch, bin_record, most_words, unpack_mask
 from synpick_warp.views.layer_codec import encode_layer
 
 ANNOTATIONS = "annotations"
@@ -35,8 +34,6 @@ One file instead of one per view, because ext4 without a journal scans the inode
 """
 NO_BOX = [-1, -1, -1, -1]
 """The toolkit's box of an instance without visible pixels (calc_gt_info.py)."""
-_ALL, _VALID, _VISIBLE = 0, 1, 2
-"""Columns of `FrameBatch.pixels`."""
 _AMODAL_BOX, _VISIBLE_BOX = 0, 1
 """Rows of `FrameBatch.boxes`."""
 _DIGITS = 6
@@ -129,7 +126,7 @@ class RenderedView:
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        """Suffix and encoded colour image; a file that the device has encoded (bytes,) uint8 stays as it is. See `EncodedView`."""
+        """Suffix and encoded colour image; a file that the device has encoded (bytes,) uint8 stays as it is."""
         color, suffix = self._color, self._settings.color_suffix
         if color.ndim == 1:
             return suffix, color.data
@@ -137,12 +134,11 @@ class RenderedView:
 
     @property
     def depth(self) -> bytes:
-        """PNG file of the depth image; the compressed data (bytes,) uint8 that the device has made get their frame. See `EncodedView`."""
+        """PNG file of the depth image; the compressed data (bytes,) uint8 that the device has made get their frame."""
         depth = self._depth
         return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *self._settings.resolution)
 
     def depth_image(self) -> np.ndarray:
-        """Depth image (H, W) uint16 in counts, decoded if the device has encoded it. See `EncodedView`."""
         if self._depth.ndim > 1:
             return self._depth
         image = cv2.imdecode(np.frombuffer(self.depth, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -151,7 +147,6 @@ class RenderedView:
         return image
 
     def masks(self) -> list[Masks]:
-        """Run lengths of the amodal and visible mask of each instance. See `EncodedView`."""
         return extract_masks(self._visible, self._amodal, self._truth, self._settings.resolution[1])
 
 
@@ -327,21 +322,19 @@ def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
 
 
 def make_gt_info_entries(truth: ViewTruth) -> list[dict[str, Any]]:
-    """The view's entry in scene_gt_info.json. Boxes may exceed the image; a box of one pixel has width and height 0."""
-    return [_make_gt_info(pixels, boxes) for pixels, boxes in zip(truth.pixels.tolist(), truth.boxes.tolist(), strict=True)]
-
-
-def _make_gt_info(pixels: list[int], boxes: list[list[int]]) -> dict[str, Any]:
-    """Record of scene_gt_info.json from an instance's pixel counts and boxes; invisible ones have no boxes (`NO_BOX`)."""
-    total, valid, visible = (pixels[column] for column in (_ALL, _VALID, _VISIBLE))
-    return {
-        "bbox_obj": _bop_box(boxes[_AMODAL_BOX]) if visible else NO_BOX,
-        "bbox_visib": _bop_box(boxes[_VISIBLE_BOX]) if visible else NO_BOX,
-        "px_count_all": total,
-        "px_count_valid": valid,
-        "px_count_visib": visible,
-        "visib_fract": visible / total if total else 0.0,
-    }
+    """The view's entry in scene_gt_info.json. Boxes may exceed the image; a box of one pixel has width and height 0; invisible instances
+    have no boxes (`NO_BOX`)."""
+    return [
+        {
+            "bbox_obj": _bop_box(boxes[_AMODAL_BOX]) if visible else NO_BOX,
+            "bbox_visib": _bop_box(boxes[_VISIBLE_BOX]) if visible else NO_BOX,
+            "px_count_all": total,
+            "px_count_valid": valid,
+            "px_count_visib": visible,
+            "visib_fract": visible / total if total else 0.0,
+        }
+        for (total, valid, visible), boxes in zip(truth.pixels.tolist(), truth.boxes.tolist(), strict=True)
+    ]
 
 
 def _bop_box(box: list[int]) -> list[int]:

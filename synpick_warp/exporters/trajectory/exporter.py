@@ -42,7 +42,6 @@ class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """See `Exporter`: a tick of some episodes."""
         size = spool_bytes(settings.objects, settings.physics.steps_per_tick, settings.trajectory.steps)
         return shared_bytes((size,))
 
@@ -51,7 +50,6 @@ class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
         return SharedFiles(CONSTANT_FILES, (), (STORE / EPISODES, STORE))
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: the store with its groups of objects and cameras."""
         with output_errors(self._context.out / STORE):
             write_constants(self._context)
         return list(CONSTANT_FILES)
@@ -62,7 +60,6 @@ class TrajectoryExporter(EpisodeExporter[SpooledEpisode]):
         self._context.pool.submit_all(self._spool(batch, episodes))
 
     def places(self, episode: int) -> tuple[Path]:
-        """The group. See `EpisodeExporter`."""
         return (STORE / EPISODES / f"{episode:06d}",)
 
     def _make_content(self, batch: TickBatch, world: int, _: Path) -> SpooledEpisode:

@@ -24,7 +24,7 @@ from synpick_warp.exporters.trajectory.arrays import (
     GroupSpec,
     TrajectoryArray,
 )
-from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog
+from synpick_warp.scenes.types import FIRST_DISTRACTOR
 from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
@@ -67,7 +67,7 @@ def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndar
         shards=(shard, *inner) if shard else None,
         compressors=ZstdCodec(level=level),
         fill_value=np.nan if dtype.kind == "f" else 0,
-        dimension_names=_make_unique(spec.dims),
+        dimension_names=[dim if dim not in spec.dims[:index] else f"{dim}_2" for index, dim in enumerate(spec.dims)],
         attributes=attributes,
         # One file in the array's folder, instead of folders in folders.
         chunk_key_encoding={"name": "default", "separator": "."},
@@ -79,22 +79,11 @@ def add_array(group: zarr.Group, name: str, spec: TrajectoryArray, data: np.ndar
         array[first:last] = np.ascontiguousarray(data[first:last])
 
 
-def _make_unique(dims: tuple[str, ...]) -> tuple[str, ...]:
-    """Number repeated dimension names: a matrix has the dimensions axis and axis_2."""
-    return tuple(name if name not in dims[:index] else f"{name}_2" for index, name in enumerate(dims))
-
-
 def chunk_layout(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[int, int]:
     """Rows per chunk and per shard for an episode of `ticks` ticks; a shard is no larger than the array needs."""
     chunks = min(settings.shard_chunks, max(1, -(-ticks // settings.chunk_ticks)))
     chunk = settings.chunk_ticks * rows_per_tick
     return chunk, chunks * chunk
-
-
-def _describe_distractors(catalog: Catalog) -> dict[str, Any]:
-    """Attribute of the root on objects without labels: what their ids mean, and their names."""
-    text = f"Objects without labels, by the object_id that they have in the arrays: {FIRST_DISTRACTOR} and below."
-    return {"description": text, "names": {str(body.obj_id): body.name for body in catalog.distractors}}
 
 
 def write_constants(context: ExportContext) -> None:
@@ -107,6 +96,10 @@ def write_constants(context: ExportContext) -> None:
             shutil.rmtree(place)
         else:
             place.unlink(missing_ok=True)
+    distractors = {
+        "description": f"Objects without labels, by the object_id that they have in the arrays: {FIRST_DISTRACTOR} and below.",
+        "names": {str(body.obj_id): body.name for body in context.catalog.distractors},
+    }
     root = zarr.create_group(
         store,
         attributes={
@@ -119,7 +112,7 @@ def write_constants(context: ExportContext) -> None:
             "gravity": physics.gravity,
             "units": {"step": "s", "gravity": "m/s²"},
             "lights": [light.name for light in context.lights],
-            **({"distractors": _describe_distractors(context.catalog)} if context.catalog.distractors else {}),
+            **({"distractors": distractors} if context.catalog.distractors else {}),
         },
     )
     entries, cameras = context.catalog.entries, context.cameras

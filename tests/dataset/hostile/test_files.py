@@ -15,7 +15,6 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
-import msgspec
 import numcodecs.zstd
 import numpy as np
 import pytest
@@ -25,7 +24,8 @@ from hypothesis import strategies as st
 import synpick_warp
 from synpick_warp.dataset.annotations import MASK_SCHEMA, VIEW_SCHEMAS, Key, ModelInfo, check_json
 from synpick_warp.dataset.commit.manifest import CONSTANTS, encode_manifest
-from synpick_warp.dataset.stored_array import ArrayMetadata, check_layout
+from synpick_warp.dataset.stored_array import open_array
+from synpick_warp.dataset.trajectory import GroupContext
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -340,14 +340,15 @@ def test_a_chunk_that_holds_more_or_less_than_its_place_is_not_decompressed(stor
         _ = synpick_warp.open(store)[0].steps["pose"][...]
 
 
-def layout(shape: list[int], *chunks: list[int], dtype: str = "float32") -> ArrayMetadata:
+def layout(shape: list[int], *chunks: list[int], dtype: str = "float32") -> dict:
     """Metadata of an array with these chunk shapes, from the files down."""
-    codecs: list[dict] = [{"name": "bytes"}, {"name": "zstd"}]
+    codecs: list[dict] = [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "zstd", "configuration": {"level": 1}}]
     for chunk in reversed(chunks[1:]):
-        codecs = [{"name": "sharding_indexed", "configuration": {"chunk_shape": chunk, "codecs": codecs}}]
+        configuration = {"chunk_shape": chunk, "codecs": codecs, "index_codecs": codecs[:1]}
+        codecs = [{"name": "sharding_indexed", "configuration": configuration}]
     grid = {"name": "regular", "configuration": {"chunk_shape": chunks[0]}}
-    content = {"zarr_format": 3, "node_type": "array", "shape": shape, "data_type": dtype, "chunk_grid": grid, "codecs": codecs}
-    return msgspec.convert(content, ArrayMetadata)
+    keys = {"chunk_key_encoding": {"name": "default"}, "fill_value": 0, "zarr_format": 3, "node_type": "array"}
+    return keys | {"shape": shape, "data_type": dtype, "chunk_grid": grid, "codecs": codecs}
 
 
 MOVED = [99, 24, 7]
@@ -357,7 +358,7 @@ LAYOUTS = [
     (layout(MOVED, [4_096_000, 24, 7], [4_096_000, 24, 7]), 400, ""),
     (layout(MOVED, [4_096_001, 24, 7]), 400, "larger than its"),
     (layout(MOVED, [99, 24, 8]), 400, "larger than its"),
-    (layout(MOVED, [99, 24]), 400, "chunks of another shape"),
+    (layout(MOVED, [99, 24]), 400, "cannot be read: .* the same number of dimensions"),
     (layout(MOVED, [1, 24, 7]), 400, ""),
     (layout(MOVED, MOVED, [1, 1, 1]), 400, "16,632 chunks for 99 rows"),
     (layout([99, 252, 7], [99, 252, 7]), 400, "252 as instance"),
@@ -366,6 +367,8 @@ LAYOUTS = [
     # Arrays of others have no specification.
     (layout([1000, 100], [1000, 100]), None, ""),
     (layout([100_000_000], [1000]), None, "states 100,000,000 as dimension 0"),
+    (layout([10], [0]), None, "cannot be read: |chunks of another shape"),
+    (layout([10], [10], dtype="string"), None, "cannot be read"),
 ]
 
 
@@ -373,10 +376,11 @@ LAYOUTS = [
 def test_a_layout_fits_the_shape_and_what_is_stored(tmp_path, metadata, times, said):
     for name in ("pose", "time"):
         (tmp_path / name).mkdir()
+    (tmp_path / "pose" / "zarr.json").write_text(json.dumps(metadata))
     (tmp_path / "time" / "c.0").write_bytes(bytes(times or 0))
-    sizes = {"step": metadata.shape[0], "tick": 30_000} if times else {}
+    context = GroupContext(lambda: {"step": metadata["shape"][0], "tick": 30_000} if times else {})
     with pytest.raises(DatasetError, match=said) if said else nullcontext():
-        assert check_layout(tmp_path / "pose", metadata, STEPS.arrays["pose"] if times else None, sizes) < 2**33
+        open_array(tmp_path / "pose", STEPS.arrays["pose"] if times else None, context)
 
 
 def test_a_chunk_file_is_no_larger_than_its_chunk(store):
@@ -395,21 +399,27 @@ def change(path: Path, place: tuple[object, ...], value: object) -> None:
 POSE = "steps/pose"
 METADATA = [
     (POSE, ("shape", 0), 10**12, "is float32 of shape .*; expected: float32 of shape 12 x instance x 7"),
-    (POSE, ("shape",), [12], "is float32 of shape 12; expected"),
+    (POSE, ("shape",), [12], "cannot be read: .* the same number of dimensions"),
     (POSE, ("shape", 1), 2**39, "more than its .* can hold"),
     (POSE, ("data_type",), "float64", "is float64 of shape .*; expected: float32"),
-    (POSE, ("data_type",), "null_terminated_bytes", "invalid enum value"),
-    (POSE, ("codecs", 0, "name"), "pickle", "invalid enum value 'pickle'"),
+    (POSE, ("data_type",), "null_terminated_bytes", "cannot be read: "),
+    (POSE, ("codecs", 0, "name"), "pickle", "cannot be read: .*pickle"),
     (POSE, ("codecs", 0, "configuration", "chunk_shape", 0), 7, "cannot be read: "),
     (POSE, ("codecs", 0, "configuration"), None, "cannot be read: "),
-    (POSE, ("chunk_grid", "configuration", "chunk_shape", 0), 0, "expected int >= 1"),
+    (POSE, ("chunk_grid", "configuration", "chunk_shape", 0), 0, "cannot be read: |chunks of another shape"),
     (POSE, ("fill_value",), "x", "cannot be read: "),
     (POSE, ("chunk_grid", "configuration", "chunk_shape", 1), 2**33, "larger than its"),
     (POSE, ("chunk_grid", "configuration", "chunk_shape", 0), 2**33, "larger than its"),
-    (POSE, ("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "larger than its"),
-    (POSE, ("codecs", 0, "configuration", "chunk_shape"), [2, 2], "chunks of another shape"),
-    (POSE, ("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "invalid enum value 'pickle'"),
-    (POSE, ("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "invalid enum value 'zstd'"),
+    (POSE, ("codecs", 0, "configuration", "chunk_shape", 2), 2**33, "cannot be read: .*8589934592"),
+    (POSE, ("codecs", 0, "configuration", "chunk_shape"), [2, 2], "cannot be read: |chunks of another shape"),
+    (POSE, ("codecs", 0, "configuration", "codecs", 1, "name"), "pickle", "cannot be read: .*pickle"),
+    (
+        POSE,
+        ("codecs", 0, "configuration", "codecs", 1),
+        {"name": "gzip", "configuration": {"level": 1}},
+        "the codec gzip is not allowed here",
+    ),
+    (POSE, ("codecs", 0, "configuration", "index_codecs", 1, "name"), "zstd", "cannot be read: "),
     ("attempts/record", ("shape", 0), 2**30, "states"),
     ("attempts/frame", ("shape", 0), 2**30, "states"),
     ("attempts/peak_force", ("shape", 1), 2**30, "states"),

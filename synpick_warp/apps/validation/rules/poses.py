@@ -106,7 +106,9 @@ def diagnose(rendered: ComparedView) -> list[Finding]:
     done: set[int] = set()
     for item in bad:
         if item.index not in done:
-            other = _find_swapped(item, [other for other in bad if other.index not in done and other is not item])
+            # An instance whose mask fits this silhouette and whose silhouette fits this mask.
+            others = (other for other in bad if other.index not in done and other is not item)
+            other = next((other for other in others if min(_overlap(item, other), _overlap(other, item)) > SWAPPED), None)
             if other is not None:
                 done |= {item.index, other.index}
                 text = f"image {rendered.view.image}: instances {item.index} and {other.index} look swapped"
@@ -165,11 +167,6 @@ def _ray(item: Instance, matrix: np.ndarray) -> np.ndarray:
     x = (item.left + np.arange(width) + 0.5 - matrix[0, 2]) / matrix[0, 0]
     y = (item.top + np.arange(height) + 0.5 - matrix[1, 2]) / matrix[1, 1]
     return np.sqrt(1.0 + x[None] ** 2 + y[:, None] ** 2).astype(np.float32)
-
-
-def _find_swapped(item: Instance, others: list[Instance]) -> Instance | None:
-    """Instance whose mask fits this silhouette and whose silhouette fits this mask; None: there is none."""
-    return next((other for other in others if min(_overlap(item, other), _overlap(other, item)) > SWAPPED), None)
 
 
 def _overlap(item: Instance, other: Instance) -> float:

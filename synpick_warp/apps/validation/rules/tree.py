@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 
@@ -175,19 +175,11 @@ def check_images_extra(scene: SceneSubject) -> Findings:
     """There is no image without an entry in scene_camera.json, and no mask beyond the image's list in scene_gt.json."""
     cameras, truths = scene.record("camera"), scene.record("gt")
     for kind in sorted(scene.files.kinds):
-        for (image, index), name in sorted(scene.files.indices(kind).items(), key=_order):
+        # By image, then by instance; without instance first.
+        files = sorted(scene.files.indices(kind).items(), key=lambda item: tuple(-1 if part is None else part for part in item[0]))
+        for (image, index), name in files:
             if kind not in MASKS or index is None:
                 if cameras.present and image not in cameras.raw:
                     yield scene.files.file(kind, image), f"no entry {image} in {cameras.file}"
-            elif truths.present and not _has(truths.raw.get(image), index):
+            elif truths.present and not (isinstance(entries := truths.raw.get(image), list) and index < len(entries)):
                 yield scene.files.file(kind, image, index), f"no instance {index} in {truths.file}, image {image} ({name})"
-
-
-def _has(entries: Any, index: int) -> bool:
-    """Whether there is an entry `index` in a list of annotations, which may be damaged."""
-    return isinstance(entries, list) and index < len(entries)
-
-
-def _order(item: tuple[tuple[int, int | None], str]) -> tuple[int, int]:
-    """Sort key: image, then instance; without instance first."""
-    return item[0][0], -1 if item[0][1] is None else item[0][1]
