@@ -36,7 +36,6 @@ class PicksExporter(EpisodeExporter[_Tables]):
         return SharedFiles((), (), (STATES_FOLDER, FOLDER))
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: the folders alone."""
         for folder in (FOLDER, STATES_FOLDER):
             with output_errors(place := self._context.out / folder):
                 place.mkdir(exist_ok=True)
@@ -47,13 +46,12 @@ class PicksExporter(EpisodeExporter[_Tables]):
         content.append((make_rows(COLUMNS, batch.trials), make_rows(STATES, batch.states)))
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
-        """See `Exporter`: an episode without trials is written, too."""
+        """An episode without trials is written, too."""
         if Ending(end.ending).delivers:
             self._staged(end.episode, lambda _: [])
         super().end_episode(end, on_committed)
 
     def places(self, episode: int) -> tuple[Path, Path]:
-        """Both tables. See `EpisodeExporter`."""
         return pick_files(episode)
 
     def _commit(self, episode: StagedEpisode[_Tables], end: EpisodeEnd) -> WriteTask:

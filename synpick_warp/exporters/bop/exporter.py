@@ -54,22 +54,18 @@ class BopExporter(SceneExporter):
 
     @staticmethod
     def annotates(bop: Bop) -> bool:
-        """Whether COCO annotations are written (`bop.coco`). See `SceneExporter`."""
         return bop.coco
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """Folder of a split: its name. See `SceneExporter`."""
         return split
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        """Names of what is written beside episodes: models, camera and notes, target lists, and the folders of splits. See `Exporter`."""
         return SharedFiles(constant_files(layout), tuple(map(Path, target_files(layout))), BopExporter.folders(layout))
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """Write the lists of evaluation targets over all episodes; returns their paths. See `Exporter`."""
         layout = settings.layout
         parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(layout), sensor_suffixes(layout)
         with output_errors(out):
@@ -92,7 +88,6 @@ class BopExporter(SceneExporter):
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """Targets of the episode's scenes. See `Exporter`."""
         layout, sensors = settings.layout, sensor_suffixes(settings.layout)
         truths = filter(lambda path: path.name == f"scene_gt{sensors[0]}.json", map(Path, names))
         for scene in sorted((path.parent for path in truths), key=lambda scene: int(scene.name)):
@@ -101,13 +96,11 @@ class BopExporter(SceneExporter):
                 yield f"{name}/0", lines
 
     def write_picks(self, batch: PickBatch) -> None:
-        """Keep grasp trials for scene_picks.json. See `Exporter`."""
         scenes = self._staged(batch.episode, partial(self._create_scenes, batch.episode)).content
         with output_errors(scenes[0]):
             spool_picks(batch, scenes)
 
     def places(self, episode: int) -> Iterator[Path]:
-        """Folders of its scenes. See `EpisodeExporter`."""
         return (self._place(scene).relative_to(self._out) for scene in self.scene_ids(episode))
 
     def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
@@ -119,21 +112,10 @@ class BopExporter(SceneExporter):
         """Task that completes an episode: writes the annotation files of its scenes, and renames the folders to their places."""
         layout = self._context.layout
         episode = scenes[0][1] // len(self._cameras)
-        supports = tuple(self._supports.pop(episode, ()))
+        split, supports = layout.folder(episode), tuple(self._supports.pop(episode, ()))
         settings = tuple(
-            SceneSettings(
-                split=layout.folder(episode),
-                images=images[index],
-                width=camera.width,
-                height=camera.height,
-                color_suffix=self._suffix,
-                coco=self._views[index].coco,
-                categories=self._categories,
-                sensor=layout.scene(0, index)[1],
-                graph=self._views[index].graph,
-                supports=supports,
-            )
-            for index, camera in enumerate(self._cameras)
+            SceneSettings(view, split, own, self._categories, layout.scene(0, index)[1], supports)
+            for index, (view, own) in enumerate(zip(self._views, images, strict=True))
         )
         if self._context.layout.has_sensors:
             return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), settings)

@@ -52,7 +52,9 @@ def join_parts(parts: list[Polygon]) -> Polygon:
     for other in others:
         gaps = np.abs(joined.points[:, None] - other.points[None]).sum(axis=2)
         at, start = np.unravel_index(int(gaps.argmin()), gaps.shape)
-        joined = _insert(joined, int(at) + 1, _closed(other, int(start)), _part(joined, int(at)))
+        around = np.append(np.roll(np.arange(len(other.points)), -start), start)
+        ends = Polygon(other.points[around], other.inward[around]), Polygon(joined.points[at : at + 1], joined.inward[at : at + 1])
+        joined = _insert(joined, int(at) + 1, *ends)
     return joined
 
 
@@ -109,17 +111,6 @@ def _find_corners(image: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         corners.append((row, column, np.full_like(row, right), np.full_like(row, lower)))
     y, x, right, lower = (np.concatenate(part) for part in zip(*corners, strict=True))
     return y, x, right, lower
-
-
-def _part(polygon: Polygon, corner: int) -> Polygon:
-    """Polygon of one vertex of a polygon."""
-    return Polygon(polygon.points[corner : corner + 1], polygon.inward[corner : corner + 1])
-
-
-def _closed(polygon: Polygon, start: int) -> Polygon:
-    """Polygon with its vertices from `start` around to `start` again."""
-    order = np.append(np.roll(np.arange(len(polygon.points)), -start), start)
-    return Polygon(polygon.points[order], polygon.inward[order])
 
 
 def _insert(polygon: Polygon, at: int, *parts: Polygon) -> Polygon:

@@ -9,7 +9,7 @@ import itertools
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -36,20 +36,16 @@ DATE = "1970-01-01 00:00:00"
 class SceneSettings:
     """What completes a scene."""
 
+    view: ViewSettings
+    """Settings of its views."""
     split: str
     """Name of the split's folder."""
     images: Sequence[int]
-    """Images (im_id) that each scene must have, ascending."""
-    width: int
-    height: int
-    color_suffix: str
-    coco: bool
-    categories: tuple[dict[str, Any], ...] = field(kw_only=True)
+    """Images (im_id) that it must have, ascending."""
+    categories: tuple[dict[str, Any], ...]
     """COCO's category of every object of the catalog."""
     sensor: str = ""
     """Suffix of the image folders, such as "_cam1"; empty: classic."""
-    graph: bool = False
-    """Whether scene_graph.json is written."""
     supports: Sequence[FrameSupport] = ()
     """Support edges by frame of the episode; empty: those of stored entries."""
 
@@ -76,7 +72,10 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
             folder.write(f"depth/{name}.png", view.depth)
         masks = view.masks() if settings.masks or settings.coco or settings.graph else []
         for index, mask in enumerate(masks if settings.masks else ()):
-            amodal, visible = _encode_masks(mask, *settings.resolution)
+            width, height = settings.resolution
+            amodal = visible = encode_mask_png(mask.amodal, height, width)
+            if mask.amodal.count != mask.visible.count:  # Something hides the instance.
+                visible = encode_mask_png(mask.visible, height, width)
             folder.write(f"mask/{name}_{index:06d}.png", amodal)
             folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
         annotations = _make_annotations(view, masks, settings) if settings.coco else ()
@@ -87,12 +86,6 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 def write_layer(data: Buffer, scene: Path, _: int, name: str, frame: int) -> None:
     """Write a view's layer into the folder of that name."""
     layer_path(scene, name, frame).write_bytes(data)
-
-
-def _encode_masks(masks: Masks, width: int, height: int) -> tuple[bytes, bytes]:
-    """Encode an instance's amodal and visible mask as PNG. If nothing hides the instance they are equal, and are encoded once."""
-    amodal = encode_mask_png(masks.amodal, height, width)
-    return amodal, amodal if masks.amodal.count == masks.visible.count else encode_mask_png(masks.visible, height, width)
 
 
 def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSettings) -> Iterator[dict[str, Any]]:
@@ -138,22 +131,16 @@ def complete_scene(scene: Path, settings: SceneSettings) -> None:
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
             _write_lines(scene / name, _format_keyed(blocks, index))
-        if settings.graph:
+        if settings.view.graph:
             _write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports)))
-        if settings.coco:
-            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.graph, settings))
+        if settings.view.coco:
+            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.view.graph, settings))
         if (scene / PICKS).exists():
-            size = settings.width, settings.height
-            _write_lines(scene / "scene_picks.json", format_picks(scene / PICKS, partial(_read_camera, blocks), size))
+            _write_lines(scene / "scene_picks.json", format_picks(scene / PICKS, blocks.camera, settings.view.resolution))
             (scene / PICKS).unlink()
     (scene / ANNOTATIONS).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
         sync_folder(folder)
-
-
-def _read_camera(blocks: AnnotationBlocks, frame: int) -> dict[str, Any] | None:
-    """Entry of a frame in scene_camera.json; None: the scene has no such image."""
-    return json.loads(next(blocks.read(frame, 0, 1))) if frame in blocks.frames else None
 
 
 class AnnotationBlocks:
@@ -177,6 +164,10 @@ class AnnotationBlocks:
         """Raise OutputError unless there is one block of each image."""
         if self.frames != list(images):
             raise OutputError(f"{scene} has {len(self.frames)} of {len(images)} frames; this is an error of synpick-warp, please report it")
+
+    def camera(self, frame: int) -> dict[str, Any] | None:
+        """Entry of a frame in scene_camera.json; None: the scene has no such image."""
+        return json.loads(next(self.read(frame, 0, 1))) if frame in self._places else None
 
     def read(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
         """Read entries `begin` to `end`, exclusive, of a frame."""
@@ -227,9 +218,9 @@ def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
     """Entry of an image in scene_gt_coco.json."""
     return {
         "id": frame,
-        "file_name": f"rgb{settings.sensor}/{frame:06d}{settings.color_suffix}",
-        "width": settings.width,
-        "height": settings.height,
+        "file_name": f"rgb{settings.sensor}/{frame:06d}{settings.view.color_suffix}",
+        "width": settings.view.resolution[0],
+        "height": settings.view.resolution[1],
         "date_captured": DATE,
         "license": 1,
         "coco_url": "",

@@ -120,11 +120,10 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """Size of a task's images in shared memory: those of one view at the largest resolution [B]. See `Exporter`."""
         return view_bytes(settings.rig.largest, settings.objects, bool(settings.render.layers))
 
     def write_constants(self) -> list[Path]:
-        """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths. See `Exporter`."""
+        """Create the folders, and write models, camera and notes, or copy them when converting; returns their paths."""
         context = self._context
         with output_errors(self._out):
             for folder in self.folders(context.layout):
@@ -149,7 +148,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         return {body.obj_id: self._context.settings.physics.gravity * body.mass for body in self._context.catalog.bodies}
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Collect which object rests on which, for each frame of a tick, if the format writes scene graphs. See `Exporter`."""
+        """Collect which object rests on which, for each frame of a tick, if the format writes scene graphs."""
         if not (self._bop.graph and self.has_graph and "support" in batch.tick):
             return
         for episode, frame, support in zip(batch.episode.tolist(), batch.frame.tolist(), find_supports(batch, self._weights), strict=True):
@@ -158,7 +157,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             self._supports[episode].append(support)
 
     def write_views(self, batch: FrameBatch) -> None:
-        """Submit a task for each view of a batch. See `Exporter`."""
         self._pool.submit_all(self._make_tasks(batch))
 
     def _make_tasks(self, batch: FrameBatch) -> Iterator[WriteTask]:
@@ -176,7 +174,6 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
                 yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """Submit a task for each scene of an episode that is read from an existing data set (conversion). See `Exporter`."""
         staged = self._staged(episode, partial(self._create_scenes, episode))
         for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
             arguments = (stored, type(self).write_view, type(self).write_layer, settings.layers, scene, settings)

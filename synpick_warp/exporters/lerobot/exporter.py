@@ -73,7 +73,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
-        """See `Exporter`: a colour image."""
         width, height = settings.rig.largest
         return shared_bytes((height * width * 3,))
 
@@ -85,12 +84,10 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the tables over all episodes."""
         with output_errors(out / FOLDER):
             return write_indices(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: camera and notes."""
         context = self._context
         with output_errors(context.out):
             return write_notes(context.out, context.settings, self._names, context.cameras)
@@ -106,7 +103,7 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         self._context.pool.submit_all(tasks)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
-        """See `Exporter`: a task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
+        """A task for each group of pictures. Videos of JPEG images differ from a bake's, as they were compressed before."""
         staged, tasks = self._episode(episode), []
         for camera, scene in enumerate(scenes):
             for group in range(-(-scene.frames // GROUP)):
@@ -122,7 +119,6 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         return self._staged(index, lambda _: _LerobotContent())
 
     def places(self, episode: int) -> list[Path]:
-        """Part and videos. See `EpisodeExporter`."""
         return [part_path(episode), *(video_path(camera, episode) for camera in self._rig.names)]
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:

@@ -118,15 +118,11 @@ def split_name(layout: DataLayout, episode: int) -> str:
     return split_kind(layout.split) if split is None else split.name
 
 
-def split_ranges(names: Sequence[str]) -> dict[str, str]:
-    """Ranges of episodes, as "0:240", from the split of each; the episodes of a split follow each other."""
-    counts = Counter(names)
-    ends = itertools.accumulate(counts.values())
-    return {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
-
-
 def make_info(rig: Rig, rate: float, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
     """Content of meta/info.json; `rate`: see `frame_rate`; `splits`: name of the split of each episode."""
+    counts = Counter(splits)  # The episodes of a split follow each other.
+    ends = itertools.accumulate(counts.values())
+    ranges = {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
     videos = {camera_key(name): _video_feature(*size, rate) for name, size in zip(rig.names, rig.sizes, strict=True)}
     columns = {
         name: {"dtype": feature.dtype, "shape": [len(feature.names) or 1], "names": list(feature.names) or None}
@@ -141,7 +137,7 @@ def make_info(rig: Rig, rate: float, splits: Sequence[str], frames: int, tasks: 
         "chunks_size": CHUNK,
         **_SIZES,
         "fps": rate,
-        "splits": split_ranges(splits),
+        "splits": ranges,
         "data_path": f"data/{_CHUNKED}.parquet",
         "video_path": f"videos/{{video_key}}/{_CHUNKED}.mp4",
         "features": videos | columns,

@@ -38,7 +38,6 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: the asset library."""
         from synpick_warp.exporters.usd.assets import write_library  # pxr loads slowly, and only this method needs it.
 
         library = self._context.out / LIBRARY
@@ -62,7 +61,6 @@ class UsdExporter(EpisodeExporter[TickSpool]):
         return WriteTask(write_episode, (), (spool.path, spool.instances, place, replace(end, attempts=()), self._settings), place)
 
     def places(self, episode: int) -> tuple[Path]:
-        """The one file. See `EpisodeExporter`."""
         return (FOLDER / f"{episode:06d}.usdc",)
 
     @cached_property

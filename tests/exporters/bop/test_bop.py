@@ -28,7 +28,7 @@ from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.shared.models import encode_model, write_models
-from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
+from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.writing.files import open_folder
 from synpick_warp.exporters.writing.png import encode_png
@@ -190,7 +190,7 @@ def test_a_killed_writer_is_reported_and_committed_scenes_stay(tmp_path):
 
 
 def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
-    settings = SceneSettings("train_pbr", range(3), 4, 3, ".jpg", True, categories=())
+    settings = SceneSettings(ViewSettings(".jpg", 95, (), True, True, {}, (4, 3)), "train_pbr", range(3), ())
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
         create_scene_folders(scene, ("rgb", "depth", "mask", "mask_visib"))

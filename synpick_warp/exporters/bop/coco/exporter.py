@@ -44,7 +44,6 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`: one for all splits."""
         return FOLDER.name
 
     @staticmethod
@@ -54,19 +53,16 @@ class CocoExporter(SceneExporter):
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the annotations of each split."""
         with output_errors(out / FOLDER):
             return write_annotation_files(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: names and keypoints of the objects, camera and notes."""
         names = self._context.names
         write_categories(self._out, names, self._keypoints)
         with output_errors(self._out):
             return [CATEGORIES, *write_notes(self._out, self._context.settings, names, self._cameras)]
 
     def places(self, episode: int) -> Iterator[Path]:
-        """Folders of images, and parts. See `EpisodeExporter`."""
         return (place for scene in self.scene_ids(episode) for place in (IMAGES / f"{scene:06d}", PARTS / f"{scene:06d}.jsonl"))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:

@@ -43,7 +43,6 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`: the toolkit's name."""
         return f"{split}_web"
 
     @staticmethod
@@ -53,7 +52,6 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        """See `Exporter`: the index of views and shards of each split, and the dataset card."""
         layout = settings.layout
         cameras = layout.cameras
         scenes = [scene for episode in episodes for scene in range(cameras * episode, cameras * (episode + 1))]
@@ -67,7 +65,7 @@ class ShardsExporter(SceneExporter):
 
     @staticmethod
     def index_lines(out: Path, settings: ExportSettings, names: Sequence[str]) -> Iterator[tuple[str, bytes]]:
-        """See `Exporter`: for each shard keys of its views, in parts of MAX_SHARD_SCENES shards; its size [B] and number of views."""
+        """For each shard keys of its views, in parts of MAX_SHARD_SCENES shards; its size [B] and number of views."""
         splits = ShardsExporter.folders(settings.layout)
         shards = filter(lambda path: path.parent in splits and path.suffix == ".tar", map(Path, names))
         for shard in sorted(shards, key=shard_index):
@@ -77,7 +75,6 @@ class ShardsExporter(SceneExporter):
             yield f"{shard.parent}/{_SIZES}/0", f"{size} {views}\n".encode()
 
     def places(self, episode: int) -> Iterator[Path]:
-        """The shards of its scenes that are there. See `EpisodeExporter`."""
         return (path.relative_to(self._out) for scene in self.scene_ids(episode) for path in find_shards(scene, self._folder(scene)))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:

@@ -32,7 +32,6 @@ class YoloExporter(SceneExporter):
 
     @staticmethod
     def folder_name(split: str) -> str:
-        """See `SceneExporter`: one for all splits."""
         return FOLDER.name
 
     @staticmethod
@@ -41,7 +40,6 @@ class YoloExporter(SceneExporter):
         return SharedFiles((DATA, *note_files(layout)), (), (*splits, *(FOLDER / kind for kind in CONTENTS), FOLDER))
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: splits and names of the classes, camera and notes."""
         context = self._context
         with output_errors(self._out):
             for folder in reversed(self.shared_files(context.layout).folders):
@@ -50,7 +48,6 @@ class YoloExporter(SceneExporter):
             return [DATA, *write_notes(self._out, context.settings, context.names, self._cameras)]
 
     def places(self, episode: int) -> list[Path]:
-        """Lists of images, and folders of images and labels. See `EpisodeExporter`."""
         split, scenes = self._context.layout.folder(episode), self.scene_ids(episode)
         return [*map(image_list, scenes), *(FOLDER / kind / split / f"{scene:06d}" for scene in scenes for kind in CONTENTS)]
 
