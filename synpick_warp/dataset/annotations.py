@@ -142,6 +142,13 @@ class EpisodeRow(Struct, gc=False):
     ending: str
 
 
+class EpisodeEntry(Struct, gc=False):
+    """Schema of an episode's manifest entry for readers, who take entries of all versions: row and attempts."""
+
+    row: EpisodeRow
+    attempts: list[dict[str, Any]] = []
+
+
 VIEW_SCHEMAS: dict[str, Any] = {"camera": camera_schema("cam_K", "depth_scale"), "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
 """Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
 GRAPH_SCHEMA = dict[Key, GraphEntry]

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.dataset.splits import DataLayout, episode_range
-from synpick_warp.dataset.annotations import ADVICE, EpisodeRow, Key, ModelInfo, check_content, read_checked
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums, read_entry
+from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.commit.plausibility import check_frames
 from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
@@ -75,7 +75,8 @@ class Episode(PickTables):
     @cached_property
     def _record(self) -> dict[str, Any] | None:
         """Entry of the episode in the manifest; None: the data set has none."""
-        return read_entry(self._data_set.folder, episode_entry(self.index))
+        path = self._data_set.folder / f"{episode_entry(self.index)}.json"
+        return read_checked(path, EpisodeEntry) if path.exists() else None
 
     @cached_property
     def _context(self) -> GroupContext:
@@ -154,7 +155,7 @@ class Episode(PickTables):
         if self._data_set.found is not None:
             return ()
         if self._record is not None:
-            return tuple(self._record["attempts"])
+            return tuple(self._record.get("attempts", ()))
         if "record" not in self.attempt_arrays:
             raise DatasetError(f"{self.group} has no array attempts/record; {ADVICE}")
         lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
