@@ -175,8 +175,7 @@ def judge_attempts_kernel(
     for instance in range(layout.instances):
         if picked < 0 and has_member(attempts.attached_words, world, instance):
             picked = instance
-    objects, slots = state.catalog_index, state.body_slot
-    moved, farthest = measure_motion(layout, world, picked, moved_distance, objects, slots, motion.body_q, results_inout.pose)
+    moved, farthest = measure_motion(layout, world, picked, moved_distance, state, motion, results_inout.pose)
     results_inout.outcome[world] = attempts.outcome[world]
     results_inout.picked[world] = picked
     results_inout.hits[world] = attempts.hits[world]
