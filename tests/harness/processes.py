@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 
-def wait_for(condition: Callable[[], bool], timeout: float = 60.0) -> None:
+def wait_for(condition: Callable[[], bool], timeout: float = 600.0) -> None:
     """Wait until a condition holds; fails after `timeout` seconds."""
     deadline = time.monotonic() + timeout
     while not condition():
