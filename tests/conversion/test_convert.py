@@ -367,15 +367,15 @@ def test_a_package_of_others_bakes_its_format_with_its_gripper_and_layer(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("module", "said"),
+    ("group", "module", "said"),
     [
-        (None, "cannot be loaded: ModuleNotFoundError"),
-        ("FORMAT =", "cannot be loaded: SyntaxError"),
-        ("class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
+        ("formats", None, "cannot be loaded: ModuleNotFoundError"),
+        ("formats", "FORMAT =", "cannot be loaded: SyntaxError"),
+        ("formats", "class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
+        ("layers", "class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
     ],
 )
-@pytest.mark.parametrize("group", ["formats", "layers"])
-def test_a_package_of_others_that_is_broken_is_one_line_of_what_uses_it(tmp_path, sets, module, said, group):
+def test_a_package_of_others_that_is_broken_is_one_line_of_what_uses_it(tmp_path, sets, group, module, said):
     folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-extras\nVersion: 1.0\n")
