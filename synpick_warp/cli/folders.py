@@ -1,4 +1,4 @@
-"""Default folders and files of the commands: which data set is read, where outputs go.
+"""Default paths of the commands: the data set to read, and the output files.
 
 A data set is a folder with manifest.json and manifest/. Commands take the current folder if it is one, else that of a bake without --out.
 """
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 DEFAULT_NAME = "synpick-data"
 """Folder of a bake without --out."""
 OWN_SUFFIXES = (".png", ".jpg", ".jpeg", ".html", ".htm", ".csv")
-"""File suffixes of pictures, pages and tables. No format writes them directly into the data set's folder, so outputs may."""
+"""File suffixes of pictures, pages and tables. No data format writes such files at the top of a data set, so outputs may lie there."""
 
 
 def is_data_set(folder: Path | str) -> bool:
-    """Whether a folder has the manifest of a data set, and a folder of entries; nothing is read."""
+    """Whether a folder contains a data set's manifest and its folder of entries; neither is read."""
     return _has(f"{folder}/manifest.json", stat.S_ISREG) and _has(f"{folder}/manifest", stat.S_ISDIR)
 
 

@@ -137,7 +137,7 @@ def newton_mesh(mesh: TriangleMesh, material: Material) -> newton.Mesh:
 def compare_hits(
     ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float
 ) -> list[MeasuredRow]:
-    """Agreement of another renderer with ours in segmentation and depth.
+    """Agreement of a peer renderer with ours in segmentation and depth: rows of the report.
 
     Args:
         ids: Segmentation id of each of its shapes (shape + 1) int64; the last one is of pixels without a shape.
@@ -159,7 +159,7 @@ def compare_hits(
 
 
 ABSENT = np.array([0.0, 0.0, 1e3, 0.0, 0.0, 0.0, 1.0])
-"""Pose of a geom that its world lacks: above and behind all cameras, since a geom cannot be left out."""
+"""Pose of a geom that is absent from its world: above and behind all cameras, since geoms cannot be removed."""
 LIGHT_DIRECTION = (-0.4, 0.3, -1.0)
 """Direction of the one light, which casts shadows."""
 EXTENT = 10.0

@@ -15,7 +15,7 @@ from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.scenes.types import RawObject
 
 MAX_OBJECTS = 32
-"""Most objects of a sheet; of more, the first are drawn, which is told."""
+"""Maximum number of objects on a sheet; of more, the first are drawn, with a note."""
 _SIDE, _CAPTION, _LINE, _TURNS = 260, 44, 18, 4
 """Size of a panel, heights of its caption and of a line [px], and most rotations shown of an object."""
 _VIEW = np.array((0.55, -0.7, 0.45)) / np.linalg.norm((0.55, -0.7, 0.45))

@@ -75,7 +75,7 @@ class Calibration:
 
 
 def read_calibration(path: Path, model: str = "", pixel_center: float | None = None) -> Calibration:
-    """Read the intrinsics of a camera from a file of any of the formats, which is told from its content.
+    """Read the intrinsics of a camera from a file of any of the formats, which is detected from its content.
 
     Args:
         model: Distortion model, where the file does not name it: four coefficients in a file of OpenCV may be of both.

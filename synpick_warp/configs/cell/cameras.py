@@ -1,4 +1,4 @@
-"""Settings of the cameras: the section [cameras] for alike cameras that look at one point, and [[camera]] tables for any others."""
+"""Settings of the cameras: the section [cameras] for identical cameras that look at one point, and [[camera]] tables for any others."""
 
 from __future__ import annotations
 

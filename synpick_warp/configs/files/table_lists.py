@@ -1,4 +1,4 @@
-"""Tables in the settings: lists, such as [[camera]], whose rows are dataclasses of settings, and those of splits, [splits.NAME].
+"""Parser of TOML tables in the settings: arrays of tables, such as [[camera]], whose rows are dataclasses, and [splits.NAME].
 
 `Config` has a field for each list: `camera: tuple[CameraRow, ...] = ()`. The class of a row may name keys that every table needs
 (`REQUIRED`), keys of no effect beside others (`replaced`), and keys by which a row is told from others (`IDENTITY`); a list with these can
@@ -22,14 +22,14 @@ from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
 
 def read_rows(key: str, kind: type[Any], content: Any, source: str) -> tuple[Any, ...]:
-    """Rows of the tables [[key]]. Raises ConfigError: it is no list of tables, a key is unknown or missing, or a value is not allowed."""
+    """Parse the array of tables [[key]]. Raises ConfigError if it is not one, a key is unknown or missing, or a value is not allowed."""
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise ConfigError(f"{key} is {format_value(content)} {source}; allowed: [[{key}]] tables")
     return tuple(read_table(f"{key}[{index}]", kind, row, source) for index, row in enumerate(content))
 
 
 def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
-    """One row, or a setting that is a table. Raises ConfigError: it is no table, a key is unknown or missing, or a value is not allowed."""
+    """Parse one table. Raises ConfigError if it is something else, a key is unknown or missing, or a value is not allowed."""
     known, required = settings_of(kind), getattr(kind, "REQUIRED", ())
     if not isinstance(content, Mapping):
         raise ConfigError(f"{key} is {format_value(content)} {source}; allowed: a table of {', '.join(known)}")
@@ -43,13 +43,13 @@ def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
 
 
 def _read_setting(key: str, value: object, item: Setting, source: str) -> Any:
-    """Checked value of a setting, which may be a table."""
+    """Validated value of a setting, which may be a table."""
     return read_table(key, item.kind, value, source) if is_table(item.kind) else check_value(key, value, item, source)
 
 
 def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mapping[str, Any], source: str) -> tuple[Any, ...]:
-    """Rows of a preset with the values of a table [key], which hold for all of them. Raises ConfigError: a key is not one of those that may
-    hold for every row, or a value is not allowed."""
+    """Override values of all rows of a preset by a table [key]. Raises ConfigError if a key may not be overridden for all, or a value is
+    not allowed."""
     identity = getattr(kind, "IDENTITY", ())
     if not identity:
         raise ConfigError(f"{key} is a table {source}; allowed: [[{key}]] tables, one for each")
@@ -63,7 +63,7 @@ def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mappi
 
 
 def given_values(row: Any) -> dict[str, Any]:
-    """Convert a row to a dictionary of the settings that are given (not None) and of effect; nested tables become dictionaries."""
+    """Convert a row to a dictionary, without settings that are None or have no effect; nested tables become dictionaries."""
     values = ((name, getattr(row, name)) for name in settings_of(type(row)) if name not in getattr(row, "replaced", ()))
     return {name: _plain(value) for name, value in values if value is not None}
 
@@ -76,18 +76,18 @@ def _plain(value: Any) -> Any:
 
 SPLITS = "splits"
 MAX_SPLITS = 64
-"""Most splits of a data set."""
+"""Maximum number of splits of a data set."""
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}")
 _NEXT = -1
-"""`Split.first` of a split that follows the one before it."""
+"""Value of `Split.first` of a split that continues after the previous one."""
 
 Tables = dict[str, dict[str, Any]]
 """Name of a split -> its checked settings."""
 
 
 def read_tables(content: Any, source: str) -> Tables:
-    """Validate the content of `splits`, a table of tables; returns the values of each split. Raises ConfigError: it is something else, a
-    name or a key is wrong, or a value is not allowed."""
+    """Validate the table of tables `splits`; returns the values of each split. Raises ConfigError if it is not one, a name or a key is
+    wrong, or a value is not allowed."""
     if not isinstance(content, Mapping) or not content or not all(isinstance(table, Mapping) for table in content.values()):
         raise ConfigError(f"{SPLITS} is {format_value(content)} {source}; allowed: tables such as [{SPLITS}.train]")
     if len(content) > MAX_SPLITS:
@@ -99,7 +99,7 @@ def read_tables(content: Any, source: str) -> Tables:
 
 
 def check_setting(name: str, key: str, value: Any, source: str) -> Any:
-    """Validate one setting of a split; returns its value. Raises ConfigError: there is no such setting, or the value is not allowed."""
+    """Validate one setting of a split; returns its value. Raises ConfigError if the setting does not exist or the value is not allowed."""
     known = settings_of(Split)
     if key not in known:
         keys = f"keys of {SPLITS}.{name}: {', '.join(known)}"
@@ -108,7 +108,7 @@ def check_setting(name: str, key: str, value: Any, source: str) -> Any:
 
 
 def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:
-    """Tables with one more setting, given as NAME.key. Raises ConfigError: there is no such split or setting, or the value is not
+    """Add a setting, given as NAME.key, to the tables. Raises ConfigError if the split or setting does not exist, or the value is not
     allowed."""
     name, _, key = path.partition(".")
     if name not in tables:
@@ -118,8 +118,8 @@ def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables
 
 
 def resolve_splits(tables: Tables, mode: str, color_format: str, source: str) -> tuple[Split, ...]:
-    """Splits of checked tables, in the order of the file, with all defaults filled in, sorted by first episode. Raises ConfigError: two
-    splits share an episode or a folder, or indices exceed 32 bits."""
+    """Convert validated tables to splits: defaults follow from the order in the file; the result is sorted by first episode. Raises
+    ConfigError if two splits share an episode or a folder, or indices exceed 32 bits."""
     splits: list[Split] = []
     following = 0
     for name, table in tables.items():

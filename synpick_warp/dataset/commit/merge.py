@@ -1,4 +1,4 @@
-"""Merge the shards of a data set that several bakes wrote: hard links of all committed episodes, then new indices.
+"""Merge of data sets that several bakes wrote in shares: hard links to all committed episodes, then new indices.
 
 Parts may have been edited: names come from checked lists only, symbolic links are refused, and files are created, never overwritten.
 """
@@ -45,19 +45,19 @@ from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.inputs.urls import store_url
 
 MAX_EPISODES = 10_000_000
-"""Most episodes of a merged data set: its missing ones are listed."""
+"""Maximum number of episodes of a merged data set, since missing ones are listed."""
 _EXECUTE = 0o111 | stat.S_ISUID | stat.S_ISGID | stat.S_ISVTX
-"""Rights that no file of a data set has. Some file systems show them on every file, so they are no error."""
+"""Permission bits that files of a data set do not have. Some file systems set them on every file, so they are not an error."""
 _COPY_BYTES = 1 << 20
 """Size of a copy block [B]."""
 
 
 class Merged(NamedTuple):
-    """Result of a merge: number of episodes, indices of missing ones, sentences on files that were left out."""
+    """Result of a merge: number of episodes, indices of missing episodes, remarks on skipped files."""
 
     episodes: int
     missing: list[int]
-    """Indices that no part has; a bake with the same settings generates them."""
+    """Episodes that no part contains; a bake with the same settings generates them."""
     left_out: list[str]
 
 
@@ -97,8 +97,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
-    """Check that every part is another folder, and the output folder outside of them. Raises DatasetError if two parts are the same folder,
-    or the output folder is one, within one, or around one."""
+    """Check that the parts are distinct folders, and that the output folder neither is, contains nor lies in one. Raises DatasetError
+    otherwise."""
     known: dict[tuple[int, int], Path] = {}
     try:
         target = out.resolve()
@@ -115,7 +115,7 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
 
 
 def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
-    """Choose the part that each manifest entry is taken from, the first that has it: entry -> part. Raises DatasetError if parts differ in
+    """Map each manifest entry to the first part that contains it: entry -> part. Raises DatasetError if parts differ in
     an entry, an entry or a checksum list is damaged, or no part has a committed episode."""
     sources: dict[Path, Path] = {}
     for part in parts:
@@ -132,7 +132,7 @@ def _sources(parts: Sequence[Path], layout: DataLayout) -> dict[Path, Path]:
 
 
 def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
-    """Settings of the first part, with the largest number of episodes of all, in each split."""
+    """Settings of the first part, with the maximum number of episodes over all parts, per split."""
     configs = [read_settings(part, manifest) for part in parts]
     longest = [max(each, key=lambda split: split.episodes) for each in zip(*(config.splits for config in configs), strict=True)]
     episodes = sum(split.episodes for split in longest) or max(config.bake.episodes for config in configs)
@@ -146,7 +146,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
 
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
-    """Link all files, then all entries, and build the indices, in a staging folder from which all is moved; an error removes it again."""
+    """Link all files, then all entries, and build the indices in a staging folder, whose content is then moved; removed on errors."""
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     work = out / PARTIAL
     names: list[str] = []

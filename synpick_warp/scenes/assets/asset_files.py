@@ -50,7 +50,7 @@ _COMMA = re.compile(r"(?im)^[ \t]*(?=v|facet +normal|[-+.0-9]).*?(?<![\w,.])([-+
 
 
 class MissingFileError(CatalogError):
-    """A file that another one names is not there; `name` is the name."""
+    """A referenced file does not exist; `name` is its name."""
 
     def __init__(self, message: str, name: str = "") -> None:
         super().__init__(message)
@@ -62,24 +62,24 @@ def ignore(line: str) -> None:
 
 
 def list_names(names: Iterable[str]) -> str:
-    """List names for a message; of more than MAX_LISTED, the rest by their number."""
+    """Comma-separated names for a message: at most MAX_LISTED, then the number of the others."""
     listed = list(names)
     return ", ".join(listed[:MAX_LISTED] + ([f"{len(listed) - MAX_LISTED} more"] if len(listed) > MAX_LISTED else []))
 
 
 @dataclass(eq=False)
 class Notes:
-    """Notes of a reader on a mesh file: warnings on what was replaced, and features that are not used; told in one line per file."""
+    """Log of a mesh import: warnings on replaced images, and unsupported features; one line per file."""
 
     substitute: bool = False
-    """Whether an image that is not there is replaced by a colour, which is noted; otherwise it is an error."""
+    """Whether a missing image is replaced by a plain colour, with a warning; otherwise it is an error."""
     said: list[str] = field(default_factory=list)
-    """Warnings: what is missing and what is used instead."""
+    """Warnings on missing images and their replacements."""
     ignored: list[str] = field(default_factory=list)
-    """Names of features that the file has and that are not used."""
+    """Names of unsupported features that the file uses."""
 
     def image(self, read: Callable[[], _Image]) -> _Image | None:
-        """Result of `read`; None if the image is not there and is replaced by a colour."""
+        """Result of `read`; None if the image is missing and a plain colour replaces it."""
         try:
             return read()
         except MissingFileError as error:
@@ -124,7 +124,7 @@ def read_isolated(
 
 @contextmanager
 def quiet_decoding() -> Iterator[None]:
-    """Silence warnings of NumPy and Pillow: whatever was decoded is validated afterwards. Text that is no number stays an error."""
+    """Silence warnings of NumPy and Pillow, since decoded values are validated afterwards. Text that is not a number remains an error."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message=".*could not be read to its end.*")
@@ -149,7 +149,7 @@ def describe_error(error: BaseException) -> str:
 
 @contextmanager
 def reading_as(kind: str, path: Path) -> Iterator[None]:
-    """Raise whatever a reader raises in this context as a `CatalogError`: on a damaged file, that may be nearly anything."""
+    """Convert any exception of a reader to a `CatalogError`: damaged files can raise nearly every type."""
     try:
         yield
     except CatalogError:
@@ -160,12 +160,12 @@ def reading_as(kind: str, path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class AssetScope:
-    """Folder that the files of one object may refer to, and the names that were found elsewhere than stated."""
+    """Sandbox of an object's asset references: its root folder, and the references that were resolved to another path."""
 
     root: Path
-    """Folder of the object: names in its files may lead up to it, not out of it."""
+    """Root folder of the object: references may lead up to it, but not out of it."""
     moved: list[str] = field(default_factory=list)
-    """A line for each name that is read from another place."""
+    """A line for each reference that was resolved to another path."""
 
 
 _scope: ContextVar[AssetScope | None] = ContextVar("scope", default=None)
@@ -173,7 +173,7 @@ _scope: ContextVar[AssetScope | None] = ContextVar("scope", default=None)
 
 @contextmanager
 def asset_scope(root: Path) -> Iterator[AssetScope]:
-    """Let the files of one object refer to all of its folder; without a scope, they refer to the folder that they lie in."""
+    """Allow references to the object's whole folder in this context; without it, files may refer to their own folder only."""
     token = _scope.set(scope := AssetScope(root))
     try:
         yield scope
@@ -182,7 +182,7 @@ def asset_scope(root: Path) -> Iterator[AssetScope]:
 
 
 def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[Path, bytes]:
-    """Read a file of up to `limit` bytes that a model file, `owner`, names, inside the object's folder only (`asset_scope`).
+    """Read a file of up to `limit` bytes that the model file `owner` refers to, within the object's folder only (`asset_scope`).
 
     A name that is not there is also tried with Windows' separators, in other letter case, and in the folders where exporters put textures.
 
@@ -202,7 +202,7 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
 
 
 def is_missing(folder: Path, name: str, owner: object) -> bool:
-    """Whether `read_referred` finds no file of this name in the object's folder."""
+    """Whether a reference has no file in the object's folder (see `read_referred`)."""
     scope = _scope.get() or AssetScope(folder)
     try:
         return not os.path.lexists(locate(folder, name, owner, CatalogError, scope.root))
@@ -211,7 +211,7 @@ def is_missing(folder: Path, name: str, owner: object) -> bool:
 
 
 def locate(folder: Path, name: str, owner: object, error: type[SynpickError], root: Path | None = None) -> Path:
-    """Path of a file that another one names; if it is not there, of what the name may mean (see `read_referred`), if that is there.
+    """Path of a referenced file; if it does not exist, of the file that the reference may mean (see `read_referred`), if any.
 
     Args:
         root: Folder that the name must not lead out of; None: `folder`.
@@ -233,7 +233,7 @@ def locate(folder: Path, name: str, owner: object, error: type[SynpickError], ro
 
 
 def _find_elsewhere(folder: Path, name: str, root: Path) -> Path | None:
-    """A file inside `root` that a name may mean, seen from `folder`; None: there is none."""
+    """File inside `root` that a reference from `folder` may mean; None: there is none."""
     parts = [part for part in re.sub(r"^[A-Za-z]:", "", name).replace("\\", "/").split("/") if part not in ("", ".")]
     if not parts:
         return None
@@ -249,7 +249,7 @@ def _find_elsewhere(folder: Path, name: str, root: Path) -> Path | None:
 
 
 def _match_case(folder: Path, names: Sequence[str]) -> Path | None:
-    """Descend from a folder by names in any letter case; exact ones first. None: there is no such entry."""
+    """Case-insensitive path lookup from a folder; exact matches first. None: there is no such entry."""
     path = folder
     for name in names:
         if name == "..":
@@ -268,7 +268,7 @@ def _match_case(folder: Path, names: Sequence[str]) -> Path | None:
 
 
 def check_decimals(text: str, path: Path) -> None:
-    """Raise CatalogError if coordinates in an unreadable mesh file have decimal commas, as programs write them under some locales."""
+    """Raise CatalogError if the coordinates of an unreadable mesh file have decimal commas, as written under some locales."""
     if (match := _COMMA.search(text)) is not None:
         raise CatalogError(f"{path}: its numbers have decimal commas, such as {match[1][:40]}; export it with decimal points")
 

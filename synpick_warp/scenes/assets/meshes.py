@@ -69,7 +69,7 @@ class MeshOptions:
     substitute: bool = False
     """Replace images that are not there by a colour, with a warning."""
     unit: str = ""
-    """Name of the unit, which is told with the mesh's size; empty: neither is told."""
+    """Name of the unit, which is reported with the mesh's size; empty: neither is reported."""
 
 
 class MeshFile(NamedTuple):

@@ -146,13 +146,13 @@ def _unit_colors(colors: np.ndarray) -> np.ndarray:
 
 
 def _similar_name(name: str, known: dict[str, MtlMaterial]) -> str | None:
-    """Find a material for a name that no library defines: without a trailing comment, or ignoring letter case. None: there is none."""
+    """Look up a material whose exact name no library defines: without a trailing comment, or ignoring case. None: there is none."""
     plain = name.partition(" #")[0].strip()
     return plain if plain in known else next((other for other in known if other.casefold() == plain.casefold()), None)
 
 
 def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
-    """Libraries that an `mtllib` line names: the rest of the line if such a file exists, else one per word if all end in .mtl."""
+    """Libraries of an `mtllib` line: the rest of the line if a file of this name exists, else one per word if all end in .mtl."""
     name = line.partition(" ")[2].strip()
     choices = (name, name.strip('"'), name.partition(" #")[0].strip())
     whole = next((each for each in choices if each and not is_missing(folder, each, owner)), None)
@@ -162,7 +162,7 @@ def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
 
 
 def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
-    """Read all libraries that an OBJ file names. Returns materials by name; a missing library is noted, not an error."""
+    """Read all libraries that an OBJ file refers to. Returns materials by name; a missing library is a warning, not an error."""
     known: dict[str, MtlMaterial] = {}
     named = dict.fromkeys(line for line in lines if line.startswith("mtllib ") and line[7:].strip())
     for name in dict.fromkeys(name for line in named for name in _library_names(line, path.parent, path)):
@@ -200,7 +200,7 @@ def normalize_text(text: str, path: Path, ignored: list[str]) -> str:
 
 
 def _resolve_indices(text: str) -> str:
-    """Replace negative indices, which count back from the last vertex so far, by those from the first one."""
+    """Convert relative (negative) vertex indices to absolute ones."""
     counts, lines = dict.fromkeys(_KINDS, 0), text.split("\n")
     for number, line in enumerate(lines):
         kind, _, rest = line.partition(" ")
@@ -216,7 +216,7 @@ def _resolve_indices(text: str) -> str:
 
 
 def _split_concave(text: str, ignored: list[str]) -> str:
-    """Replace concave polygons by triangles, since the reader makes fans; other text stays."""
+    """Triangulate concave polygons, since the reader makes triangle fans; other text is unchanged."""
     matches = list(_POLYGON.finditer(text))
     try:
         rows = [line.split()[1:4] for line in re.findall(r"(?m)^v [^\n]*", text)]
@@ -250,7 +250,7 @@ _SILENT = {"ka", "ks", "ns", "ni", "illum", "tf", "d", "tr", "ke", "pcr", "aniso
 
 @dataclass(eq=False)
 class MtlMaterial:
-    """Colours, factors and image names of a material as its library states; the images are not yet read."""
+    """Material of an MTL library before its images are read: colours, factors and image file names."""
 
     library: Path
     color: tuple[float, float, float] | None = None
@@ -263,17 +263,17 @@ class MtlMaterial:
     clamp: bool = False
     """Whether map_Kd is clamped to its edges instead of repeated (option -clamp)."""
     factors: dict[str, float] = field(default_factory=dict)
-    """Metallic (pm) and roughness (pr) in 0..1, as far as they are stated."""
+    """Metallic (Pm) and roughness (Pr) in 0..1, where the library states them."""
     ignored: list[str] = field(default_factory=list)
-    """Names of statements and options that are not used."""
+    """Names of unsupported statements and options."""
 
     def missing_images(self) -> list[str]:
-        """Names of the images that the material refers to and that do not exist."""
+        """Names of images that the material refers to and that are missing."""
         return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
 class TexturePixels(ImageCache):
-    """Images of one OBJ file."""
+    """Image cache of one OBJ file."""
 
     def read(self, name: str, library: Path, linear: bool) -> np.ndarray:
         """Decode an image that a material library names; `linear`: one of numbers, as roughness is.
@@ -366,7 +366,7 @@ def _parse_map(material: MtlMaterial, key: str, words: list[str], line: str) -> 
 
 
 def _is_neutral(option: str, arguments: list[str]) -> bool:
-    """Whether an option with these arguments changes nothing in how the renderer draws the texture."""
+    """Whether an option with these arguments has no effect on the rendered texture."""
     expected = _NEUTRAL.get(option)
     if expected is None:
         return option in ("-texres", "-type", "-bm", "-o", "-s")

@@ -48,7 +48,7 @@ AGREEMENT, MAX_DIFFERENT = 3e-3, 0.01
 
 @dataclass(frozen=True, eq=False)
 class BinModel:
-    """Mesh, material and collision shapes of a bin in its frame, its inside, and what is told of it."""
+    """Mesh, material and collision shapes of a bin in its frame, its inside, and remarks on it."""
 
     mesh: TriangleMesh
     material: FileMaterial

@@ -304,9 +304,9 @@ def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...
 
 
 def _without_repeats(faces: np.ndarray) -> np.ndarray:
-    """Remove repeated triangles: of those with the same corners, one remains of the orientation that more of them have.
+    """Remove duplicate triangles: of triangles with the same vertices, one of the majority's orientation is kept.
 
-    None remains of as many of either orientation: merging vertices leaves such pairs, and they enclose nothing.
+    If both orientations are equally frequent, none is kept: merging vertices leaves pairs that enclose no volume.
     """
     shift = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (shift + np.arange(3)) % 3, axis=1)
@@ -318,7 +318,7 @@ def _without_repeats(faces: np.ndarray) -> np.ndarray:
 
 
 def _without_needles(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Remove triangles of no area, but for rounding, and the vertices that no other triangle has."""
+    """Remove degenerate triangles, whose area is zero up to rounding, and vertices that are no longer referenced."""
     corners = vertices[faces].astype(np.float64)
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -68,7 +68,7 @@ class PathScene:
 
 
 RandomizedScene = variant_of(PathScene, "RandomizedScene", surfaces=RandomizedSurfaces)
-"""Scene whose materials are drawn at random for each episode."""
+"""Scene with domain randomization: materials are sampled for each episode."""
 AnyScene = Any
 """`PathScene`, or `RandomizedScene`: functions are compiled for each; see `variants`."""
 VARIANTS["scene"] = PathScene, RandomizedScene
