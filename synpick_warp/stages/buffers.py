@@ -104,7 +104,7 @@ _LAYER_DTYPES = {
     ("float32", 2): wp.vec2,
     ("float32", 3): wp.vec3,
 }
-_LAYER_FIELDS = [(name, wp.array, _declare_layer(layer)) for name, layer in LAYER_TABLE.items()]
+_LAYER_FIELDS = [(name, wp.array, _declare_layer(layer)) for name, layer in LAYER_TABLE.loadable()]
 
 
 class LayerBuffers(make_dataclass("LayerArrays", _LAYER_FIELDS, frozen=True, eq=False)):

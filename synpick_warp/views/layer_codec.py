@@ -41,7 +41,7 @@ def layer_path(scene: Path, name: str, frame: int) -> Path:
 
 def layer_notes(names: tuple[str, ...]) -> str:
     """Markdown for a data set's notes: one line per layer, with the meaning of its file's codes."""
-    return "".join(f"- `{name}/`: {layer.note}\n" for name, layer in LAYER_TABLE.items() if name in names)
+    return "".join(f"- `{name}/`: {LAYER_TABLE[name].note}\n" for name in LAYER_TABLE if name in names)
 
 
 def image_format(name: str) -> tuple[str, int | None]:

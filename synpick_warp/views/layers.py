@@ -15,8 +15,10 @@ To add a layer:
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 
+from synpick_warp.errors import ConfigError
 from synpick_warp.system.plugins import load_plugin, plugin_names
 
 ZERO_CODE = 32768
@@ -165,6 +167,12 @@ class LayerTable(Mapping[str, Layer]):
         members = [field.name for field in fields(Layer)]
         plugin = load_plugin("layers", name, *members)
         return Layer(*(getattr(plugin, member) for member in members))
+
+    def loadable(self) -> Iterator[tuple[str, Layer]]:
+        """Name and row of all layers but those of packages that are broken: bakes without these must not suffer."""
+        for name in self:
+            with suppress(ConfigError):
+                yield name, self[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

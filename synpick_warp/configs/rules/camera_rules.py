@@ -19,6 +19,7 @@ from synpick_warp.configs.episodes.randomize import FIXED
 from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.schema import Bop, Config, DepthSensor, Gripper
 from synpick_warp.errors import ConfigError
+from synpick_warp.views.layers import LAYER_TABLE
 
 DEPTH_COUNTS = 65535
 """Maximum value of a 16-bit depth image."""
@@ -49,6 +50,8 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
         yield from found
         return
     rig = config.rig
+    for layer in config.render.layers:
+        LAYER_TABLE[layer]  # Raises ConfigError if it is of a package that is broken.
     for index in range(len(rig)):
         yield from _view(rig, index, config)
     yield from _perception(config.perception.camera, rig, may_pick(config.bake, config.splits))
