@@ -119,13 +119,13 @@ def arguments(request: dict) -> list[str]:
 def _serve() -> None:
     from synpick_warp.cli import main as commands
     from synpick_warp.exporters.writing import pool
-    from synpick_warp.factory import assembly, pipeline
+    from synpick_warp.factory import assembly, devices
     from tests.harness.made_once import made_once
 
     once = made_once()
     once.__enter__()  # Forks inherit what a bake in this process has made.
     pool.NICENESS = 0  # Writers of lower priority stall their bakes while other tests saturate all cores.
-    assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()
+    assembly.load_catalog = devices.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
     os.dup2(2, 1)
     with open(os.devnull, "w") as nowhere:
