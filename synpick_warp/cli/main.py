@@ -414,7 +414,7 @@ def _bake(
     price: float,
 ) -> int:
     """Check device and folders, which is cheap, then bake: in this process and its children, or by the workers of an engine."""
-    with collection_paused():
+    with collection_paused(freezes=True):
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
         from synpick_warp.system.hardware.device import pick_device, pick_devices
@@ -429,7 +429,7 @@ def _bake(
         check_output_folder(out)
     bake: Callable[..., BakeSummary]
     remark: object = ""
-    with collection_paused():
+    with collection_paused(freezes=True):
         if url is None:
             from synpick_warp.factory.pipeline import run_bake
 

@@ -30,7 +30,7 @@ from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.progress import Progress
 
-_PROGRAM = "from synpick_warp.cloud.workers import run_worker; from synpick_warp.factory.worker import main; main(run_worker)"
+_PROGRAM = "from synpick_warp.factory.worker import main; main('synpick_warp.cloud.workers', 'run_worker')"
 
 
 def start_bake(

@@ -44,9 +44,7 @@ from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
 
-_DEVICE_PROGRAM = (
-    "from synpick_warp.factory.pipeline import generate_share; from synpick_warp.factory.worker import main; main(generate_share)"
-)
+_DEVICE_PROGRAM = "from synpick_warp.factory.worker import main; main('synpick_warp.factory.pipeline', 'generate_share')"
 """Program of a device's process, where a bake uses several."""
 MAX_TICK_FRAMES = 256
 """Maximum number of a tick's frames that are handed over before more physics is enqueued: some 30 ms of CPU time. The parts of physics in

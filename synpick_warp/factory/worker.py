@@ -9,11 +9,13 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from multiprocessing.connection import Connection
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.errors import SynpickError
+from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.processes.threads import LINK
 from synpick_warp.system.processes.worker import send
 from synpick_warp.system.progress import SilentProgress
@@ -76,10 +78,12 @@ class BakeLink(SilentProgress):
         self.number = number
 
 
-def main(generate: Callable[[Any, Sequence[int], BakeLink], BakeSummary]) -> None:
-    """Serve one share from the socket with handle argv[1]: `generate` generates its episodes from the share (`devices.DeviceShare`, or what
-    `cloud.workers` sends), the other handles, which are for the writers to keep open, and the link."""
+def main(module: str, function: str) -> None:
+    """Serve one share from the socket with handle argv[1]: the function generates its episodes from the share (`devices.DeviceShare`, or
+    what `cloud.workers` sends), the other handles, which are for the writers to keep open, and the link."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with collection_paused(freezes=True):
+        generate: Callable[[Any, Sequence[int], BakeLink], BakeSummary] = getattr(import_module(module), function)
     connection, *handles = map(int, sys.argv[1:])
     link = Connection(connection)
     try:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import newton
 import numpy as np
 import warp as wp
-from scipy.stats import binom
 
 from synpick_warp.configs.dataset.splits import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
@@ -151,6 +150,8 @@ def count_distractor_slots(most: int, catalog: Catalog, arrangement: Arrangement
     """Body slots (single, compound) that suffice for `most` distractors, in all draws but a fraction `slot_shortfall` for each type."""
     if not most or not catalog.distractors:
         return 0, 0
+    from scipy.stats import binom  # which takes 0.3 s to import
+
     share = np.mean([len(entry.pieces) > 1 for entry in catalog.distractors])
     single, compound = (int(binom.isf(arrangement.slot_shortfall, most, part)) for part in (1.0 - share, share))
     return single, compound

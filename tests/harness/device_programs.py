@@ -22,7 +22,7 @@ _SLEEPER = f"import time; time.sleep({FOREVER})"
 
 def program(behaviour: str) -> str:
     """Program of a process that behaves as the function of this module with that name."""
-    return f"from synpick_warp.factory.worker import main; from {__name__} import {behaviour}; main({behaviour})"
+    return f"from synpick_warp.factory.worker import main; main({__name__!r}, {behaviour!r})"
 
 
 def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> BakeSummary:
