@@ -417,19 +417,18 @@ def _bake(
     with collection_paused(freezes=True):
         from synpick_warp.cli.display import make_console, make_progress, print_summary
         from synpick_warp.exporters.writing.files import check_output_folder
-        from synpick_warp.system.hardware.device import pick_device, pick_devices
+        from synpick_warp.system.hardware.device import opening_context, pick_device, pick_devices
 
+    own = None if devices or engine else pick_device(config.bake.device)
     if devices:
         pick_devices(devices)
-    elif not engine:
-        pick_device(config.bake.device)
     _check_inputs(config.bake.models, config.bake.lights)
     url = store_url(out)
     if url is None:
         check_output_folder(out)
     bake: Callable[..., BakeSummary]
     remark: object = ""
-    with collection_paused(freezes=True):
+    with collection_paused(freezes=True), opening_context(own):
         if url is None:
             from synpick_warp.factory.pipeline import run_bake
 

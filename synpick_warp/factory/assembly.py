@@ -21,7 +21,7 @@ from synpick_warp.configs.cell.gripper import describe_forces
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset.splits import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
-from synpick_warp.configs.schema import Config, Render
+from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.factory.episodes import PLACES, EpisodeOutcome
@@ -29,9 +29,15 @@ from synpick_warp.factory.memory_plan import check_memory, explain_shortage, pla
 from synpick_warp.factory.order import order_longest_first
 from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.kernels.render.lighting.brdf import measure_albedo_kernel
+from synpick_warp.kernels.render.lighting.paths.coarse import trace_coarse_paths_kernel
+from synpick_warp.kernels.render.lighting.shading import shade_kernel
+from synpick_warp.kernels.render.visibility.raster import rasterize_triangles_kernel
+from synpick_warp.kernels.render.visibility.view_setup import set_up_views_kernel
 from synpick_warp.kernels.render.visibility.wide_bvh import read_binary_bvh_kernel
 from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
-from synpick_warp.newton_patches.narrow_phase import slow_builds
+from synpick_warp.kernels.tuning import PIXEL_BLOCK
+from synpick_warp.newton_patches.narrow_phase import early_builds, slow_builds, take_shipped
 from synpick_warp.scenes.bins import Bin, make_bins, make_fixtures
 from synpick_warp.scenes.build import REPEATS, find_drawn, find_repeat_rules, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import EpisodeCameras, describe_cameras
@@ -50,7 +56,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
+from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.views.frames import bin_record, most_words
@@ -186,9 +192,17 @@ def make_compiler(device: wp.Device | None, progress: Progress) -> Compiler:
     return Compiler(lambda ready, total: progress.stage(f"compiling kernels: {ready} of {total} modules"), last)
 
 
-def submit_slow(compiler: Compiler, device: wp.Device) -> None:
-    """Start to compile what every bake needs and takes longest, before worlds are built that launch it."""
-    compiler.submit([build_of(read_binary_bvh_kernel, wp.get_device("cpu")), *slow_builds(device)])
+def submit_slow(compiler: Compiler, device: wp.Device, config: Config) -> None:
+    """Start to compile what takes longest, and what is launched while worlds are built, before these are."""
+    own = [
+        build_of(read_binary_bvh_kernel, wp.get_device("cpu")),
+        build_of(measure_albedo_kernel, device),
+        build_of(set_up_views_kernel, device),
+    ]
+    shown = (trace_coarse_paths_kernel, shade_kernel) if Needs.of(config).views and config.render.mode == FAST else ()
+    block = PIXEL_BLOCK if device.is_cuda else 1
+    per_pixel = [ModuleBuild(kernel.module, device.alias, block) for kernel in (rasterize_triangles_kernel, *shown)]
+    compiler.submit([*slow_builds(device), *own, *early_builds(device), *per_pixel])
 
 
 def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:
@@ -239,9 +253,10 @@ def compiling_if_cold(config: Config, device: wp.Device, progress: Progress, onl
         if is_cache_warm(device):
             yield
             return
+        take_shipped(device)
         progress.stage("compiling kernels, once")
         with make_compiler(device, progress) as compiler:
-            submit_slow(compiler, device)
+            submit_slow(compiler, device, config)
             factory = build_smallest(config, device, SilentProgress(), online)
             submit_launches(compiler, factory.simulation, factory.stream if online or Needs.of(config).views else None)
             del factory

@@ -14,6 +14,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.assembly import build_smallest, launch_all, make_compiler, sole_compiler, submit_launches, submit_slow
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
+from synpick_warp.newton_patches.narrow_phase import take_shipped
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
 from synpick_warp.system.hardware.device import pick_device
@@ -56,9 +57,10 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     needs = Needs.of(config)
     device = pick_device(config.bake.device)
     with sole_compiler(progress):
+        take_shipped(device)
         before = list_binaries()
         with make_compiler(device, progress) as compiler:
-            submit_slow(compiler, device)
+            submit_slow(compiler, device, config)
             compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
             factory = build_smallest(config, device, progress)
             stream = factory.stream if needs.views else None

@@ -5,10 +5,12 @@ matching between substeps in which no contact loses its impulse to another one, 
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import newton
 import warp as wp
+from newton._src.geometry import inertia
 from newton._src.geometry import narrow_phase as narrow
 from newton._src.geometry.contact_match import ContactMatcher
 from newton._src.sim import collide
@@ -16,7 +18,7 @@ from newton._src.sim import model as newton_model
 from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 
 from synpick_warp.kernels.newton_patches import contact_matching
-from synpick_warp.system.hardware.kernels import ModuleBuild, split_modules
+from synpick_warp.system.hardware.kernels import ModuleBuild, module_build, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
 split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
@@ -34,6 +36,18 @@ takes, and a block holds the registers of all its threads until the last one is 
 world has some 60 pairs, about as many as its two blocks have threads."""
 REFINE_BLOCK = 32
 """Block size of the narrow phase's refinement in Newton; its kernel takes longer to compile than any other."""
+_BUILDERS = {
+    "geometry.bvh": "compute_shape_local_bounds compute_enabled_shapes compute_shape_world_transforms compute_shape_bvh_bounds "
+    "compute_bvh_group_roots mark_inactive_bvh_shapes",
+    "geometry.broad_phase_nxn": "_nxn_broadphase_kernel",
+    "sim.model": "_select_body_variants_kernel _copy_variant_shape_kernel",
+    "solvers.steel.friction_patches": "_accumulate_body_radius",
+    "solvers.steel.kernels": "gather_free_root_anchors compute_spatial_inertia compute_com_transforms compute_effective_joint_armature "
+    "gather_group_armature",
+}
+"""Kernels that Newton launches while it builds a model, by their file; each has a module of its own, see `split_modules`."""
+SHIPPED = Path(__file__).with_name("narrow_phase.zip")
+"""Archive of those compiled modules that take longer than all others together on 16 cores, for common GPUs; see `tools.narrow_phase`."""
 
 
 def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
@@ -46,11 +60,24 @@ def resize_blocks(pipeline: newton.CollisionPipeline) -> None:
 
 
 def slow_builds(device: wp.Device) -> list[ModuleBuild]:
-    """Modules that take longest to compile, and that every bake launches: Newton's narrow phase of convex shapes.
+    """Modules that take longest to compile, longest first, and that every bake launches: Newton's narrow phase of convex shapes.
 
     Kernels that are created twice are one: their modules have the same name, and the same source.
     """
     return [ModuleBuild(kernel.module, device.alias, block) for kernel, block in _narrow_kernels(device.is_cuda)]
+
+
+def early_builds(device: wp.Device) -> list[ModuleBuild]:
+    """Modules that Newton needs to build a model: by launches they would be compiled one after the other."""
+    modules = [wp.get_module(f"newton._src.{file}.{name}") for file, names in _BUILDERS.items() for name in names.split()]
+    modules += [kernel.module for kernel in (inertia.validate_and_correct_inertia_kernel, inertia.compute_body_inverses_kernel)]
+    return [module_build(module, device) for module in modules]
+
+
+def take_shipped(device: wp.Device) -> None:
+    """Copy those of `slow_builds` that are shipped for this GPU, and of these versions of all sources, into the kernel cache."""
+    for build in slow_builds(device):
+        build.take_shipped(SHIPPED)
 
 
 @cache

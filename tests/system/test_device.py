@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import threading
 import time
 from types import SimpleNamespace
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 import warp as wp
 
 from synpick_warp.errors import DeviceError
+from synpick_warp.newton_patches.narrow_phase import SHIPPED
 from synpick_warp.system.hardware import green_contexts, kernels
+from synpick_warp.system.hardware.device import opening_context
 from synpick_warp.system.hardware.green_contexts import SmPartition
 from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, build_of, compilation_lock, dry_launches, split_modules
+from tools.narrow_phase import ARCHITECTURES, shipped_builds
 
 MODULES = 1
 
@@ -57,6 +62,33 @@ def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_ca
     np.testing.assert_array_equal(values.numpy(), 3.0)
 
 
+def test_a_shipped_module_is_taken_if_it_is_of_the_same_sources_and_versions(device, empty_cache, tmp_path_factory, monkeypatch):
+    build, other = (build_of(make_kernel(factor), device) for factor in (31.0, 37.0))
+    build.module.load(build.device, build.block)
+    (folder,), archive = empty_cache.iterdir(), tmp_path_factory.mktemp("shipped") / "modules.zip"
+    content = {name: (folder / name).read_bytes() for name in build.names()}
+    for version in (None, wp.config.version):  # There is no archive at first.
+        shutil.rmtree(folder, ignore_errors=True)
+        build.take_shipped(archive)
+        assert build.is_cached() is (version is not None)
+        with ZipFile(archive, "w") as shipped:
+            for name, data in content.items():
+                shipped.writestr(f"{build.shipped_key()}/{name}", data)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == content
+    other.take_shipped(archive)
+    shutil.rmtree(folder)
+    monkeypatch.setattr(wp.config, "version", "0.0.0")
+    build.take_shipped(archive)
+    assert list(empty_cache.iterdir()) == []
+
+
+def test_the_shipped_modules_are_those_of_the_present_sources():
+    """`python -m tools.narrow_phase` compiles them again."""
+    expected = {f"{build.shipped_key()}/{name}" for build in shipped_builds() for each in ARCHITECTURES for name in build.names(each)}
+    with ZipFile(SHIPPED) as archive:
+        assert set(archive.namelist()) == expected
+
+
 def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empty_cache):
     """Submitted ones, a marker after them, and one that a launch compiles."""
     scales = [make_kernel(5.0 + index) for index in range(MODULES + 2)]
@@ -75,6 +107,21 @@ def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empt
     with Compiler(lambda *_: pytest.fail("nothing is missing")) as compiler:
         compiler.submit(builds)
     assert compiler.compiled == 0
+
+
+def test_a_context_is_created_in_a_thread_and_its_faults_are_left_to_the_first_use():
+    class Device:
+        @property
+        def context(self):
+            threads.append(threading.current_thread())
+            raise RuntimeError("there is no memory")
+
+    threads = []
+    for device in (Device(), None):
+        with opening_context(device):
+            pass
+    assert len(threads) == 1
+    assert threads[0] is not threading.current_thread()
 
 
 def test_a_launch_waits_for_the_thread_that_compiles_its_module(device, empty_cache, monkeypatch):

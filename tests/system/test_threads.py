@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -98,3 +99,13 @@ def test_collection_goes_on_as_before(before):
         assert gc.isenabled() is before
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("imports", [True, False])
+def test_collections_pass_over_what_a_program_imported(imports, monkeypatch):
+    frozen = []
+    monkeypatch.setattr(gc, "freeze", lambda: frozen.append(True))
+    with collection_paused(freezes=True):
+        if imports:
+            monkeypatch.setitem(sys.modules, "imported_meanwhile", sys)
+    assert frozen == [True] * imports

@@ -8,6 +8,7 @@ import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
@@ -88,6 +89,16 @@ def describe_kinds(names: Sequence[str]) -> str:
     return f"{names[0]} is {kinds[0]}, " + ", ".join(f"{name} {kind}" for name, kind in zip(names[1:], kinds[1:], strict=True))
 
 
+@contextlib.contextmanager
+def opening_context(device: wp.Device | None) -> Iterator[None]:
+    """Context manager that creates the CUDA context of a GPU in a thread, which takes 0.9 s without the interpreter's lock. Faults are left
+    to the first use. The CPU has none; None: no device."""
+    with ThreadPoolExecutor(1) as pool:
+        if device is not None:
+            pool.submit(getattr, device, "context")
+        yield
+
+
 def start_warp() -> None:
     """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept.
 
@@ -98,6 +109,7 @@ def start_warp() -> None:
     """
     os.environ.setdefault(*_CONNECTIONS)  # CUDA reads it when it starts.
     wp.config.log_level = wp.LOG_WARNING
+    wp.config.cuda_output = wp.config.cuda_output or "cubin"  # A new driver would compile PTX instead, one module after the other.
     if wp.config.kernel_cache_dir is None:  # Else the caller has chosen, or Warp runs already.
         temporary = usable_kernel_cache(wp.config.version)
         wp.config.kernel_cache_dir = None if temporary is None else str(temporary)

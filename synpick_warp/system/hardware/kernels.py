@@ -10,6 +10,7 @@ import contextlib
 import fcntl
 import os
 import threading
+import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -20,6 +21,7 @@ import warp as wp
 from warp._src import context
 
 from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.paths import make_folder
 
 MAX_COMPILERS = 16
 """Maximum number of compiling threads: the longest module of a bake takes as long as 16 threads need for all others."""
@@ -44,11 +46,40 @@ class ModuleBuild(NamedTuple):
     device: str
     block: int
 
+    def names(self, architecture: int | None = None) -> tuple[str, str]:
+        """Names of its binary and, which Warp writes after that, its metadata. `architecture`: GPUs of this compute capability, times ten,
+        in place of its device."""
+        device = wp.get_device(self.device) if architecture is None else None
+        binary = self.module._get_compile_output_name(device, architecture, block_dim=self.block)
+        return binary, self.module._get_meta_name(block_dim=self.block)
+
     def is_cached(self) -> bool:
-        """Whether the kernel cache has it: its binary and, which Warp writes after that, its metadata."""
-        name = self.module._get_compile_output_name(wp.get_device(self.device), block_dim=self.block)
-        folder = Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block))
-        return (folder / name).exists() and (folder / self.module._get_meta_name(block_dim=self.block)).exists()
+        """Whether the kernel cache has it."""
+        return all((self._folder / name).exists() for name in self.names())
+
+    def shipped_key(self) -> str:
+        """Folder of its files in an archive of `take_shipped`: versions of Warp and of CUDA's compiler, and the hash of all its sources and
+        options, so that nothing stale is taken."""
+        compiler = ".".join(map(str, context.runtime.toolkit_version or ()))
+        return f"warp-{wp.config.version}-cuda-{compiler}/{self.module.get_module_hash(self.block).hex()}"
+
+    def take_shipped(self, archive: Path) -> None:
+        """Copy its files from an archive (zip) into the kernel cache, if it has them and the cache lacks them."""
+        if self.is_cached():
+            return
+        absent = (OSError, KeyError, zipfile.BadZipFile, RuntimeError)  # RuntimeError: Python was built without LZMA.
+        with contextlib.suppress(*absent), zipfile.ZipFile(archive) as shipped:
+            files = {name: shipped.read(f"{self.shipped_key()}/{name}") for name in self.names()}
+            make_folder(self._folder)
+            for name, content in files.items():
+                part = self._folder / f"{name}.{os.getpid()}"
+                part.write_bytes(content)
+                part.replace(self._folder / name)
+
+    @property
+    def _folder(self) -> Path:
+        """Its folder in the kernel cache."""
+        return Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block))
 
 
 @contextlib.contextmanager
@@ -85,7 +116,12 @@ def _lock(handle: int, flags: int = 0) -> bool:
 
 def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
     """Identify the build that a launch of a kernel with the default block size loads."""
-    return ModuleBuild(kernel.module, device.alias, kernel.module.options["block_dim"] if device.is_cuda else 1)
+    return module_build(kernel.module, device)
+
+
+def module_build(module: wp.Module, device: wp.Device) -> ModuleBuild:
+    """Identify the build of a module with the default block size."""
+    return ModuleBuild(module, device.alias, module.options["block_dim"] if device.is_cuda else 1)
 
 
 def split_modules(prefixes: tuple[str, ...]) -> None:
