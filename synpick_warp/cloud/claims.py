@@ -11,8 +11,6 @@ import itertools
 import os
 import random
 import socket
-import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
@@ -21,6 +19,7 @@ import msgspec
 
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.errors import StoreError, SynpickError
+from synpick_warp.system import clock
 from synpick_warp.system.stores.opening import CONTROL
 from synpick_warp.system.stores.store import SMALL, Store
 
@@ -67,13 +66,13 @@ class Claim:
     def __init__(self, store: Store, key: str, owner: str, tag: str, until: float, offset: float, lease: float) -> None:
         self._store, self._key, self._owner, self._tag = store, key, owner, tag
         self._until, self._offset, self._lease = until, offset, lease
-        self._lost, self._ending, self._beat = False, threading.Event(), 0
-        self._thread = threading.Thread(target=self._keep, name="heartbeat", daemon=True)
+        self._lost, self._ending, self._beat = False, clock.Event(), 0
+        self._thread = clock.Thread(target=self._keep, name="heartbeat", daemon=True)
         self._thread.start()
 
     def check(self) -> None:
         """Check the lease locally, without a request: raises LeaseLostError if another worker has it, or may have taken it over."""
-        if self._lost or time.time() + self._offset > self._until - MARGIN * self._lease:
+        if self._lost or clock.time() + self._offset > self._until - MARGIN * self._lease:
             raise LeaseLostError(f"the claim {self._key} ran out, since this worker was too slow, and others may have it")
 
     def _keep(self) -> None:
@@ -81,7 +80,7 @@ class Claim:
         while not self._ending.wait(self._lease / BEATS):
             self._beat += 1
             with contextlib.suppress(StoreError):
-                if not self._replace(time.time() + self._offset + self._lease):
+                if not self._replace(clock.time() + self._offset + self._lease):
                     self._lost = True
                     return
 
@@ -132,7 +131,7 @@ class Claims:
 
     def take(self, key: str) -> Claim | None:
         """Acquire the lease on a key: creates it, or takes over one that has expired. None: another worker has it."""
-        store, until = self.store, time.time() + self.offset + self.lease
+        store, until = self.store, clock.time() + self.offset + self.lease
         data = msgspec.json.encode(_Lease(self.owner, until))
         tag = store.create(key, data)
         if tag is None:
@@ -141,7 +140,7 @@ class Claims:
                 return None
             if found[0] == data:  # Created by an attempt of ours whose answer was lost.
                 tag = found[1]
-            elif (ends := _read(found[0]).until) > time.time() + self.offset:
+            elif (ends := _read(found[0]).until) > clock.time() + self.offset:
                 self.seen[key] = ends
                 return None
             else:
@@ -226,7 +225,7 @@ class Chunks:
                 if pauses is None:
                     pauses = self.claims.pauses()
                     self.on_wait()
-                time.sleep(next(pauses))
+                clock.sleep(next(pauses))
                 continue
             pauses = None
             if chunk.episodes:
@@ -247,7 +246,7 @@ class Chunks:
             open_chunks: Number and bounds of the chunks without end mark.
             leased: Numbers of those that had a lease when they were listed. Of those that are not known to last, CHECKS are looked at.
         """
-        now, seen = time.time() + self.claims.offset, self.claims.seen
+        now, seen = clock.time() + self.claims.offset, self.claims.seen
         free = [each for each in open_chunks if each[0] not in leased]
         held = [each for each in open_chunks if each[0] in leased and seen.get(self._key(each[0]), 0.0) <= now]
         for number, (start, end) in free[:CHECKS] or random.sample(held, min(CHECKS, len(held))):

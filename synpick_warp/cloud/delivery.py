@@ -8,10 +8,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,6 +22,7 @@ from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.system import clock
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.store import Store, TransientError, persist
@@ -84,10 +82,10 @@ class Delivery:
         self._fault: BaseException | None = None
         self._waiting: dict[int, int] = {}
         """Backlog: sizes of the episodes that are committed in the folder and not delivered [B]."""
-        self._ending, self._lock = threading.Event(), threading.Lock()
-        self._files = ThreadPoolExecutor(FILES_AT_ONCE, "upload")
-        self._episodes = ThreadPoolExecutor(EPISODES_AT_ONCE, "deliver")
-        self._watcher = threading.Thread(target=self._watch, name="delivery", daemon=True)
+        self._ending, self._lock = clock.Event(), clock.Lock()
+        self._files = clock.Executor(FILES_AT_ONCE, "upload")
+        self._episodes = clock.Executor(EPISODES_AT_ONCE, "deliver")
+        self._watcher = clock.Thread(target=self._watch, name="delivery", daemon=True)
 
     def __enter__(self) -> Self:
         self._watcher.start()
@@ -108,7 +106,7 @@ class Delivery:
                 raise self._fault
             if sum(list(self._waiting.values())) <= MAX_BACKLOG:
                 return
-            time.sleep(_INTERVAL)
+            clock.sleep(_INTERVAL)
 
     def finish(self) -> None:
         """Drain the uploads: waits until all episodes that are committed in the folder are delivered. Raises the first error."""

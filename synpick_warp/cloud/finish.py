@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from synpick_warp.cloud.bundles import MAX_BUNDLE, unpack_bundle
@@ -20,6 +19,7 @@ from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.sizes import count_writers
+from synpick_warp.system import clock
 from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.stores.store import SMALL
@@ -88,7 +88,7 @@ def _gather(ledger: Ledger, work: Path) -> list[int]:
         make_folder((work / name).parent)
         (work / name).write_bytes(store.get(name, MAX_JSON))
     episodes = list(heapq.merge(*layout.plan()))
-    with ThreadPoolExecutor(FILES_AT_ONCE, "index") as pool:
+    with clock.Executor(FILES_AT_ONCE, "index") as pool:
         for first in range(0, len(episodes), AHEAD):
             names = [f"{INDEX}/{episode:06d}.tar.gz" for episode in episodes[first : first + AHEAD]]
             for name, bundle in zip(names, pool.map(lambda name: store.get(name, MAX_BUNDLE), names), strict=True):

@@ -51,22 +51,28 @@ class Ledger:
 
     def _read_manifest(self) -> bytes | None:
         """Read the manifest, and compare it with the settings; None: the prefix is empty. Raises as the constructor."""
-        url = self.store.url
-        try:
-            data = self.store.get(MANIFEST_FILE, MAX_JSON)
-        except FileNotFoundError:
+        url, data = self.store.url, self._stored_manifest()
+        if data is None:
             first = next(self.store.list(""), None)
             if first is not None and first[0].startswith(f"{CONTROL}/"):
                 first = next(self.store.list("", f"{CONTROL}/~"), None)
             if first is not None:
-                raise OutputError(
-                    f"{url} is not empty: it has {first[0]} and no manifest; name a new prefix, or a data set to resume"
-                ) from None
+                data = self._stored_manifest()  # Another worker may have started the data set since the first look.
+                if data is None:
+                    raise OutputError(f"{url} is not empty: it has {first[0]} and no manifest; name a new prefix, or a data set to resume")
+        if data is None:
             self._check_outside()
             return None
         if said := describe_differences(make_manifest(self.config), self._decode(data)):
             raise ConfigError(f"{url} was started with other settings: {said}; {_ADVICE}")
         return data
+
+    def _stored_manifest(self) -> bytes | None:
+        """Read the manifest; None: there is none."""
+        try:
+            return self.store.get(MANIFEST_FILE, MAX_JSON)
+        except FileNotFoundError:
+            return None
 
     def _decode(self, manifest: bytes) -> dict[str, Any]:
         """Parse the manifest of the store; raises OutputError if it is damaged."""

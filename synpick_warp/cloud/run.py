@@ -6,10 +6,8 @@ import contextlib
 import gc
 import shutil
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +25,7 @@ from synpick_warp.errors import StoreError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.order import EpisodeSource
 from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.system import clock
 from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.opening import open_store, probe
 
@@ -81,13 +80,13 @@ class PlanProgress(ForwardingProgress):
     def __init__(self, progress: Progress, chunks: Chunks, crew: Crew) -> None:
         super().__init__(progress)
         self._chunks, self._planned, self._before = chunks, chunks.sizes.episodes, chunks.count_over()
-        self._crew, self._started = crew, time.monotonic()
+        self._crew, self._started = crew, clock.monotonic()
         self._now = self._started
 
     def update(self, *, episodes_done: int, episodes: int, worlds_active: int, seconds_left: float | None, **views: Any) -> None:
         """Pass on counts since the workers' start; running episodes count as half done. See `Progress`."""
         del episodes, seconds_left
-        before, self._now = self._now, time.monotonic()
+        before, self._now = self._now, clock.monotonic()
         self._crew.seconds += self._crew.alive * (self._now - before)
         done, begun = self._before + episodes_done, episodes_done + 0.5 * worlds_active
         left = max(0.0, self._planned - self._before - begun) * (self._now - self._started) / begun if episodes_done else None
@@ -176,8 +175,8 @@ class _Work(EpisodeSource):
         self._numbers: dict[int, int] = {}
         """Chunk number of each episode that has no done mark, by the episode's index."""
         self._notes: list[str] = []
-        self._lock = threading.Lock()
-        self._asker = ThreadPoolExecutor(1, "claim")
+        self._lock = clock.Lock()
+        self._asker = clock.Executor(1, "claim")
         self._asked: Future[tuple[Chunk | None, bool]] | None = None
         self._pauses: Iterator[float] | None = None
         self._next = 0.0
@@ -243,7 +242,7 @@ class _Work(EpisodeSource):
         if self._asked is None:
             with self._lock:
                 count = sum(len(left) for _, left in self._held.values())
-            if not wait and (count >= self._limit or time.monotonic() < self._next):
+            if not wait and (count >= self._limit or clock.monotonic() < self._next):
                 return []
             self._asked = self._asker.submit(self._chunks.take)
         if not (wait or self._asked.done()):
@@ -260,7 +259,7 @@ class _Work(EpisodeSource):
         if chunk is not None and chunk.claim is not None:  # Worlds may still run lost episodes, whose files have the same names.
             chunk.claim.release()
         self._pauses = self._pauses or self._chunks.claims.pauses()
-        self._next = time.monotonic() + next(self._pauses)
+        self._next = clock.monotonic() + next(self._pauses)
         return []
 
     def _hold(self, chunk: Chunk) -> None:
@@ -306,7 +305,7 @@ def _finalize_once(ledger: Ledger, claims: Claims, place: Path) -> int:
                 return finalize_store(ledger, place)
             finally:
                 claim.release()
-        time.sleep(next(pauses))
+        clock.sleep(next(pauses))
     return 0
 
 

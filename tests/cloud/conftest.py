@@ -1,6 +1,4 @@
-"""An S3 server in this process, on 127.0.0.1, that fails on request; a store whose worker dies at a chosen request; settings of a tiny set,
-and what a local bake makes of them.
-"""
+"""An S3 server in this process, on 127.0.0.1, that fails on request; settings of a tiny set, and what a local bake makes of them."""
 
 from __future__ import annotations
 
@@ -16,7 +14,6 @@ import pytest
 from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import CONTROL, open_store
-from synpick_warp.system.stores.store import Store
 from tests.builders import once
 from tests.harness import scripted_bake
 
@@ -127,33 +124,6 @@ def local(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-class Killed(BaseException):
-    """What no code handles."""
-
-
-class MortalStore:
-    """`Store` that passes `lives` requests on, then raises at each one; every second death comes after its request was carried out."""
-
-    def __init__(self, store: Store, lives: int) -> None:
-        self._store, self.lives, self.url = store, lives, store.url
-        self._late, self._lock = lives % 2 == 1, threading.Lock()
-
-    def __getattr__(self, name: str) -> Any:
-        method = getattr(self._store, name)
-
-        def request(*arguments: Any) -> Any:
-            with self._lock:
-                self.lives -= 1
-                lives = self.lives
-            if lives == 0 and self._late:
-                method(*arguments)
-            if lives <= 0:
-                raise Killed
-            return method(*arguments)
-
-        return request
 
 
 def stored(url: str) -> dict[str, bytes]:

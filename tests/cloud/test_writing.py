@@ -18,7 +18,7 @@ from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import EPISODES, Killed, MortalStore, files, stored, tiny
+from tests.cloud.conftest import EPISODES, files, stored, tiny
 from tests.harness import scripted_bake
 
 QUIET = SilentProgress()
@@ -26,17 +26,6 @@ QUIET = SilentProgress()
 
 def bake(url: str, config=None, **given):
     return run.bake_into_store(run.Job(config or tiny(), url, bake=scripted_bake.bake_episodes), QUIET, **given)
-
-
-def bake_mortal(url: str, lives: int, monkeypatch) -> bool:
-    """Bake until it is done, or dies; returns whether it is done."""
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "open_store", lambda url: MortalStore(open_store(url), lives))
-        try:
-            bake(url)
-        except Killed:
-            return False
-    return True
 
 
 def test_the_set_equals_a_local_one_of_every_format(prefix, tmp_path, monkeypatch):
@@ -81,20 +70,6 @@ def test_requests_that_fail_leave_no_trace(server, prefix, local, fault):
     bake(prefix)
     server.fault = lambda method, path: None
     assert stored(prefix) == local
-
-
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 9))])
-def test_a_worker_may_die_at_any_request(memory, local, monkeypatch, seed):
-    """Each life is longer than the one before, so that the bake ends."""
-    draw, lives = random.Random(seed), 20
-    while not bake_mortal(memory, draw.randrange(1, lives), monkeypatch):
-        lives += 20
-        found = stored(memory)
-        committed = [key for key in found if key.startswith("manifest/0") and key.endswith(".json")]
-        for key in committed:
-            lines = found[key.replace(".json", ".sha256")].decode().splitlines()
-            assert all(found[line.split("  ")[1]] == local[line.split("  ")[1]] for line in lines)
-    assert stored(memory) == local
 
 
 def test_two_plans_of_as_many_episodes_are_told_apart(memory, tmp_path):

@@ -16,7 +16,6 @@ import json
 import os
 import re
 import shutil
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -68,6 +67,7 @@ from synpick_warp.exporters.writing.files import (
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
+from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import check_regular_file
 from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.inputs.toml import MAX_TOML
@@ -348,15 +348,15 @@ def lock_folder(out: Path) -> int:
     """Lock a folder (flock); returns its open handle, which holds the lock. File systems without locks are used unlocked. Raises
     OutputError if the folder stayed locked for LOCK_TIMEOUT."""
     handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    deadline = time.monotonic() + LOCK_TIMEOUT
+    deadline = clock.monotonic() + LOCK_TIMEOUT
     while True:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            if time.monotonic() > deadline:
+            if clock.monotonic() > deadline:
                 os.close(handle)
                 raise OutputError(f"another bake writes to {out}; wait for its end, or name another folder with --out") from None
-            time.sleep(_LOCK_INTERVAL)
+            clock.sleep(_LOCK_INTERVAL)
         except OSError as error:
             if error.errno not in (errno.ENOTSUP, errno.ENOLCK, errno.EBADF, errno.ENOSYS, errno.EINVAL):
                 os.close(handle)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-import uuid
+import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -47,11 +47,8 @@ def check_output_folder(out: Path) -> None:
             kind = "a folder" if (out / PARTIAL).is_dir() else "a file"
             reason = f": it has {kind} {PARTIAL} of another program" if names == [PARTIAL] else ""
             raise OutputError(f"{out} is not empty{reason}; {_ALLOWED}, or a data set to resume")
-        probe = out / f".{uuid.uuid4().hex}"
-        try:
-            probe.write_bytes(b"\0")
-        finally:
-            probe.unlink(missing_ok=True)
+        with tempfile.TemporaryFile(dir=out, buffering=0) as probe:  # It has no name that would stay after a kill.
+            probe.write(b"\0")
     except FileExistsError:
         raise OutputError(f"{out} is a file; {_ALLOWED}") from None
     except OSError as error:

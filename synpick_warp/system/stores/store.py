@@ -12,12 +12,12 @@ import importlib
 import os
 import random
 import re
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from synpick_warp.errors import StoreError
+from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import describe_bytes
 
 TRIES = 6
@@ -97,7 +97,7 @@ def persist(request: Callable[[], _Result], what: str, tries: int = TRIES) -> _R
         except TransientError as error:
             if attempt == tries:
                 raise StoreError(f"cannot {what}: {error}; {tries} attempts failed; the same command resumes") from error
-        time.sleep(pause * random.uniform(0.5, 1.0))
+        clock.sleep(pause * random.uniform(0.5, 1.0))
         pause = min(2.0 * pause, MAX_PAUSE)
     raise AssertionError("unreachable")
 

@@ -1,0 +1,76 @@
+"""Crash points of a folder: the n-th change to it, and all later ones, raise `Dead` in place of being made, as if the process were killed.
+
+In a power cut, files that were not synchronized are cut off, too.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+from tests.simulation.scheduler import Dead
+
+_CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "shutil.rmtree")
+"""Audit events of changes, beside `open` for writing (sys.addaudithook)."""
+_WRITES = os.O_WRONLY | os.O_RDWR
+_disks: list[CrashingDisk] = []
+"""Disk that is watched, if any: an audit hook cannot be removed."""
+
+
+def _watch(event: str, arguments: tuple[Any, ...]) -> None:
+    if _disks and (event == "open" or event in _CHANGES):
+        _disks[0].see(event, arguments)
+
+
+sys.addaudithook(_watch)
+
+
+class CrashingDisk:
+    """Context manager that counts the changes to a folder, and crashes at one of them."""
+
+    def __init__(self, folder: Path, crash_at: int = 0) -> None:
+        """`crash_at`: number of the change from 1 on; 0: none."""
+        self.changes = 0
+        self._folder, self._crash_at = str(folder), crash_at
+        self._synced = {path.stat().st_ino for path in folder.rglob("*") if path.is_file()}
+        """Inodes of the files that were there, or were synchronized."""
+        self._patch = pytest.MonkeyPatch()
+
+    def __enter__(self) -> Self:
+        self._patch.setattr(os, "fsync", self._sync)
+        _disks.append(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _disks.remove(self)
+        self._patch.undo()
+
+    def see(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Count a change, or crash."""
+        path = os.fspath(arguments[0]) if isinstance(arguments[0], (str, os.PathLike)) else ""
+        if event == "open":
+            mode, flags = arguments[1], arguments[2]
+            if not (any(letter in "wxa+" for letter in mode) if mode else flags & _WRITES):
+                return
+        if not path.startswith(self._folder) and (path.startswith("/") or event != "open"):
+            return
+        self.changes += 1
+        if 0 < self._crash_at <= self.changes:
+            raise Dead
+
+    def _sync(self, handle: int) -> None:
+        """fsync, by which a file outlives a power cut."""
+        self._synced.add(os.fstat(handle).st_ino)
+
+    def cut_power(self) -> None:
+        """Cut off all files that were not synchronized."""
+        for root, _, names in os.walk(self._folder):
+            for name in names:
+                path = os.path.join(root, name)
+                state = os.stat(path)
+                if state.st_ino not in self._synced:
+                    os.truncate(path, state.st_size // 2)

@@ -1,0 +1,143 @@
+"""Object store in memory for simulations: requests take virtual time, are refused, lose their answers, arrive late, and are observed."""
+
+from __future__ import annotations
+
+import contextlib
+import types
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from synpick_warp.system.stores.store import Store
+from tests.simulation.scheduler import Process, Simulation
+
+LATENCY = 0.05
+"""Longest virtual time to the store, and back [s]."""
+LATE = 5.0
+"""Longest delay of a request that its client took for lost [s]."""
+REFUSED, LOST, DELAYED = "refused", "lost", "delayed"
+"""Faults: the request is refused; it is carried out, but its answer is lost; the client gives it up, and it is carried out later."""
+
+
+class _Error(Exception):
+    """As obstore's BaseError."""
+
+
+class _AlreadyExistsError(_Error):
+    """As obstore's."""
+
+
+class _PreconditionError(_Error):
+    """As obstore's."""
+
+
+class Write(NamedTuple):
+    """Write that the store carried out: by whom, where, what, and what was there before."""
+
+    process: Process
+    key: str
+    data: bytes | None
+    before: bytes | None
+
+
+class FaultyStore:
+    """Objects with versions, in place of the module `obstore` and of a store of it: strongly consistent, as S3, GCS and Azure are."""
+
+    def __init__(self, simulation: Simulation, faults: dict[str, float] | None = None) -> None:
+        """`faults`: probability of each."""
+        self.simulation, self.faults = simulation, faults or {}
+        self.objects: dict[str, tuple[bytes, int]] = {}
+        self.injected = dict.fromkeys((REFUSED, LOST, DELAYED), 0)
+        """Number of faults so far."""
+        self.observe: Callable[[Write], object] = lambda write: None
+        """Called at each write that is carried out, before it is."""
+        self._version = 0
+        self._clients = Process("network")
+        names = {"BaseError": _Error, "AlreadyExistsError": _AlreadyExistsError, "PreconditionError": _PreconditionError}
+        self.exceptions = types.SimpleNamespace(**names)
+
+    def open(self, process: Process, url: str = "s3://simulated") -> Store:
+        """The product's store, by which a process uses this one."""
+        store = object.__new__(Store)
+        vars(store).update(url=url, _store=process, _obs=self, _errors=self.exceptions)
+        return store
+
+    def _request(self, carry_out: Callable[[], Any], *, may_delay: bool = False) -> Any:
+        """Carry out a request, or inject a fault."""
+        draw = self.simulation.draw
+        late_answer = draw.random() < 0.5  # Not both of its ways take time, since each costs a change of threads.
+        if not late_answer:
+            self.simulation.sleep(LATENCY * draw.random())
+        number, fault = draw.random(), ""
+        for name, share in self.faults.items():
+            if 0.0 <= number < share and (may_delay or name != DELAYED):
+                fault = name
+            number -= share
+        if fault:
+            self.injected[fault] += 1
+        if fault == REFUSED:
+            raise _Error("status code: 503 SlowDown")
+        if fault == DELAYED:
+            self.simulation.start(self._clients, lambda: self._carry_out_late(carry_out, LATE * draw.random()))
+            raise _Error("timed out")
+        result = carry_out()
+        if late_answer:
+            self.simulation.sleep(LATENCY * draw.random())
+        if fault == LOST:
+            raise _Error("connection reset")
+        return result
+
+    def _carry_out_late(self, carry_out: Callable[[], Any], seconds: float) -> None:
+        self.simulation.sleep(seconds)
+        with contextlib.suppress(_Error, FileNotFoundError):
+            carry_out()
+
+    def put(self, process: Process, key: str, data: bytes | Path, *, mode: Any = "overwrite", **_: Any) -> dict[str, Any]:
+        content = data.read_bytes() if isinstance(data, Path) else bytes(data)
+
+        def carry_out() -> dict[str, Any]:
+            found = self.objects.get(key)
+            if mode == "create" and found is not None:
+                raise _AlreadyExistsError(key)
+            if isinstance(mode, dict) and (found is None or str(found[1]) != mode["e_tag"]):
+                raise _PreconditionError(key)
+            self.observe(Write(process, key, content, found and found[0]))
+            self._version += 1
+            self.objects[key] = content, self._version
+            return self._meta(key)
+
+        return self._request(carry_out, may_delay=True)
+
+    def _meta(self, key: str) -> dict[str, Any]:
+        data, version = self.objects[key]
+        return {"path": key, "size": len(data), "e_tag": str(version), "version": None, "last_modified": None}
+
+    def head(self, _: Process, key: str) -> dict[str, Any]:
+        return self._request(lambda: self._meta(self._found(key)))
+
+    def get(self, _: Process, key: str, options: dict[str, Any] | None = None) -> Any:
+        def carry_out() -> Any:
+            data = self.objects[self._found(key)][0]
+            start, end = (options or {}).get("range", (0, len(data)))
+            return types.SimpleNamespace(meta=self._meta(key), bytes=lambda: data[start:end])
+
+        return self._request(carry_out)
+
+    def _found(self, key: str) -> str:
+        if key not in self.objects:
+            raise FileNotFoundError(f"no object {key}")
+        return key
+
+    def list(self, _: Process, folder: str | None, offset: str | None, chunk_size: int) -> Iterator[list[dict[str, Any]]]:
+        def carry_out() -> list[dict[str, Any]]:
+            inside = (key for key in sorted(self.objects) if key.startswith(f"{folder}/" if folder else "") and key > (offset or ""))
+            return [self._meta(key) for key, _ in zip(inside, range(chunk_size), strict=False)]
+
+        return iter([self._request(carry_out)])
+
+    def delete(self, process: Process, key: str) -> None:
+        def carry_out() -> None:
+            self.observe(Write(process, key, None, self.objects[self._found(key)][0]))
+            del self.objects[key]
+
+        self._request(carry_out, may_delay=True)

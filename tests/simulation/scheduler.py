@@ -1,0 +1,308 @@
+"""Discrete-event simulation of processes and their threads in virtual time (after FoundationDB's simulator; Zhou et al., 2021).
+
+One thread runs at a time, and hands over at each sleep, wait, lock and request; a seed draws which comes next. So a schedule repeats.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import random
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+import pytest
+
+from synpick_warp.system import clock
+
+START = 1.8e9
+"""Virtual time at the start [s since 1970]."""
+LONGEST = 1e6
+"""Virtual duration of a simulation from which on it counts as hung [s]."""
+
+
+class Dead(BaseException):
+    """The process was killed: raised by its threads at whatever they do next, so that no code of theirs has an effect."""
+
+
+class HungError(AssertionError):
+    """No thread can ever go on, or the simulation takes too long."""
+
+
+class Process:
+    """Process of a simulation: killed as a whole, or frozen for a time, as by a suspended machine."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.dead, self.frozen = name, False, 0.0
+        """Until when it is frozen: virtual time [s]."""
+
+
+class _Task:
+    """Thread of a process: waits until `ready`, or until `wake`."""
+
+    def __init__(self, process: Process) -> None:
+        self.process, self.done = process, False
+        self.ready: Callable[[], bool] | None = None
+        self.wake: float | None = None
+        self.baton = _taken_lock()
+
+    def can_run(self, now: float) -> bool:
+        """Whether the scheduler may choose this task."""
+        if self.process.dead:
+            return True
+        if self.process.frozen > now:
+            return False
+        if self.wake is not None and self.wake <= now:
+            return True
+        return self.ready() if self.ready is not None else self.wake is None
+
+
+def _taken_lock() -> threading.Lock:
+    """Lock that its next user waits for, until another thread releases it: faster than a semaphore."""
+    lock = threading.Lock()
+    lock.acquire()
+    return lock
+
+
+class Simulation:
+    """Scheduler: replaces `system.clock` while it is entered, and runs functions as processes."""
+
+    def __init__(self, seed: object) -> None:
+        self.draw, self.now = random.Random(repr(seed)), START
+        self.points = 0
+        """Number of scheduling points so far."""
+        self.at_point: Callable[[Process], object] = lambda process: None
+        """Called at each scheduling point: it may kill or freeze processes."""
+        self.errors: list[tuple[str, BaseException]] = []
+        """Errors that ended a thread, with the name of its process."""
+        self._main = _Task(Process("main"))
+        self._tasks, self._running = [self._main], self._main
+        self._idle: list[_Runner] = []
+        self._hung = False
+
+    def __enter__(self) -> Simulation:
+        self._patch = pytest.MonkeyPatch()
+        seam = {"time": lambda: self.now, "monotonic": lambda: self.now, "sleep": self.sleep}
+        seam |= {kind.__name__.removeprefix("_"): functools.partial(kind, self) for kind in (_Event, _Lock, _Thread, _Executor)}
+        for name, value in seam.items():
+            self._patch.setattr(clock, name, value)
+        random.seed(self.draw.random())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for task in self._tasks:
+            task.process.dead = task is not self._main
+        self._hung = False
+        with contextlib.suppress(HungError):
+            self.wait(lambda: all(task.done for task in self._tasks if task is not self._main))
+        for runner in self._idle:
+            runner.start(None)
+        self._patch.undo()
+
+    def run(self, *processes: tuple[Process, Callable[[], object]]) -> None:
+        """Run functions as processes until all of them have ended."""
+        tasks = [self.start(process, function) for process, function in processes]
+        self.wait(lambda: all(task.done for task in tasks))
+
+    @property
+    def process(self) -> Process:
+        """Process of the running thread."""
+        return self._running.process
+
+    def start(self, process: Process, function: Callable[[], object]) -> _Task:
+        """Start a thread of a process."""
+        task = _Task(process)
+        self._tasks.append(task)
+        runner = self._idle.pop() if self._idle else _Runner()
+        runner.start(functools.partial(self._execute, task, function, runner))
+        return task
+
+    def _execute(self, task: _Task, function: Callable[[], object], runner: _Runner) -> None:
+        """Run a task on an operating system's thread, from when it is chosen first."""
+        task.baton.acquire()
+        try:
+            if not task.process.dead:
+                function()
+        except Dead:
+            pass
+        except BaseException as error:
+            self.errors.append((task.process.name, error))
+        task.done = True
+        self._tasks.remove(task)
+        self._idle.append(runner)
+        self._hand_over(self._choose())
+
+    def sleep(self, seconds: float) -> None:
+        """Sleep in virtual time."""
+        self.wait(None, seconds)
+
+    def wait(self, ready: Callable[[], bool] | None, seconds: float | None = None) -> bool:
+        """Scheduling point: block the running thread until a condition holds, or for a virtual time; returns the condition."""
+        task = self._running
+        self._check(task)
+        self.points += 1
+        self.at_point(task.process)
+        task.ready, task.wake = ready, None if seconds is None else self.now + seconds
+        chosen = self._choose()
+        if chosen is not task:
+            self._hand_over(chosen)
+            task.baton.acquire()
+        task.ready = task.wake = None
+        if self._hung and task is self._main:
+            raise HungError(f"no thread can go on, or none ends: {self.now - START:.1f} s, {len(self._tasks)} threads")
+        self._check(task)
+        return ready is not None and ready()
+
+    def _check(self, task: _Task) -> None:
+        if task.process.dead:
+            raise Dead
+
+    def _choose(self) -> _Task:
+        """Draw the next thread; without one that can run, virtual time goes on to the next event."""
+        while True:
+            found = [task for task in self._tasks if task.can_run(self.now)]
+            if found:
+                return found[int(self.draw.random() * len(found))]
+            events = [task.wake for task in self._tasks if task.wake is not None and task.wake > self.now]
+            events += [task.process.frozen for task in self._tasks if task.process.frozen > self.now]
+            if not events or self.now > START + LONGEST:
+                self._hung = True
+                return self._main
+            self.now = min(events)
+
+    def _hand_over(self, task: _Task) -> None:
+        self._running = task
+        task.baton.release()
+
+
+class _Runner:
+    """Operating system's thread, which is reused for one task after another."""
+
+    def __init__(self) -> None:
+        self._given, self._function = _taken_lock(), None
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def start(self, function: Callable[[], object] | None) -> None:
+        """Run a function, or end."""
+        self._function = function
+        self._given.release()
+
+    def _work(self) -> None:
+        while True:
+            self._given.acquire()
+            if self._function is None:
+                return
+            self._function()
+
+
+class _Event:
+    """`threading.Event` in a simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation, self._set = simulation, False
+
+    def set(self) -> None:
+        self._set = True
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self._simulation.wait(self.is_set, timeout)
+
+
+class _Lock:
+    """`threading.Lock` in a simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation, self._held = simulation, False
+
+    def __enter__(self) -> None:
+        while self._held or not self._simulation.wait(lambda: not self._held):
+            pass
+        self._held = True
+
+    def __exit__(self, *_: object) -> None:
+        self._held = False
+
+
+class _Thread:
+    """`threading.Thread` in a simulation, of the process that makes it."""
+
+    def __init__(self, simulation: Simulation, target: Callable[[], object], name: str = "", daemon: bool = False) -> None:
+        self._simulation, self._target, self._process = simulation, target, simulation.process
+        self.name, self._task = name, None
+
+    def start(self) -> None:
+        self._task = self._simulation.start(self._process, self._target)
+
+    def join(self) -> None:
+        task = self._task
+        self._simulation.wait(lambda: task is None or task.done)
+
+
+class _Future:
+    """Result of a task of `_Executor`."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation, self._ended, self._result, self._error = simulation, False, None, None
+
+    def run(self, function: Callable[[], object]) -> None:
+        """Run a function, whose result or error this has then."""
+        try:
+            self._result = function()
+        except Dead:
+            raise
+        except BaseException as error:
+            self._error = error
+        self._ended = True
+
+    def done(self) -> bool:
+        return self._ended
+
+    def result(self) -> Any:
+        self._simulation.wait(self.done)
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+
+class _Executor:
+    """`ThreadPoolExecutor` in a simulation."""
+
+    def __init__(self, simulation: Simulation, workers: int, name: str = "") -> None:
+        self._simulation, self._free, self._waiting, self._open = simulation, workers, [], 0
+
+    def __enter__(self) -> _Executor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+
+    def submit(self, function: Callable[..., object], *arguments: object) -> _Future:
+        future = _Future(self._simulation)
+        self._waiting.append((future, functools.partial(function, *arguments)))
+        if self._free:
+            self._free -= 1
+            self._simulation.start(self._simulation.process, self._work)
+        return future
+
+    def _work(self) -> None:
+        """Run waiting tasks until there is none."""
+        self._open += 1
+        while self._waiting:
+            future, function = self._waiting.pop(0)
+            future.run(function)
+        self._open -= 1
+        self._free += 1
+
+    def map(self, function: Callable[..., Any], *arguments: Iterable[Any]) -> Iterator[Any]:
+        futures = [self.submit(function, *each) for each in zip(*arguments, strict=True)]
+        return (future.result() for future in futures)
+
+    def shutdown(self, wait: bool = True, cancel_futures: bool = False) -> None:
+        if cancel_futures:
+            self._waiting.clear()
+        if wait:
+            self._simulation.wait(lambda: not (self._waiting or self._open))

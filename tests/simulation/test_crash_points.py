@@ -1,0 +1,147 @@
+"""Every crash point, enumerated: of bakes and merges in a local folder, and of workers that bake into a store; the next run repairs all."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cloud import run
+from synpick_warp.cloud.ledger import Ledger
+from synpick_warp.dataset.commit import writing
+from synpick_warp.dataset.commit.manifest import read_entry
+from synpick_warp.dataset.commit.merge import merge
+from synpick_warp.dataset.commit.verify import verify
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing import checksums
+from synpick_warp.system.progress import SilentProgress
+from synpick_warp.system.stores.opening import CONTROL, Probe
+from tests.builders import once
+from tests.cloud.conftest import files
+from tests.harness import scripted_bake
+from tests.simulation.claiming import FAULTS, LEASE
+from tests.simulation.crashing_disk import CrashingDisk
+from tests.simulation.faulty_store import FaultyStore
+from tests.simulation.scheduler import Dead, Process, Simulation
+
+CONFIG = scripted_bake.small_settings()
+EVERY = 16
+"""Crash points are tested in this many turns: the first with the fast tests, the others with the slow ones."""
+TURNS = [0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in range(1, EVERY))]
+
+
+@pytest.fixture(scope="session")
+def expected(tmp_path_factory) -> dict[str, bytes]:
+    """Files of an undisturbed bake."""
+    folder, _ = once(tmp_path_factory, "crash-points", _bake)
+    return files(folder)
+
+
+def _bake(out: Path) -> None:
+    scripted_bake.bake(out, CONFIG)
+
+
+def _begin(out: Path) -> None:
+    """Leave a bake that was stopped after its first episode."""
+    scripted_bake.bake(out, CONFIG, stop_after=1)
+
+
+def crash(folder: Path, prepare: Callable[[Path], object], change: Callable[[Path], object], turn: int, *, power: bool) -> dict[int, Path]:
+    """Crash `change` at every EVERYth of its changes to a prepared folder; returns the folders by the number of the change."""
+    prepare(folder / "counted")
+    with CrashingDisk(folder / "counted") as disk:
+        change(folder / "counted")
+    left = {}
+    for number in range(1 + turn, disk.changes + 1, EVERY):
+        out = left[number] = folder / str(number)
+        prepare(out)
+        with CrashingDisk(out, number) as crashing, contextlib.suppress(Dead):
+            change(out)
+        if power:
+            crashing.cut_power()
+    assert disk.changes > 4 * EVERY
+    return left
+
+
+@pytest.mark.parametrize("turn", TURNS)
+@pytest.mark.parametrize("power", [False, True], ids=["killed", "power cut"])
+@pytest.mark.parametrize("prepare", [lambda out: None, _begin], ids=["new", "resumed"])
+def test_a_bake_may_end_at_any_change_to_its_folder(tmp_path, expected, prepare, power, turn):
+    for number, out in crash(tmp_path, prepare, _bake, turn, power=power).items():
+        _bake(out)
+        assert files(out) == expected, number
+        assert verify(out).finished
+        shutil.rmtree(out)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_merge_may_end_at_any_change_to_its_folder(tmp_path, expected, turn):
+    """Its parts stay as they are, and nothing that it leaves is taken for a data set."""
+    parts = [tmp_path / "parts" / str(number) for number in range(2)]
+    for number, part in enumerate(parts):
+        scripted_bake.bake(part, CONFIG, shard=(number, 2))
+    before = [files(part) for part in parts]
+    for number, out in crash(tmp_path, lambda out: None, lambda out: merge(parts, out), turn, power=False).items():
+        if not (out / "manifest.json").exists():
+            shutil.rmtree(out, ignore_errors=True)
+            merge(parts, out)
+        assert files(out) == expected, number
+        assert [files(part) for part in parts] == before
+
+
+BUGS = {
+    "a mark is not synchronized": lambda patch: patch.setattr(checksums, "write_atomically", lambda path, data: path.write_bytes(data)),
+    "a mark counts without its files": lambda patch: patch.setattr(
+        writing, "is_complete", lambda folder, entry: read_entry(folder, entry) is not None
+    ),
+}
+"""Planted bugs, by name."""
+
+
+@pytest.mark.parametrize("bug", BUGS)
+def test_a_planted_bug_of_a_folder_is_found(tmp_path, expected, monkeypatch, bug):
+    BUGS[bug](monkeypatch)
+    left = crash(tmp_path, lambda out: None, _bake, 0, power=True)
+    with pytest.raises((AssertionError, DatasetError)):  # noqa: PT012
+        for out in left.values():
+            _bake(out)
+            assert files(out) == expected
+
+
+class Workers:
+    """Workers of a simulation that bake into a store, with real bakes and uploads; the first dies at a scheduling point."""
+
+    def __init__(self, seed: object, die_at: int = 0, faults: dict[str, float] | None = None, *, claim: bool = True) -> None:
+        self._simulation, self._claim = Simulation(seed), claim
+        self.store = FaultyStore(self._simulation, faults)
+        self.points, self._die_at = 0, die_at
+        self._simulation.at_point = self._at_point
+
+    def _at_point(self, process: Process) -> None:
+        if process.name == "first":
+            self.points += 1
+            process.dead = self.points == self._die_at
+
+    def run(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
+        """Run the first worker, then, if it dies, another; returns the files in the store."""
+        with self._simulation as simulation, monkeypatch.context() as patch:
+            patch.setattr(run, "open_ledger", lambda job: Ledger(self.store.open(simulation.process), job.config, Probe(0.0, True)))
+            patch.setattr(run.gc, "collect", lambda: 0)  # It takes most of the time.
+            job = run.Job(CONFIG, "s3://simulated", bake=scripted_bake.bake_episodes, lease=LEASE)
+            for name in ("first", "second") if self._die_at else ("first",):
+                simulation.run((Process(name), lambda: run.bake_into_store(job, SilentProgress(), claim=self._claim)))
+            assert simulation.errors == []
+        return {key: data for key, (data, _) in self.store.objects.items() if not key.startswith(f"{CONTROL}/")}
+
+
+@pytest.mark.parametrize(("faults", "claim"), [({}, False), (FAULTS, True)], ids=["one worker", "claiming, requests fail"])
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_worker_may_die_at_any_point_of_a_bake_into_a_store(monkeypatch, expected, turn, faults, claim):
+    """The next worker ends the set."""
+    undisturbed = Workers("whole", claim=claim)
+    assert undisturbed.run(monkeypatch) == expected
+    for point in range(1 + turn, undisturbed.points + 1, EVERY):
+        assert Workers(point if faults else "whole", point, faults, claim=claim).run(monkeypatch) == expected, point
