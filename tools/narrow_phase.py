@@ -20,8 +20,8 @@ from synpick_warp.system.hardware.device import start_warp
 from synpick_warp.system.hardware.kernels import ModuleBuild
 from tools.options import make_parser
 
-ARCHITECTURES = (80, 86, 89, 90, 100)
-"""Compute capabilities times ten: A100, RTX 30, L40 and RTX 40, H100 and H200, B200."""
+ARCHITECTURES = (80, 86, 89, 90, 100, 120)
+"""Compute capabilities times ten: A100, RTX 30, L40 and RTX 40, H100 and H200, B200, RTX 50."""
 
 
 def main() -> None:

@@ -56,7 +56,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, build_of, compilation_lock, dry_launches
+from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused
 from synpick_warp.system.progress import Progress, SilentProgress
 from synpick_warp.views.frames import bin_record, most_words
@@ -194,15 +194,10 @@ def make_compiler(device: wp.Device | None, progress: Progress) -> Compiler:
 
 def submit_slow(compiler: Compiler, device: wp.Device, config: Config) -> None:
     """Start to compile what takes longest, and what is launched while worlds are built, before these are."""
-    own = [
-        build_of(read_binary_bvh_kernel, wp.get_device("cpu")),
-        build_of(measure_albedo_kernel, device),
-        build_of(set_up_views_kernel, device),
-    ]
+    own = [build_of(kernel, device) for kernel in (measure_albedo_kernel, set_up_views_kernel)]
     shown = (trace_coarse_paths_kernel, shade_kernel) if Needs.of(config).views and config.render.mode == FAST else ()
-    block = PIXEL_BLOCK if device.is_cuda else 1
-    per_pixel = [ModuleBuild(kernel.module, device.alias, block) for kernel in (rasterize_triangles_kernel, *shown)]
-    compiler.submit([*slow_builds(device), *own, *early_builds(device), *per_pixel])
+    own += [build_of(kernel, device, PIXEL_BLOCK) for kernel in (rasterize_triangles_kernel, *shown)]
+    compiler.submit([*slow_builds(device), build_of(read_binary_bvh_kernel, wp.get_device("cpu")), *early_builds(device), *own])
 
 
 def submit_launches(compiler: Compiler, simulation: Simulation, stream: FrameStream | None) -> None:

@@ -24,10 +24,10 @@ from synpick_warp.system.progress import Progress
 
 @dataclass(frozen=True)
 class WarmUp:
-    """Result of a warm-up: number of modules compiled (the others were in the cache), and duration [s]."""
+    """Result of a warm-up."""
 
     compiled: int
-    """Modules that were compiled; the others were in the cache."""
+    """Number of modules that were compiled; the others were in the cache, or are shipped."""
     seconds: float
     """Duration [s]."""
 

@@ -29,11 +29,8 @@ SOLVER_ARRAYS = {
     "solved_normal": "_ws_prev_contact_normal",
 }
 PATCH_ARRAYS = {"pair": "keys", "pair_contact": "indices", "patch_normal": "normal", "friction": "mu"}
-PATCH_ARRAYS |= {
-    name: name
-    for name in ("displacement", "body_a", "body_b", "shape_a", "shape_b", "owner", "anchor_a", "anchor_b", "surface_a", "surface_b")
-}
-PATCH_ARRAYS |= {name: name for name in ("valid", "tangent_impulse")}
+_SAME = "displacement body_a body_b shape_a shape_b owner anchor_a anchor_b surface_a surface_b valid tangent_impulse"
+PATCH_ARRAYS |= {name: name for name in _SAME.split()}
 """Newton's names of the members of `ContactHistory`: in its contact matcher, its solver, and the previous frame of friction patches."""
 ROW_ARRAYS = ("impulses", "row_type", "row_parent")
 """Warm-start data of each family of constraint rows."""

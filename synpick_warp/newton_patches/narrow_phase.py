@@ -18,7 +18,7 @@ from newton._src.sim import model as newton_model
 from newton._src.solvers.steel import solver_steel  # noqa: F401  (Newton imports it late, and its modules are split below.)
 
 from synpick_warp.kernels.newton_patches import contact_matching
-from synpick_warp.system.hardware.kernels import ModuleBuild, module_build, split_modules
+from synpick_warp.system.hardware.kernels import ModuleBuild, build_of, split_modules
 
 # Of the kernels in these modules of Newton, a bake launches a fifth.
 split_modules(("newton._src.geometry.", "newton._src.sim.", "newton._src.solvers.solver", "newton._src.solvers.steel."))
@@ -69,9 +69,9 @@ def slow_builds(device: wp.Device) -> list[ModuleBuild]:
 
 def early_builds(device: wp.Device) -> list[ModuleBuild]:
     """Modules that Newton needs to build a model: by launches they would be compiled one after the other."""
-    modules = [wp.get_module(f"newton._src.{file}.{name}") for file, names in _BUILDERS.items() for name in names.split()]
-    modules += [kernel.module for kernel in (inertia.validate_and_correct_inertia_kernel, inertia.compute_body_inverses_kernel)]
-    return [module_build(module, device) for module in modules]
+    modules = (wp.get_module(f"newton._src.{file}.{name}") for file, names in _BUILDERS.items() for name in names.split())
+    kernels = [inertia.validate_and_correct_inertia_kernel, inertia.compute_body_inverses_kernel]
+    return [build_of(kernel, device) for kernel in (*kernels, *(kernel for module in modules for kernel in module.kernels.values()))]
 
 
 def take_shipped(device: wp.Device) -> None:

@@ -114,14 +114,9 @@ def _lock(handle: int, flags: int = 0) -> bool:
     return True
 
 
-def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
-    """Identify the build that a launch of a kernel with the default block size loads."""
-    return module_build(kernel.module, device)
-
-
-def module_build(module: wp.Module, device: wp.Device) -> ModuleBuild:
-    """Identify the build of a module with the default block size."""
-    return ModuleBuild(module, device.alias, module.options["block_dim"] if device.is_cuda else 1)
+def build_of(kernel: Any, device: wp.Device, block: int | None = None) -> ModuleBuild:
+    """Identify the build that a launch of a kernel loads; `block`: its block size on a GPU, None: the default one."""
+    return ModuleBuild(kernel.module, device.alias, (block or kernel.module.options["block_dim"]) if device.is_cuda else 1)
 
 
 def split_modules(prefixes: tuple[str, ...]) -> None:
