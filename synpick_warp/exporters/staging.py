@@ -116,11 +116,12 @@ class EpisodeExporter(Exporter, Generic[_Content]):
         arguments: tuple[Any, ...],
         path: Path,
         then: Callable[[], None] | None = None,
+        affinity: int | None = None,
     ) -> WriteTask:
         """A task that writes to the staging folders of episodes, which are committed after it; `then` runs first, and may submit others."""
         for episode in episodes:
             episode.pending += 1
-        return WriteTask(function, images, arguments, path, partial(self._task_done, episodes, then))
+        return WriteTask(function, images, arguments, path, partial(self._task_done, episodes, then), affinity)
 
     def _task_done(self, episodes: Sequence[StagedEpisode[_Content]], then: Callable[[], None] | None) -> None:
         """Count a finished task of these episodes, after calling `then`; commits or discards those that have ended and wait for none."""

@@ -101,7 +101,7 @@ class BopExporter(SceneExporter):
             spool_picks(batch, scenes)
 
     def places(self, episode: int) -> Iterator[Path]:
-        return (self._place(scene).relative_to(self._out) for scene in self.scene_ids(episode))
+        return map(self._place, self.scene_ids(episode))
 
     def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
         """Create the staging folder of a scene, with a folder for each kind of images."""
@@ -118,10 +118,10 @@ class BopExporter(SceneExporter):
             for index, (view, own) in enumerate(zip(self._views, images, strict=True))
         )
         if self._context.layout.has_sensors:
-            return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), settings)
-        return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
+            return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), self._out, settings)
+        return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), self._out, settings)
 
     def _place(self, scene_id: int) -> Path:
-        """Folder of a scene in the data set; with several sensors the folder that the scenes of an episode share."""
+        """Folder of a scene, relative to the data set; with several sensors the folder that the scenes of an episode share."""
         episode, camera = divmod(scene_id, len(self._cameras))
-        return self._folder(scene_id) / f"{self._context.layout.scene(episode, camera)[0]:06d}"
+        return (self._folder(scene_id) / f"{self._context.layout.scene(episode, camera)[0]:06d}").relative_to(self._out)

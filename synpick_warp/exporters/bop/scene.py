@@ -5,6 +5,7 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import os
@@ -21,13 +22,16 @@ from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.graph import GRAPH_FILE, FrameSupport, find_occlusions, graph_entry
 from synpick_warp.exporters.bop.picks import PICKS, format_picks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
-from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder
-from synpick_warp.exporters.writing.png import encode_mask_png
+from synpick_warp.exporters.writing.checksums import spooled_checksums
+from synpick_warp.exporters.writing.files import Buffer, checksum_line, open_folder, sync_folder
+from synpick_warp.exporters.writing.png import hashed_mask_png
 from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.views.layer_codec import layer_path
 
 IGNORE_VISIBILITY = 0.1
 """COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""
+CHECKSUMS = "checksums"
+"""Spool file of a staged scene: the checksum lines of its images, so that they are hashed while they are in the cache of the processor."""
 DATE = "1970-01-01 00:00:00"
 """Value of COCO's date fields: constant, so that the same seed gives the same bytes."""
 
@@ -64,7 +68,7 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     without their ids.
     """
     name = f"{view.frame:06d}"
-    with open_folder(scene) as folder:
+    with open_folder(scene, CHECKSUMS) as folder:
         if settings.color:
             suffix, color = view.color
             folder.write(f"rgb/{name}{suffix}", color)
@@ -73,11 +77,8 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
         masks = view.masks() if settings.masks or settings.coco or settings.graph else []
         for index, mask in enumerate(masks if settings.masks else ()):
             width, height = settings.resolution
-            amodal = visible = encode_mask_png(mask.amodal, height, width)
-            if mask.amodal.count != mask.visible.count:  # Something hides the instance.
-                visible = encode_mask_png(mask.visible, height, width)
-            folder.write(f"mask/{name}_{index:06d}.png", amodal)
-            folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
+            for kind, runs in (("mask", mask.amodal), ("mask_visib", mask.visible)):
+                folder.write(f"{kind}/{name}_{index:06d}.png", *hashed_mask_png(runs, height, width))
         annotations = _make_annotations(view, masks, settings) if settings.coco else ()
         graph = (view.graph or {"occlusion": find_occlusions(masks)},) if settings.graph else ()
         folder.append(ANNOTATIONS, annotation_block(view.frame, map(to_json, (view.camera, view.gt, view.gt_info, *graph, *annotations))))
@@ -85,7 +86,8 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
 
 def write_layer(data: Buffer, scene: Path, _: int, name: str, frame: int) -> None:
     """Write a view's layer into the folder of that name."""
-    layer_path(scene, name, frame).write_bytes(data)
+    with open_folder(scene, CHECKSUMS) as folder:
+        folder.write(str(layer_path(Path(), name, frame)), data)
 
 
 def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSettings) -> Iterator[dict[str, Any]]:
@@ -109,38 +111,54 @@ def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSetti
             } | points
 
 
-def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: tuple[SceneSettings, ...]) -> None:
-    """Task: complete an episode's scenes, and rename each from its staging folder to its place: (from, to).
+def commit_scenes(scenes: tuple[tuple[Path, Path], ...], out: Path, settings: tuple[SceneSettings, ...]) -> None:
+    """Task: complete an episode's scenes, rename each from its staging folder to its place in the data set, (from, to), and spool the
+    checksums.
 
     JSON files and folder entries are synced to disk before the rename. Images are at least in the page cache: they survive the end
     of this process, but not necessarily a power cut.
     """
-    for (scene, _), own in zip(scenes, settings, strict=True):
-        complete_scene(scene, own)
+    for (scene, place), own in zip(scenes, settings, strict=True):
+        spooled_checksums(out, place).write_text(complete_scene(scene, place, own), encoding="utf-8")
     for scene, place in scenes:
-        scene.rename(place)
+        scene.rename(out / place)
     for folder in {place.parent for _, place in scenes}:
-        sync_folder(folder)
+        sync_folder(out / folder)
 
 
-def complete_scene(scene: Path, settings: SceneSettings) -> None:
-    """Write the JSON files of a staged scene from its annotation blocks, and sync its folders to disk."""
+def complete_scene(scene: Path, place: Path, settings: SceneSettings) -> str:
+    """Write the JSON files of a staged scene from its annotation blocks, and sync its folders to disk. Returns the checksum lines of all of
+    its files, at their place in the data set."""
+    sums: list[str] = []
     with (scene / ANNOTATIONS).open("rb") as file:
         blocks = AnnotationBlocks(file)
         blocks.check_frames(scene, settings.images)
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
-            _write_lines(scene / name, _format_keyed(blocks, index))
+            sums.append(_write_lines(scene / name, _format_keyed(blocks, index)))
         if settings.view.graph:
-            _write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports)))
+            sums.append(_write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports))))
         if settings.view.coco:
-            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.view.graph, settings))
+            sums.append(_write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.view.graph, settings)))
         if (scene / PICKS).exists():
-            _write_lines(scene / "scene_picks.json", format_picks(scene / PICKS, blocks.camera, settings.view.resolution))
+            lines = format_picks(scene / PICKS, blocks.camera, settings.view.resolution)
+            sums.append(_write_lines(scene / "scene_picks.json", map(str.encode, lines)))
             (scene / PICKS).unlink()
-    (scene / ANNOTATIONS).unlink()
+    with (scene / CHECKSUMS).open(encoding="ascii") as file:
+        sums += file
+    for name in (ANNOTATIONS, CHECKSUMS):
+        (scene / name).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
         sync_folder(folder)
+    parts = (line.split(" ", 2) for line in sums)
+    return "".join(f"{digest} {size} {place}/{_add_sensor(name, settings.sensor)}" for digest, size, name in parts)
+
+
+def _add_sensor(name: str, sensor: str) -> str:
+    """Name of a file or image folder of a scene, or a path that begins with it, with the suffix of its sensor."""
+    first, slash, rest = name.partition("/")
+    stem, dot, kind = first.partition(".")
+    return f"{stem}{sensor}{dot}{kind}{slash}{rest}"
 
 
 class AnnotationBlocks:
@@ -169,28 +187,30 @@ class AnnotationBlocks:
         """Entry of a frame in scene_camera.json; None: the scene has no such image."""
         return json.loads(next(self.read(frame, 0, 1))) if frame in self._places else None
 
-    def read(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
+    def read(self, frame: int, begin: int, end: int | None) -> Iterator[bytes]:
         """Read entries `begin` to `end`, exclusive, of a frame."""
         for offset, size in self._places[frame][begin:end]:
             self._file.seek(offset)
-            yield self._file.read(size).decode("ascii")
+            yield self._file.read(size)
 
 
-def _complete_graph(supports: Sequence[FrameSupport], frame: int, text: str) -> str:
+def _complete_graph(supports: Sequence[FrameSupport], frame: int, text: bytes) -> bytes:
     """Complete the JSON of a view's entry in scene_graph.json by what its frame's contacts tell."""
-    return to_json(graph_entry(orjson.loads(text), supports[frame] if supports else None)).decode("ascii")
+    return to_json(graph_entry(orjson.loads(text), supports[frame] if supports else None))
 
 
-def _format_keyed(blocks: AnnotationBlocks, index: int, change: Callable[[int, str], str] = lambda frame, text: text) -> Iterator[str]:
+def _format_keyed(
+    blocks: AnnotationBlocks, index: int, change: Callable[[int, bytes], bytes] = lambda frame, text: text
+) -> Iterator[bytes]:
     """Format entry `index` of all views, as `change` of frame and text returns it, as a JSON object with a key for each frame."""
-    yield "{\n"
+    yield b"{\n"
     for position, frame in enumerate(blocks.frames):
         (text,) = blocks.read(frame, index, index + 1)
-        yield ("" if position == 0 else ",\n") + f'  "{frame}": {change(frame, text)}'
-    yield "\n}\n"
+        yield b'%s  "%d": %s' % (b",\n" if position else b"", frame, change(frame, text))
+    yield b"\n}\n"
 
 
-def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) -> Iterator[str]:
+def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) -> Iterator[bytes]:
     """Format scene_gt_coco.json; the views' annotations are their entries from `first` on, and get their ids here, from 1."""
     head = {
         "info": {
@@ -205,13 +225,13 @@ def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) 
         "categories": settings.categories,
         "images": [_coco_image(frame, settings) for frame in blocks.frames],
     }
-    yield json.dumps(head)[:-1] + ', "annotations": [\n'
+    yield json.dumps(head)[:-1].encode() + b', "annotations": [\n'
     annotation_id = 0
     for frame in blocks.frames:
         for text in blocks.read(frame, first, None):
             annotation_id += 1
-            yield ("" if annotation_id == 1 else ",\n") + f'{{"id": {annotation_id}, {text[1:]}'
-    yield "\n]}\n"
+            yield b'%s{"id": %d, %s' % (b",\n" if annotation_id > 1 else b"", annotation_id, text[1:])
+    yield b"\n]}\n"
 
 
 def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
@@ -228,15 +248,19 @@ def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
     }
 
 
-def _write_lines(path: Path, parts: Iterable[str]) -> None:
-    """Write text parts to an ASCII file, and sync it to the disk."""
-    with path.open("w", encoding="ascii", newline="\n") as file:
-        file.writelines(parts)
+def _write_lines(path: Path, parts: Iterable[bytes]) -> str:
+    """Write text parts to a file, and sync it to the disk; returns its checksum line."""
+    digest, size = hashlib.sha256(), 0
+    with path.open("wb") as file:
+        for part in parts:
+            digest.update(part)
+            size += file.write(part)
         file.flush()
         os.fsync(file.fileno())
+    return checksum_line(digest.hexdigest(), size, path.name)
 
 
-def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: tuple[SceneSettings, ...]) -> None:
+def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, out: Path, settings: tuple[SceneSettings, ...]) -> None:
     """Task of the multisensor layout of BOP-Industrial 2025: complete the scenes of an episode's cameras, which are staged in the classic
     layout, bring them together in one folder, with folders and annotation files for each camera, and rename it to its place.
 
@@ -244,10 +268,12 @@ def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: tuple[S
     """
     whole = scenes[0].with_name(f"{scenes[0].name}-sensors")
     whole.mkdir()
+    sums: list[str] = []
     for scene, own in zip(scenes, settings, strict=True):
-        complete_scene(scene, own)
+        sums.append(complete_scene(scene, place, own))
         for path in sorted(scene.iterdir()):
-            path.rename(whole / f"{path.stem}{own.sensor}{path.suffix}")
+            path.rename(whole / _add_sensor(path.name, own.sensor))
+    spooled_checksums(out, place).write_text("".join(sums), encoding="utf-8")
     sync_folder(whole)
-    whole.rename(place)
-    sync_folder(place.parent)
+    whole.rename(out / place)
+    sync_folder((out / place).parent)

@@ -168,7 +168,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             images, truth = make_view_task(batch, view, self.scene_ids(index)[camera], self._views[camera])
             place = self._folder(truth.scene) / scene.name
             arguments = (type(self).write_view, scene, self._views[camera], truth)
-            yield self._task((episode,), write_rendered_view, images, arguments, place)
+            yield self._task((episode,), write_rendered_view, images, arguments, place, affinity=truth.scene)
             for name in self._views[camera].layers:
                 arguments = (type(self).write_layer, scene, truth.scene, name, truth.frame)
                 yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)

@@ -20,7 +20,15 @@ from synpick_warp.exporters.base import PIXEL_BYTES, EncodedView, StoredScene
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
 from synpick_warp.exporters.writing.files import Buffer
 from synpick_warp.exporters.writing.png import encode_png, frame_depth_png
-from synpick_warp.exporters.writing.rle import Masks, Runs, find_run_boundaries, find_runs, split_listed_runs, unpack_run_boundaries
+from synpick_warp.exporters.writing.rle import (
+    Masks,
+    Runs,
+    cached_by_runs,
+    find_run_boundaries,
+    find_runs,
+    split_listed_runs,
+    unpack_run_boundaries,
+)
 from synpick_warp.scenes.types import Camera
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.linear_algebra import matmul
@@ -312,13 +320,11 @@ def make_gt_entries(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, 
 
 def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
     """Convert quaternions x, y, z, w (N, 4) float64, of any length but zero, to rotation matrices (N, 3, 3)."""
-    x, y, z, w = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    unit = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
+    (xx, xy, xz, xw), (_, yy, yz, yw), (_, _, zz, zw) = unit[:3, None] * unit
+    matrix = 2 * np.stack((yy + zz, xy - zw, xz + yw, xy + zw, xx + zz, yz - xw, xz - yw, yz + xw, xx + yy), axis=-1)
+    matrix[:, ::4] = 1 - matrix[:, ::4]
+    return matrix.reshape(-1, 3, 3)
 
 
 def make_gt_info_entries(truth: ViewTruth) -> list[dict[str, Any]]:
@@ -353,6 +359,12 @@ def make_keypoints(view: EncodedView, keypoints: Mapping[int, Keypoints]) -> lis
     return project_keypoints(view.gt, view.camera, view.depth_image(), keypoints)
 
 
-def make_rle(runs: Runs, height: int, width: int) -> dict[str, Any]:
-    """Mask in COCO's uncompressed run-length encoding, which BOP uses as well."""
-    return {"counts": runs.counts(height, width), "size": [height, width]}
+def make_rle(runs: Runs, height: int, width: int) -> orjson.Fragment:
+    """Mask in COCO's uncompressed run-length encoding, which BOP uses as well, for `to_json`."""
+    return orjson.Fragment(_format_rle(runs, height, width))
+
+
+@cached_by_runs
+def _format_rle(runs: Runs, height: int, width: int) -> bytes:
+    """JSON of a mask's run lengths."""
+    return to_json({"counts": runs.counts(height, width), "size": [height, width]})

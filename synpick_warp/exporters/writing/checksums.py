@@ -10,9 +10,10 @@ import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, is_litter, write_atomically
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, checksum_line, is_litter, write_atomically
 from synpick_warp.system.inputs.paths import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
@@ -106,9 +107,18 @@ def _hash_file(path: Path | str, limit: int | None = None) -> tuple[str, int]:
         return digest.hexdigest(), size
 
 
+def spooled_checksums(out: Path, path: Path) -> Path:
+    """Temporary list of the `checksum_line`s of a committed file or folder whose format has hashed all as it wrote them."""
+    return out / PARTIAL / f"{quote(str(path), safe='')}.sha256"
+
+
 def write_checksums(out: Path, path: Path, part: Path) -> None:
-    """Writer task: hash a file, or all files in a folder, and write their SHA-256, sizes [bytes] and names to `part`, one file per line."""
-    part.write_bytes("".join(f"{digest} {size} {name}\n" for name, (digest, size) in _hash_files(out, (path,)).items()).encode())
+    """Writer task: write the `checksum_line`s of a file, or of all files in a folder, to `part`: those that its format has spooled, else
+    those of the files on disk."""
+    try:
+        spooled_checksums(out, path).rename(part)
+    except FileNotFoundError:
+        part.write_bytes("".join(checksum_line(*hashed, name) for name, hashed in _hash_files(out, (path,)).items()).encode())
 
 
 def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: dict[str, Any]) -> None:

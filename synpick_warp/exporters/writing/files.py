@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import shutil
 import tempfile
@@ -164,13 +165,18 @@ def sync_folder(folder: Path) -> None:
 class Folder:
     """Writer of many small files in one folder with the fewest system calls: openat relative to the folder's handle, write, close."""
 
-    def __init__(self, path: Path, handle: int) -> None:
+    def __init__(self, path: Path, handle: int, hashes: bool) -> None:
         self._path = path
         self._handle = handle
+        self._hashes = hashes
+        self.checksums: list[str] = []
+        """`checksum_line` of each written file, if the folder `hashes` them."""
 
-    def write(self, name: str, data: Buffer) -> None:
-        """Write a file. `name` is relative to the folder; subfolders in it must exist."""
+    def write(self, name: str, data: Buffer, digest: str = "") -> None:
+        """Write a file. `name` is relative to the folder; subfolders in it must exist. `digest`: its SHA-256, if known."""
         self._write(name, data, os.O_TRUNC)
+        if self._hashes:
+            self.checksums.append(checksum_line(digest or hashlib.sha256(data).hexdigest(), len(data), name))
 
     def append(self, name: str, data: Buffer) -> None:
         """Append to a file (O_APPEND). Processes may append at the same time: the bytes of one call stay contiguous."""
@@ -181,20 +187,28 @@ class Folder:
         try:
             handle = os.open(name, _WRITE | flag, 0o666, dir_fd=self._handle)
             try:
-                rest = memoryview(data).cast("B")
-                while rest:
-                    rest = rest[os.write(handle, rest) :]
+                written = os.write(handle, data)
+                while written < len(data):
+                    written += os.write(handle, memoryview(data)[written:])
             finally:
                 os.close(handle)
         except OSError as error:
             raise OSError(error.errno, error.strerror, str(self._path / name)) from error
 
 
+def checksum_line(digest: str, size: int, name: str) -> str:
+    """Line of a list of files before they are in the manifest: SHA-256 in hexadecimal, size [bytes] and name."""
+    return f"{digest} {size} {name}\n"
+
+
 @contextlib.contextmanager
-def open_folder(path: Path) -> Iterator[Folder]:
-    """Open a folder handle, so that the kernel resolves the folder's own path once instead of once a file."""
+def open_folder(path: Path, spool: str = "") -> Iterator[Folder]:
+    """Open a folder handle, so that the kernel resolves the folder's own path once instead of once a file. `spool`: file of the folder to
+    which the checksum lines of the written files are appended at the end; empty: they are not hashed."""
     handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        yield Folder(path, handle)
+        yield (folder := Folder(path, handle, bool(spool)))
+        if spool:
+            folder.append(spool, "".join(folder.checksums).encode())
     finally:
         os.close(handle)

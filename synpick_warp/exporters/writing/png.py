@@ -6,13 +6,14 @@ Equal pixels give equal bytes with one version of ISA-L on one type of CPU.
 from __future__ import annotations
 
 import functools
+import hashlib
 import struct
 
 import numpy as np
 from isal import isal_zlib
 
 from synpick_warp.exporters.writing.files import Buffer
-from synpick_warp.exporters.writing.rle import Runs
+from synpick_warp.exporters.writing.rle import Runs, cached_by_runs
 
 LEVEL = 1
 """ISA-L's level: on depth images, 0 makes files a third larger in the same time, 3 takes twice as long and gains nothing."""
@@ -126,6 +127,13 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     above, below = _blank_rows(runs.top, stride), _blank_rows(height - runs.top - rows, stride)
     data = b"".join((_ZLIB_HEADER, above, middle, below, _FINAL_BLOCK, _adler32(height * stride, total, moment)))
     return _assemble(width, height, 8, _GREY, data)
+
+
+@cached_by_runs
+def hashed_mask_png(runs: Runs, height: int, width: int) -> tuple[bytes, str]:
+    """File of `encode_mask_png`, and its SHA-256 in hexadecimal."""
+    data = encode_mask_png(runs, height, width)
+    return data, hashlib.sha256(data).hexdigest()
 
 
 @functools.cache

@@ -46,6 +46,8 @@ class WriteTask:
     """The file or folder that the task writes, for error messages."""
     on_done: Callable[[], None] | None = None
     """Callback after success, run in the caller's thread by a later call of the pool. It may submit tasks without images."""
+    affinity: int | None = None
+    """Tasks of equal numbers are run by the same process, if that is not busier than others: it may have cached parts of their files."""
 
 
 def _call(function: Callable[..., None], images: tuple[SharedArray, ...], arguments: tuple[Any, ...], memory: mmap.mmap) -> None:
@@ -64,6 +66,7 @@ class _QueuedTask:
     """Index of the slot that holds its images; None: it has no images."""
     copying: Future[None] | None
     """The thread's copy of the images in progress; None: they are in place."""
+    affinity: int | None
 
 
 class WriterPool:
@@ -126,7 +129,8 @@ class WriterPool:
         for task in tasks:
             slot = self._take_slot() if task.images else None
             images, copying = ((), None) if slot is None else self._slots.put(task.images, slot)
-            submitted.append(_QueuedTask(partial(_call, task.function, images, task.arguments), task.path, task.on_done, slot, copying))
+            call = partial(_call, task.function, images, task.arguments)
+            submitted.append(_QueuedTask(call, task.path, task.on_done, slot, copying, task.affinity))
             self._waiting.append(submitted[-1])
             self._progress(0.0)
             while len(self._waiting) > MAX_WAITING and not self._finishing:
@@ -216,7 +220,7 @@ class WriterPool:
             if self._pool.load() >= QUEUE_DEPTH or not (blocking or copying is None or copying.done()):
                 return
             _await_copy(self._waiting[0])
-            future = self._pool.submit(self._waiting[0].call, drain=False)
+            future = self._pool.submit(self._waiting[0].call, self._waiting[0].affinity, drain=False)
             self._running[future] = self._waiting.popleft()
             if future.done():  # A task of the calling process.
                 self._answered.append(future)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,6 +14,11 @@ from synpick_warp.codes import MAX_INSTANCES
 
 _ID_BITS = 8
 """Bits of an id in a packed boundary, see `FrameBatch.boundaries`."""
+_SIDE_BITS = 21
+"""Bits of a row or column in `Runs.key`: no codec takes images of more pixels a side."""
+_CACHED_MASKS = 4096
+"""Results that `cached_by_runs` keeps, at most: of two masks of each instance in some 200 views. Files at full HD take 40 MB."""
+_Result = TypeVar("_Result")
 
 
 @dataclass(eq=False, slots=True)
@@ -24,6 +32,8 @@ class Runs:
     """Row of the run's first pixel (N) int64."""
     past: np.ndarray
     """Row after the run's last pixel (N) int64."""
+    key: bytes
+    """The three in one, by which masks are compared."""
     count: int
     """Number of True pixels."""
     top: int
@@ -84,26 +94,35 @@ class RunBoundaries:
 
     def split_by_value(self, instances: Sequence[int]) -> list[Runs]:
         """Masks of the pixels that equal 1 + i for instances i, from one pass over the boundaries."""
-        begin, end = self._list_values(self.below), self._list_values(self.above)
-        bounds = np.searchsorted(begin, np.arange(max(instances, default=-1) + 2, dtype=begin.dtype) * self._places)
-        return _split_runs(_divide(begin, self._places)[1], end - begin, self.span, bounds, instances)
+        (instance, begin), (_, end) = self._list_values(self.below), self._list_values(self.above)
+        bounds = np.searchsorted(instance, np.arange(max(instances, default=-1) + 2, dtype=instance.dtype))
+        return _split_runs(begin, end - begin, self.span, bounds, instances)
 
-    def _make_keys(self, instance: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Sort keys, by instance and then by position (M): of 32 bits if they suffice, which NumPy sorts in half the time."""
-        kind = np.uint32 if MAX_INSTANCES * self._places < 1 << 32 else np.uint64
-        return instance.astype(kind, copy=False) * kind(self._places) + place.astype(kind, copy=False)
-
-    @property
-    def _places(self) -> int:
-        """Number of positions up to the last boundary: the range of keys that an instance takes."""
-        return 1 + int(self.place[-1]) if self.place.size else 1
-
-    def _list_values(self, values: np.ndarray) -> np.ndarray:
-        """List the boundaries beside which a value (N) denotes an instance, as sorted keys (M)."""
-        # Of unsigned integers, 0 - 1 is the largest.
-        instance = values.astype(np.uint32, copy=False) - np.uint32(1)
+    def _list_values(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """List the boundaries beside which a value (N) denotes an instance: instance and position, sorted by both (M)."""
+        instance = values - values.dtype.type(1)  # Of unsigned integers, 0 - 1 is the largest.
         listed = np.flatnonzero(instance < MAX_INSTANCES)
-        return np.sort(self._make_keys(instance[listed], self.place[listed]))
+        found = instance[listed]
+        order = np.argsort(found, kind="stable")  # By radix: instances are bytes.
+        return found[order], self.place[listed[order]]
+
+
+def cached_by_runs(function: Callable[[Runs, int, int], _Result]) -> Callable[[Runs, int, int], _Result]:
+    """Decorator: least-recently-used cache of a function of a mask and the image's height and width. While an object rests, its masks are
+    those of an earlier frame: 9 of 10 in mode pick, 3 of 10 in mode move."""
+    known: OrderedDict[tuple[bytes, int, int], _Result] = OrderedDict()
+
+    @functools.wraps(function)
+    def cached(runs: Runs, height: int, width: int) -> _Result:
+        key = runs.key, height, width
+        if key in known:
+            known.move_to_end(key)
+            return known[key]
+        while len(known) >= _CACHED_MASKS:
+            known.popitem(last=False)
+        return known.setdefault(key, function(runs, height, width))
+
+    return cached
 
 
 def split_listed_runs(places: np.ndarray, count: np.ndarray, height: int, instances: Sequence[int]) -> list[Runs]:
@@ -128,8 +147,9 @@ def _split_runs(begin: np.ndarray, length: np.ndarray, span: int, bounds: np.nda
         parts = ((np.add, length), (np.minimum, first), (np.maximum, past))
         measures[:, filled] = [operation.reduceat(values[:stop], starts) for operation, values in parts]
     rows = list(zip(bounds.tolist(), bounds[1:].tolist(), *measures.tolist(), strict=False))
-    chosen = (rows[instance] for instance in instances)
-    return [Runs(column[start:stop], first[start:stop], past[start:stop], *measured) for start, stop, *measured in chosen]
+    keys = (column << 2 * _SIDE_BITS) + (first << _SIDE_BITS) + past
+    parts = ((slice(start, stop), measured) for start, stop, *measured in map(rows.__getitem__, instances))
+    return [Runs(column[part], first[part], past[part], keys[part].tobytes(), *measured) for part, measured in parts]
 
 
 def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
@@ -140,7 +160,7 @@ def find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
 def unpack_run_boundaries(packed: np.ndarray, height: int) -> RunBoundaries:
     """Unpack run boundaries that the device has listed (2, N): column · (height + 1) + row; value above, and that below shifted by 8 bits;
     see `FrameBatch.boundaries`."""
-    return RunBoundaries(packed[0], height + 1, packed[1] & ((1 << _ID_BITS) - 1), packed[1] >> _ID_BITS)
+    return RunBoundaries(packed[0], height + 1, packed[1].astype(np.uint8), (packed[1] >> _ID_BITS).astype(np.uint8))
 
 
 def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBoundaries:

@@ -23,6 +23,8 @@ from synpick_warp.system.interpreter import open_standard_descriptors
 from synpick_warp.system.processes.worker import END_TIMEOUT, ProcessError, WorkerProcess, send, start_process
 
 _PROGRAM = "from synpick_warp.system.processes.pool import main; main()"
+_SLACK = 2
+"""Unanswered tasks that a process may have more than the least busy one and still be chosen by affinity."""
 _AHEAD = 8
 """Size of the reorder buffer of an ordered map [results per process]: while it is full, no further task is started."""
 
@@ -129,13 +131,13 @@ class WorkerPool:
         """Number of unanswered tasks of the least busy process."""
         return min(map(_load, self._workers), default=0)
 
-    def submit(self, task: Callable[[Any], Any], affinity: int = 0, *, drain: bool = True) -> TaskFuture:
+    def submit(self, task: Callable[[Any], Any], affinity: int | None = None, *, drain: bool = True) -> TaskFuture:
         """Send a task to the process with the fewest unanswered tasks; returns its future, which later calls of `receive`, `wait` and
         `submit` set.
 
         Args:
             task: The task; see `WorkerProgram`.
-            affinity: Among several such processes, equal numbers choose the same.
+            affinity: Equal numbers choose the same process, unless it has `_SLACK` more than another; None: any.
             drain: Receive available results first, so that a process that waits for its answer to be read takes the task. Needless if
                 the caller bounds the unanswered tasks, and both tasks and results are small.
 
@@ -152,8 +154,9 @@ class WorkerPool:
         message = pickle.dumps((task, False))
         if drain:
             self.receive(0.0)
-        first = affinity % len(self._workers)
-        worker = min(self._workers[first:] + self._workers[:first] if first else self._workers, key=_load)
+        worker = min(self._workers, key=_load)
+        if affinity is not None and _load(own := self._workers[affinity % len(self._workers)]) < _load(worker) + _SLACK:
+            worker = own
         worker.tasks.append(future)
         self._send(worker, message)
         return future

@@ -26,11 +26,12 @@ from synpick_warp.configs.cell.sensors import Effects
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
+from synpick_warp.exporters.bop.scene import CHECKSUMS, SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.shared.models import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from synpick_warp.exporters.writing.files import open_folder
+from synpick_warp.exporters.writing.checksums import spooled_checksums, write_checksums
+from synpick_warp.exporters.writing.files import PARTIAL, open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
@@ -192,25 +193,34 @@ def test_a_killed_writer_is_reported_and_committed_scenes_stay(tmp_path):
 def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
     settings = SceneSettings(ViewSettings(".jpg", 95, (), True, True, {}, (4, 3)), "train_pbr", range(3), ())
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
-        scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
+        scene, place = tmp_path / "hidden", Path("-".join(map(str, frames)))
         create_scene_folders(scene, ("rgb", "depth", "mask", "mask_visib"))
-        with open_folder(scene) as folder:
+        (tmp_path / PARTIAL).mkdir(exist_ok=True)
+        with open_folder(scene, CHECKSUMS) as folder:
             for frame in frames:
                 annotations = [b'{"of": %d}' % frame] * frame
                 folder.append(ANNOTATIONS, annotation_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
+                folder.write(f"rgb/{frame}.jpg", b"%d" % frame)
         if frames != (2, 0, 1):
             with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
-                commit_scenes(((scene, place),), (settings,))
-            assert not place.exists()
+                commit_scenes(((scene, place),), tmp_path, (settings,))
+            assert not (tmp_path / place).exists()
             shutil.rmtree(scene)
             continue
-        commit_scenes(((scene, place),), (settings,))
+        commit_scenes(((scene, place),), tmp_path, (settings,))
+        known, place = spooled_checksums(tmp_path, place).read_text(), tmp_path / place
+        write_checksums(tmp_path, place.relative_to(tmp_path), tmp_path / "spooled")
+        assert not spooled_checksums(tmp_path, place.relative_to(tmp_path)).exists()
+        write_checksums(tmp_path, place.relative_to(tmp_path), tmp_path / "hashed")
+        for name in ("spooled", "hashed"):
+            assert sorted((tmp_path / name).read_text().splitlines()) == sorted(known.splitlines())
         assert load(place / "scene_camera.json") == {str(frame): {"view": frame} for frame in range(3)}
         assert list(load(place / "scene_gt_info.json").items()) == [(str(frame), [1]) for frame in range(3)]
         assert load(place / "scene_gt_coco.json")["annotations"] == [
             {"id": number, "of": frame} for number, frame in ((1, 1), (2, 2), (3, 2))
         ]
         assert not (place / ANNOTATIONS).exists()
+        assert not (place / CHECKSUMS).exists()
 
 
 def test_bop_models_are_copied_byte_for_byte(tmp_path):

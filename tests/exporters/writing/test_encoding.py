@@ -3,6 +3,7 @@ encoding: runs of masks from run boundaries of images, and COCO's counts."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import zlib
 
@@ -16,8 +17,8 @@ from PIL import Image
 from pycocotools import mask as coco
 
 from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.exporters.writing import png
-from synpick_warp.exporters.writing.png import HEAD, Deflater, encode_mask_png, encode_png
+from synpick_warp.exporters.writing import png, rle
+from synpick_warp.exporters.writing.png import HEAD, Deflater, encode_mask_png, encode_png, hashed_mask_png
 from synpick_warp.exporters.writing.rle import RunBoundaries, Runs, find_run_boundaries, find_runs, split_listed_runs
 from synpick_warp.testing.box_views import pack_masks
 from synpick_warp.views.frames import most_words, unpack_mask
@@ -86,6 +87,23 @@ def test_masks_are_encoded_at_their_place(data):
     with Image.open(io.BytesIO(stream)) as image:
         image.load()
         np.testing.assert_array_equal(np.asarray(image), full)
+
+
+@pytest.mark.parametrize("size", [1, 3, 100])
+def test_cached_files_are_those_of_the_encoder_whatever_came_before(size, monkeypatch):
+    """Masks of several episodes in turns, of images of two sizes, with and without room for all."""
+    monkeypatch.setattr(rle, "_CACHED_MASKS", size)
+    encoded: list[Runs] = []
+    monkeypatch.setattr(png, "encode_mask_png", lambda runs, *size: encoded.append(runs) or encode_mask_png(runs, *size))
+    draw = np.random.default_rng(0).integers
+    masks = [find_runs(mask) for mask in draw(0, 2, (8, 5, 4), np.uint8)] + [find_runs(np.zeros((5, 4), np.uint8))]
+    calls = [
+        (masks[index], 5 + taller, 4 + taller) for index, taller in zip(draw(0, 9, 200).tolist(), draw(0, 2, 200).tolist(), strict=True)
+    ]
+    for call in calls:
+        data = encode_mask_png(*call)
+        assert hashed_mask_png(*call) == (data, hashlib.sha256(data).hexdigest())
+    assert len(encoded) > 18 if size < 18 else len(encoded) <= 18
 
 
 UNSUPPORTED = (np.zeros((2, 2)), np.zeros((2, 2, 2), np.uint16), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 3), np.uint8))
@@ -218,6 +236,8 @@ def test_packed_and_listed_masks_become_the_same_runs(masks, instances):
             np.testing.assert_array_equal(paint(one, height, width), masks[instance])
             assert one.count == masks[instance].sum()
             assert (one.top, one.bottom) == (runs.top, runs.bottom)
+            same = [np.array_equal(masks[instance], masks[other]) for other in chosen]
+            assert [one.key == other.key for other in listed] == same
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

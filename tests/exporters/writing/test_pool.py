@@ -40,6 +40,10 @@ def note(path: Path, text: str) -> None:
         file.write(text)
 
 
+def note_process(path: Path) -> None:
+    note(path, f"{os.getpid()} ")
+
+
 def fill_the_disk(path: Path) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
@@ -200,6 +204,20 @@ def test_a_full_queue_blocks_the_caller(tmp_path):
         threading.Timer(0.1, gate.touch).start()
         pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)  # Returns when a slot is free, so not before the gate opens.
         assert gate.exists()
+
+
+def test_a_task_goes_to_the_process_of_its_affinity_unless_others_are_idle(tmp_path):
+    gate = tmp_path / "gate"
+    with WriterPool(2, SIZE) as pool:
+        for _ in range(6):
+            pool.submit_all(WriteTask(note_process, (), (tmp_path / str(number),), tmp_path, affinity=number) for number in (4, 7, 6))
+            pool.wait()
+        first, second, third = ((tmp_path / str(number)).read_text().split() for number in (4, 7, 6))
+        assert (len(set(first)), len(set(second))) == (1, 1)
+        assert first == third != second
+        pool.submit_all(WriteTask(wait_for, (), (gate,), tmp_path, affinity=4) for _ in range(4))
+        assert sorted(len(worker.tasks) for worker in pool._pool._workers) == [1, 3]
+        gate.touch()
 
 
 def test_abort_kills_running_processes(tmp_path):

@@ -107,9 +107,9 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: Seque
             blocks = AnnotationBlocks(file)
             blocks.check_frames(scene, own)
             known = set(blocks.frames)
-            lines = [next(blocks.read(frame, 0, 1)) if frame in known else "null" for frame in range(max(known, default=-1) + 1)]
+            lines = [next(blocks.read(frame, 0, 1)) if frame in known else b"null" for frame in range(max(known, default=-1) + 1)]
         part = scene.with_name(f"{scene.name}.part")
-        write_synced(part, "".join(f"{line}\n" for line in lines).encode())
+        write_synced(part, b"".join(b"%s\n" % line for line in lines))
         (scene / ANNOTATIONS).unlink()
         sync_folder(scene)
         part.rename(out / PARTS / f"{scene_id:06d}.jsonl")
