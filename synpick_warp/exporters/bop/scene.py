@@ -5,10 +5,8 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +21,7 @@ from synpick_warp.exporters.bop.graph import GRAPH_FILE, FrameSupport, find_occl
 from synpick_warp.exporters.bop.picks import PICKS, format_picks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
 from synpick_warp.exporters.writing.checksums import spooled_checksums
-from synpick_warp.exporters.writing.files import Buffer, checksum_line, open_folder, sync_folder
+from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
 from synpick_warp.exporters.writing.png import hashed_mask_png
 from synpick_warp.exporters.writing.rle import Masks
 from synpick_warp.views.layer_codec import layer_path
@@ -135,14 +133,14 @@ def complete_scene(scene: Path, place: Path, settings: SceneSettings) -> str:
         blocks.check_frames(scene, settings.images)
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
-            sums.append(_write_lines(scene / name, _format_keyed(blocks, index)))
+            sums.append(write_synced(scene / name, _format_keyed(blocks, index)))
         if settings.view.graph:
-            sums.append(_write_lines(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports))))
+            sums.append(write_synced(scene / GRAPH_FILE, _format_keyed(blocks, len(names), partial(_complete_graph, settings.supports))))
         if settings.view.coco:
-            sums.append(_write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.view.graph, settings)))
+            sums.append(write_synced(scene / "scene_gt_coco.json", _format_coco(blocks, len(names) + settings.view.graph, settings)))
         if (scene / PICKS).exists():
             lines = format_picks(scene / PICKS, blocks.camera, settings.view.resolution)
-            sums.append(_write_lines(scene / "scene_picks.json", map(str.encode, lines)))
+            sums.append(write_synced(scene / "scene_picks.json", map(str.encode, lines)))
             (scene / PICKS).unlink()
     with (scene / CHECKSUMS).open(encoding="ascii") as file:
         sums += file
@@ -246,18 +244,6 @@ def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
         "coco_url": "",
         "flickr_url": "",
     }
-
-
-def _write_lines(path: Path, parts: Iterable[bytes]) -> str:
-    """Write text parts to a file, and sync it to the disk; returns its checksum line."""
-    digest, size = hashlib.sha256(), 0
-    with path.open("wb") as file:
-        for part in parts:
-            digest.update(part)
-            size += file.write(part)
-        file.flush()
-        os.fsync(file.fileno())
-    return checksum_line(digest.hexdigest(), size, path.name)
 
 
 def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, out: Path, settings: tuple[SceneSettings, ...]) -> None:

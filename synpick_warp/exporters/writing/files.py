@@ -126,12 +126,16 @@ def write_atomically(path: Path, data: bytes | Iterable[bytes]) -> None:
     sync_folder(path.parent)
 
 
-def write_synced(path: Path, data: bytes | Iterable[bytes]) -> None:
-    """Write a file, given whole or in pieces, and fsync it."""
+def write_synced(path: Path, data: bytes | Iterable[bytes], folder: Path = Path()) -> str:
+    """Write a file, given whole or in pieces, and fsync it; returns its `checksum_line`, in that folder."""
+    digest, size = hashlib.sha256(), 0
     with path.open("wb") as file:
-        file.writelines([data] if isinstance(data, bytes) else data)
+        for piece in [data] if isinstance(data, bytes) else data:
+            digest.update(piece)
+            size += file.write(piece)
         file.flush()
         os.fsync(file.fileno())
+    return checksum_line(digest.hexdigest(), size, str(folder / path.name))
 
 
 def join_lines(parts: Iterable[Path], begin: bytes, end: bytes) -> Iterator[bytes]:

@@ -78,7 +78,8 @@ class ShardsExporter(SceneExporter):
         return (path.relative_to(self._out) for scene in self.scene_ids(episode) for path in find_shards(scene, self._folder(scene)))
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], images: SceneImages) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._folder(scenes[0][1]), images, tuple(view.layers for view in self._views))
+        split = self._folder(scenes[0][1]).relative_to(self._out)
+        return commit_shards, (scenes, self._out, split, images, tuple(view.layers for view in self._views))
 
 
 def _write_keys(out: Path, name: str, split: Path, pool: WriterPool, scenes: Sequence[int]) -> SplitContent:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import tarfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -16,7 +15,8 @@ from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import ViewSettings, make_rle, to_json
-from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder
+from synpick_warp.exporters.writing.checksums import spooled_checksums
+from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.tar_files import list_members
 
@@ -25,8 +25,6 @@ MAX_SHARD_VIEWS = 1000
 END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)
 """End-of-archive marker of a tar file (POSIX.1-1988, section 10.1.1)."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
-_COPY_BYTES = 1 << 20
-"""Size of a copy block [B]."""
 
 
 def shard_name(scene: int, part: int) -> str:
@@ -75,10 +73,11 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
 
 
 def commit_shards(
-    scenes: tuple[tuple[Path, int], ...], split: Path, images: Sequence[Sequence[int]], layers: Sequence[Sequence[str]]
+    scenes: tuple[tuple[Path, int], ...], out: Path, split: Path, images: Sequence[Sequence[int]], layers: Sequence[Sequence[str]]
 ) -> None:
-    """Task: concatenate the views and layers of an episode's scenes, (staging folder, scene_id), into shards, synced to disk, and rename
-    these to their places in the split's folder; raises OutputError unless each scene has all its images (im_id, ascending) and layers."""
+    """Task: concatenate the views and layers of an episode's scenes, (staging folder, scene_id), into shards, synced to disk, rename these
+    to their places in the split's folder, and spool their checksums; raises OutputError unless each scene has all its images (im_id,
+    ascending) and layers."""
     complete: list[tuple[Path, Path]] = []
     for (scene, scene_id), own, shown in zip(scenes, images, layers, strict=True):
         views = [[str(frame), *(f"{frame}.{name}" for name in shown)] for frame in own]
@@ -87,22 +86,21 @@ def commit_shards(
             raise OutputError(f"{scene} does not have {len(own)} whole frames; this is an error of synpick-warp, please report it")
         for part, begin in enumerate(range(0, len(own), MAX_SHARD_VIEWS)):
             shard = scene / shard_name(scene_id, part)
-            _concatenate(shard, [scene / name for view in views[begin : begin + MAX_SHARD_VIEWS] for name in view])
-            complete.append((shard, split / shard.name))
+            place = split / shard.name
+            pieces = (scene / name for view in views[begin : begin + MAX_SHARD_VIEWS] for name in view)
+            spooled_checksums(out, place).write_text(write_synced(shard, _join_pieces(pieces), split), encoding="utf-8")
+            complete.append((shard, out / place))
     for shard, place in complete:
         shard.rename(place)
-    sync_folder(split)
+    sync_folder(out / split)
 
 
-def _concatenate(shard: Path, pieces: list[Path]) -> None:
-    """Concatenate files of tar entries to a tar file; each is removed at once, so that little disk space is used twice."""
-    with shard.open("wb", buffering=0) as target:
-        for piece in pieces:
-            with piece.open("rb", buffering=0) as source:
-                shutil.copyfileobj(source, target, _COPY_BYTES)
-            piece.unlink()
-        target.write(END_OF_ARCHIVE)
-        os.fsync(target.fileno())
+def _join_pieces(pieces: Iterable[Path]) -> Iterator[bytes]:
+    """Content of a tar file from files of its entries; each is removed once it is written, so that little disk space is used twice."""
+    for piece in pieces:
+        yield piece.read_bytes()
+        piece.unlink()
+    yield END_OF_ARCHIVE
 
 
 def find_shards(scene: int, split: Path) -> Iterator[Path]:
