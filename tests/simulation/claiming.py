@@ -21,6 +21,7 @@ from synpick_warp.dataset.commit.manifest import encode_manifest, episode_entry,
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe
+from synpick_warp.system.stores import store
 from synpick_warp.system.stores.store import Store
 from tests.cloud.conftest import tiny
 from tests.simulation.faulty_store import DELAYED, LOST, REFUSED, FaultyStore, Write
@@ -56,7 +57,8 @@ class Report(NamedTuple):
 
 
 def without_formats(patch: pytest.MonkeyPatch) -> None:
-    """Finalize by marks alone, and write manifest and settings once: their formats are tested elsewhere, and take most of the time."""
+    """Finalize by marks alone, and make manifest, settings and messages once: tested elsewhere, they take most of the time."""
+    patch.setattr(store, "describe_fault", str)
     patch.setattr(run, "finalize_store", _finalize)
     patch.setattr(ledger, "make_manifest", lambda config: MANIFEST)
     patch.setattr(ledger, "config_to_toml", lambda config: SETTINGS)
