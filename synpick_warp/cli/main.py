@@ -18,7 +18,7 @@ from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate
 from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
-from synpick_warp.cli.commands.validate import validate, verify
+from synpick_warp.cli.commands.validate import prove, validate, verify
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
 from synpick_warp.cli.options import (
     EXAMPLES,
@@ -292,6 +292,7 @@ app.command(convert)
 app.command(show_statistics, name="stats")
 app.command(validate)
 app.command(verify)
+app.command(prove)
 app.command(write_page, name="report")
 for _name, _lines in EXAMPLES.items():
     app[_name].help_epilogue = "\n".join(["Examples:", "", "```", *(f"{NAME} {line}" for line in _lines), "```"])

@@ -170,6 +170,7 @@ EXAMPLES = {
     "stats": ("stats DATA", "stats DATA --paper"),
     "validate": ("validate DATA", "validate REAL --tolerance 5,2"),
     "verify": ("verify DATA",),
+    "prove": ("prove DATA --share 0.01",),
     "report": ("report DATA",),
 }
 """Example command lines by name of the command, without the program's name, which `--help` prints below the options."""

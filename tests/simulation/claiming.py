@@ -20,8 +20,8 @@ from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, episode_entry, make_manifest
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
-from synpick_warp.system.stores.opening import Probe
 from synpick_warp.system.stores import store
+from synpick_warp.system.stores.opening import Probe
 from synpick_warp.system.stores.store import Store
 from tests.cloud.conftest import tiny
 from tests.simulation.faulty_store import DELAYED, LOST, REFUSED, FaultyStore, Write

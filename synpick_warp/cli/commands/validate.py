@@ -1,4 +1,4 @@
-"""Commands `validate` and `verify`: check a BOP data set by all rules, and poses against re-rendered views; checksums."""
+"""Commands `validate`, `verify` and `prove`: rules of BOP data sets, and poses against re-rendered views; checksums; replication."""
 
 from __future__ import annotations
 
@@ -167,3 +167,31 @@ def verify(
     if not verdict.finished:
         print("the data set is not finished: the command that started it resumes it")
     return 0 if verdict.finished else EXIT_INCOMPLETE
+
+
+def prove(
+    folder: DataSetArgument = None,
+    /,
+    *,
+    share: Annotated[float, Parameter(help="Share of the episodes, above 0 to 1; at least one is baked.")] = 0.01,
+    seed: Annotated[WholeNumber, Parameter(help="Seed by which they are drawn.")] = 0,
+    device: Annotated[str | None, Parameter(help="Device that bakes, such as cuda:0 (default: that of the settings).")] = None,
+) -> int:
+    """Bake a share of a data set's episodes again, in a temporary folder, and compare their files byte by byte.
+
+    Exit codes: 0, all are equal; 1, a file differs (it is named); 2, it cannot be compared here, as with other versions or objects.
+    """
+    if not 0.0 < share <= 1.0:
+        raise ConfigError(f"--share is {share:g}; allowed: above 0, to 1")
+    place = find_data_set(folder, "synpick-warp prove DIR")
+    from synpick_warp.apps.validation.proof import prove as bake_again
+    from synpick_warp.cli.display import make_console, make_progress
+
+    with make_progress(make_console()) as progress:
+        proof = bake_again(place, share, seed, progress, device)
+    episodes = f"{len(proof.episodes):,} episode{'' if len(proof.episodes) == 1 else 's'}"
+    if proof.problem:
+        print(proof.problem)
+        return EXIT_VIOLATIONS
+    print(f"{episodes} baked again, {proof.files:,} files compared: all are equal")
+    return 0

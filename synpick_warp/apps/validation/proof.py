@@ -1,0 +1,89 @@
+"""Proof of a data set by replication: a random share of its episodes is baked again from the recorded settings, and compared by bytes.
+
+On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from synpick_warp.dataset.commit.manifest import (
+    CONSTANTS,
+    MANIFEST_FILE,
+    committed_episodes,
+    describe_differences,
+    episode_entry,
+    make_manifest,
+    read_checksums,
+    read_manifest,
+    read_settings,
+)
+from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.exporters.writing.checksums import checksum
+from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.system.progress import Progress
+
+
+class Proof(NamedTuple):
+    """Result of a proof: episodes that were baked again, their files, and the first difference (empty: none)."""
+
+    episodes: list[int]
+    files: int
+    """Files of these episodes and constants, as far as they were compared."""
+    problem: str
+
+
+def prove(folder: Path, share: float, seed: int, progress: Progress, device: str | None = None) -> Proof:
+    """Bake a share of the episodes again in a temporary folder, at least one, drawn by `seed`, and compare all of their files.
+
+    `device`: None, that of the settings. Raises DatasetError: the folder is not a data set, has no episodes, or is of other versions;
+    ConfigError: its objects or lights are not those of the bake; SynpickError as the bake.
+    """
+    manifest = read_manifest(folder)
+    config = read_settings(folder, manifest).with_values({"bake.device": device} if device else {})
+    if said := describe_differences(make_manifest(config), manifest):
+        raise DatasetError(f"{folder} cannot be proved here: {said}; only the same versions bake the same bytes")
+    known = committed_episodes(folder)
+    if not known:
+        raise DatasetError(f"{folder} has no episodes yet; resume its bake first")
+    drawn = sorted(random.Random(seed).sample(known, math.ceil(share * len(known)) or 1))
+    with tempfile.TemporaryDirectory(prefix="synpick-prove-") as name:
+        again = Path(name) / folder.resolve().name
+        again.mkdir()
+        (again / MANIFEST_FILE).write_bytes((folder / MANIFEST_FILE).read_bytes())  # Its digests of objects and lights are compared.
+        try:
+            summary = bake_episodes(with_measures(config, ()), again, progress, drawn, deliver=lambda: None)
+        except SynpickError as error:
+            raise type(error)(str(error).replace(str(again), str(folder))) from error
+        if summary.stopped:
+            raise DatasetError(f"the proof of {folder} was interrupted: nothing was compared")
+        return _compare(folder, again, drawn)
+
+
+def _compare(folder: Path, again: Path, episodes: list[int]) -> Proof:
+    """Compare constants and episodes of two data sets, up to the first difference."""
+    files = 0
+    for entry in (CONSTANTS, *map(episode_entry, episodes)):
+        then, now = (read_checksums(each, entry) for each in (folder, again))
+        for name in sorted(then | now):
+            files += 1
+            if then.get(name) != now.get(name) or not (folder / name).is_file():
+                return Proof(episodes, files, _describe(folder / name, again / name, then.get(name)))
+        if (folder / f"{entry}.json").read_bytes() != (again / f"{entry}.json").read_bytes():
+            return Proof(episodes, files, f"{folder / entry}.json differs from that of a new bake, but no file that it lists")
+    return Proof(episodes, files, "")
+
+
+def _describe(path: Path, again: Path, recorded: str | None) -> str:
+    """Describe how a file differs from that of a new bake."""
+    if recorded is None or not again.is_file():
+        return f"{path} is not in the data set, but in a new bake" if recorded is None else f"{path} is not in a new bake"
+    if not path.is_file() or checksum(path) != recorded:
+        return f"{path} is missing, or has changed since it was written"
+    old, new = path.read_bytes(), again.read_bytes()
+    place = next((index for index, pair in enumerate(zip(old, new, strict=False)) if pair[0] != pair[1]), min(len(old), len(new)))
+    return f"{path} differs from byte {place:,} on: {len(old):,} bytes here, {len(new):,} in a new bake"

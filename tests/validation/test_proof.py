@@ -1,0 +1,67 @@
+"""Proofs by replication: the episodes that a seed draws are baked again; what differs is named, and so is what cannot be compared."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.apps.validation.proof import prove
+from synpick_warp.dataset.commit import manifest
+from synpick_warp.system.progress import SilentProgress
+from tests.builders import boxes, mistake, run
+from tests.worlds.small_worlds import CUBE, catalog
+
+
+@pytest.fixture
+def copy(picked_set, tmp_path) -> Path:
+    """A copy of the shared data set, which a test may change."""
+    return shutil.copytree(picked_set, tmp_path / "set")
+
+
+def test_a_data_set_proves_itself(picked_set):
+    with boxes():
+        found = run("prove", picked_set, "--share", 1.0)
+        drawn = {tuple(prove(picked_set, 0.01, seed, SilentProgress()).episodes) for seed in range(3)}
+    assert found.code == 0
+    last = found.out.splitlines()[-1]
+    assert last.startswith("2 episodes baked again, ")
+    assert last.endswith(" files compared: all are equal")
+    assert all(len(episodes) == 1 for episodes in drawn)
+    assert len(drawn) == 2
+
+
+def _recorded(path: Path, folder: Path) -> None:
+    """Change the last byte of a file, and its record, as if the bake had written so."""
+    before = hashlib.sha256(path.read_bytes()).hexdigest()
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    for lines in (folder / "manifest").glob("0*.sha256"):
+        lines.write_text(lines.read_text().replace(before, hashlib.sha256(path.read_bytes()).hexdigest()))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda path, folder: path.unlink(), "is missing, or has changed"),
+        (_recorded, "differs from byte "),
+    ],
+)
+def test_a_difference_is_named(copy, change, said):
+    path = next(iter(sorted((copy / "train").rglob("mask_visib/*.png"))))
+    change(path, copy)
+    with boxes():
+        found = run("prove", copy, "--share", 1.0)
+    assert found.code == 1
+    assert found.out.splitlines()[-1].startswith(f"{path} {said}")
+
+
+def test_what_cannot_be_compared_is_one_line(copy, tmp_path, monkeypatch):
+    for share in (0.0, 1.5):
+        assert "allowed: above 0, to 1" in mistake("prove", copy, "--share", share)
+    with boxes(lambda: catalog(CUBE)):
+        assert f"{copy} was started with other objects" in mistake("prove", copy)
+    monkeypatch.setattr(manifest, "_version", lambda name: "0.0")
+    assert "only the same versions bake the same bytes" in mistake("prove", copy)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set"]
