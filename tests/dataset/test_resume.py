@@ -24,7 +24,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.testing.exporters import digests
 from tests.builders import mistake, run
-from tests.harness.bake_server import TINY, TINY_PICKS, BakeServer
+from tests.harness.bake_server import TINY, BakeServer
 from tests.harness.processes import kill_after, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 6))
@@ -80,50 +80,6 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
             assert digests(out) == expected
             finished += 1
             longest = min(longest, 2.0 * (time.monotonic() - started))
-
-
-@pytest.fixture(scope="module")
-def changes(server, whole, tmp_path_factory) -> int:
-    """Number of changes to its folder by an undisturbed bake."""
-    folder = tmp_path_factory.mktemp("counted")
-    assert server.bake(folder / "set", alone=True, count=str(folder / "count")) == 0
-    assert digests(folder / "set") == digests(whole)
-    return int((folder / "count").read_text())
-
-
-@pytest.mark.parametrize("share", [0.4, pytest.param(0.995, marks=pytest.mark.slow)])
-def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected, changes, tmp_path, share):
-    """Killed, resumed, killed again and resumed. One process writes all files (`alone`), so that the places are known."""
-    out = tmp_path / "set"
-    assert server.bake(out, alone=True, kill_at=1 + round(share * changes)) == -signal.SIGKILL
-    server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
-    assert server.bake(out, alone=True) == 0
-    assert digests(out) == expected
-
-
-@pytest.mark.slow
-def test_a_killed_bake_has_the_same_tables_of_picks(server, tmp_path):
-    """Killed when some episodes are committed, and resumed, in other numbers of worlds and of trials at once."""
-    whole, out = tmp_path / "whole", tmp_path / "set"
-    other = {"settings": TINY_PICKS | {"bake.worlds": 1, "picks.worlds": 3}, "rounds": 0}
-    assert server.bake(whole, settings=TINY_PICKS, alone=True, count=str(tmp_path / "count")) == 0
-    changes = int((tmp_path / "count").read_text())
-    assert server.bake(out, **other, alone=True, kill_at=round(0.6 * changes)) == -signal.SIGKILL
-    assert 0 < len(committed_episodes(out)) < EPISODES
-    assert server.bake(out, **other) == 0
-    tables = [{name: digest for name, digest in digests(folder).items() if name.startswith(("picks", "train"))} for folder in (whole, out)]
-    assert sum(name.endswith(".parquet") for name in tables[0]) == 2 * EPISODES
-    assert tables[1] == tables[0]
-
-
-def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expected, changes, tmp_path):
-    out = tmp_path / "set"
-    # Before `.partial` is emptied; two changes would follow: its removal, and an attempt to remove the data set's folder.
-    assert server.bake(out, alone=True, kill_at=changes - 2) == -signal.SIGKILL
-    assert verify(out).finished
-    assert digests(out) != expected
-    assert server.bake(out) == 0
-    assert digests(out) == expected
 
 
 @pytest.mark.slow
@@ -271,17 +227,6 @@ def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
     assert server.wait() == 130
     assert server.bake(out) == 0
     assert digests(out) == expected
-
-
-@pytest.mark.slow
-def test_scenes_of_several_sensors_are_whole_after_kills(server, tmp_path):
-    """A scene brings the files of all cameras together by many renames, some of which a kill prevents."""
-    whole, out, count = tmp_path / "whole", tmp_path / "set", tmp_path / "count"
-    assert server.bake(whole, settings=SENSORS, alone=True, count=str(count)) == 0
-    for share in (0.5, 0.3):
-        assert server.bake(out, settings=SENSORS, alone=True, kill_at=round(share * int(count.read_text()))) == -signal.SIGKILL
-    assert server.bake(out, settings=SENSORS) == 0
-    assert digests(out) == digests(whole)
 
 
 # ---- when something fails ----

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import itertools
 import json
 import os
 import resource
-import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 from tests.worlds.small_worlds import QUICK, QUICK_PICKS, catalog
@@ -53,8 +50,6 @@ TINY_PICKS = QUICK_PICKS | {
 """Overrides on top of TINY: short attempts, and few trials from a state."""
 _PERTURB = -6
 """M_PERTURB of glibc's malloc.h."""
-_EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree")
-"""Audit events of changes to a folder (sys.addaudithook)."""
 
 
 class BakeServer:
@@ -165,12 +160,8 @@ def _prepare(request: dict) -> None:
             return pool
 
         pipeline.WriterPool = make_inline_pool
-    if "kill_at" in request:
-        _watch(request["out"], lambda number: os.kill(os.getpid(), signal.SIGKILL) if number == request["kill_at"] else None)
     if "allocated" in request:
         _fill_allocations(request["allocated"])
-    if "count" in request:
-        _watch(request["out"], lambda number: Path(request["count"]).write_text(str(number)))
 
 
 def _fill_allocations(value: int) -> None:
@@ -187,18 +178,6 @@ def _fill_allocations(value: int) -> None:
     os.environ["MALLOC_PERTURB_"] = str(perturb)
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_PERTURB, perturb)
-
-
-def _watch(out: str, at_change: Callable[[int], object]) -> None:
-    """Call with the number of each change to the data set's folder, before it is made."""
-    numbers = itertools.count(1)
-
-    def watch(event: str, arguments: tuple) -> None:
-        reads = event == "open" and arguments[1] in ("r", "rb", None)
-        if event in _EVENTS and str(arguments[0]).startswith(out) and not reads:
-            at_change(next(numbers))
-
-    sys.addaudithook(watch)
 
 
 if __name__ == "__main__":

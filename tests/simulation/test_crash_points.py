@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -28,25 +30,32 @@ from tests.simulation.faulty_store import FaultyStore
 from tests.simulation.scheduler import Dead, Process, Simulation
 
 CONFIG = scripted_bake.small_settings()
+SENSORS = scripted_bake.settings(2, ("bop",)).with_values({"bop.layout": "multisensor", "bop.keypoints": 4, "bop.coco": False})
+PICKS = scripted_bake.settings(2, ("bop", "picks"))
 EVERY = 16
-"""Crash points are tested in this many turns: the first with the fast tests, the others with the slow ones."""
-TURNS = [0, *(pytest.param(turn, marks=pytest.mark.slow) for turn in range(1, EVERY))]
+"""Crash points are tested in this many turns: the first with the fast tests, of some cases the others with the slow ones."""
+
+
+BAKES = {
+    "new": (lambda out: None, lambda out: scripted_bake.bake(out, CONFIG)),
+    "resumed": (lambda out: scripted_bake.bake(out, CONFIG, stop_after=1), lambda out: scripted_bake.bake(out, CONFIG)),
+    "several sensors": (lambda out: None, lambda out: scripted_bake.bake(out, SENSORS)),
+    "picks": (lambda out: None, lambda out: scripted_bake.bake(out, PICKS, picks=True)),
+}
+"""What is there before, and the bake that crashes and is repeated, by name."""
+
+
+def turns(*cases: str, all_of: str) -> list[Any]:
+    """Rows (case, turn): the first turn of each case, and all turns of one; SYNPICK_CRASH_POINTS=all: of each."""
+    rows = [(case, turn) for turn in range(EVERY) for case in cases if turn == 0 or case == all_of or "SYNPICK_CRASH_POINTS" in os.environ]
+    return [pytest.param(*row, marks=[pytest.mark.slow] * (row[1] > 0)) for row in rows]
 
 
 @pytest.fixture(scope="session")
 def expected(tmp_path_factory) -> dict[str, bytes]:
     """Files of an undisturbed bake."""
-    folder, _ = once(tmp_path_factory, "crash-points", _bake)
+    folder, _ = once(tmp_path_factory, "crash-points", BAKES["new"][1])
     return files(folder)
-
-
-def _bake(out: Path) -> None:
-    scripted_bake.bake(out, CONFIG)
-
-
-def _begin(out: Path) -> None:
-    """Leave a bake that was stopped after its first episode."""
-    scripted_bake.bake(out, CONFIG, stop_after=1)
 
 
 def crash(folder: Path, prepare: Callable[[Path], object], change: Callable[[Path], object], turn: int, *, power: bool) -> dict[int, Path]:
@@ -66,19 +75,19 @@ def crash(folder: Path, prepare: Callable[[Path], object], change: Callable[[Pat
     return left
 
 
-@pytest.mark.parametrize("turn", TURNS)
-@pytest.mark.parametrize("power", [False, True], ids=["killed", "power cut"])
-@pytest.mark.parametrize("prepare", [lambda out: None, _begin], ids=["new", "resumed"])
-def test_a_bake_may_end_at_any_change_to_its_folder(tmp_path, expected, prepare, power, turn):
-    for number, out in crash(tmp_path, prepare, _bake, turn, power=power).items():
-        _bake(out)
-        assert files(out) == expected, number
+@pytest.mark.parametrize(("case", "turn"), turns(*BAKES, "new, power cut", all_of="new"))
+def test_a_bake_may_end_at_any_change_to_its_folder(tmp_path, case, turn):
+    name, _, power = case.partition(", ")
+    prepare, bake = BAKES[name]
+    for number, out in crash(tmp_path, prepare, bake, turn, power=bool(power)).items():
+        bake(out)
+        assert files(out) == files(tmp_path / "counted"), number
         assert verify(out).finished
         shutil.rmtree(out)
 
 
-@pytest.mark.parametrize("turn", TURNS)
-def test_a_merge_may_end_at_any_change_to_its_folder(tmp_path, expected, turn):
+@pytest.mark.parametrize(("case", "turn"), turns("merge", all_of="merge"))
+def test_a_merge_may_end_at_any_change_to_its_folder(tmp_path, expected, case, turn):
     """Its parts stay as they are, and nothing that it leaves is taken for a data set."""
     parts = [tmp_path / "parts" / str(number) for number in range(2)]
     for number, part in enumerate(parts):
@@ -104,10 +113,11 @@ BUGS = {
 @pytest.mark.parametrize("bug", BUGS)
 def test_a_planted_bug_of_a_folder_is_found(tmp_path, expected, monkeypatch, bug):
     BUGS[bug](monkeypatch)
-    left = crash(tmp_path, lambda out: None, _bake, 0, power=True)
+    prepare, bake = BAKES["new"]
+    left = crash(tmp_path, prepare, bake, 0, power=True)
     with pytest.raises((AssertionError, DatasetError)):  # noqa: PT012
         for out in left.values():
-            _bake(out)
+            bake(out)
             assert files(out) == expected
 
 
@@ -137,11 +147,12 @@ class Workers:
         return {key: data for key, (data, _) in self.store.objects.items() if not key.startswith(f"{CONTROL}/")}
 
 
-@pytest.mark.parametrize(("faults", "claim"), [({}, False), (FAULTS, True)], ids=["one worker", "claiming, requests fail"])
-@pytest.mark.parametrize("turn", TURNS)
-def test_a_worker_may_die_at_any_point_of_a_bake_into_a_store(monkeypatch, expected, turn, faults, claim):
+@pytest.mark.parametrize(("case", "turn"), turns("one worker", "claims and faults", all_of="one worker"))
+def test_a_worker_may_die_at_any_point_of_a_bake_into_a_store(monkeypatch, expected, case, turn):
     """The next worker ends the set."""
+    claim = case == "claims and faults"
     undisturbed = Workers("whole", claim=claim)
     assert undisturbed.run(monkeypatch) == expected
     for point in range(1 + turn, undisturbed.points + 1, EVERY):
-        assert Workers(point if faults else "whole", point, faults, claim=claim).run(monkeypatch) == expected, point
+        workers = Workers(point, point, FAULTS, claim=True) if claim else Workers("whole", point, claim=False)
+        assert workers.run(monkeypatch) == expected, point
