@@ -22,8 +22,7 @@ from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.progress import SilentProgress
 from tests.worlds import small_worlds
-from tests.worlds.sights import SHORT
-from tests.worlds.small_worlds import catalog, settings
+from tests.worlds.small_worlds import SHORT, catalog, settings
 
 COARSE = small_worlds.COARSE | {"render.coarse_pixel": 2, "render.coarse_paths": 1}
 """Settings under which physics takes few steps, and light few paths."""

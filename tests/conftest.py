@@ -16,7 +16,7 @@ from hypothesis import settings
 
 from synpick_warp.exporters.writing import pool
 from synpick_warp.system.hardware.device import pick_device, start_warp
-from tests.harness.devices import VARIABLE
+from tests.harness.environment import VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL_DATA = ROOT.parent / "shared" / "data"

@@ -30,8 +30,7 @@ from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, STIRRING, assignments, bake_boxes, boxes, failing_after, once
-from tests.worlds.sights import BRIEF
-from tests.worlds.small_worlds import QUICK, catalog, settings
+from tests.worlds.small_worlds import BRIEF, QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
 WIDTH, HEIGHT = 96, 54

@@ -291,7 +291,7 @@ def _is_refused(column: str, value: str, path: Path, out: Path) -> None:
 
 
 def _has_physics(parts: Path, out: Path) -> None:
-    """Break forces follow from the vacuum, as `tests/sim/test_vacuum.py` measures on these parts; a bake without one tells its forces."""
+    """Break forces follow from the vacuum, as `tests/sim/test_suction.py` measures on these parts; a bake without one tells its forces."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(new_cell, "draw_cell", lambda file, name, picture, *_: picture.write_bytes(b""))
         assert run("new-cell", out / "cell", "--part", parts, "--unit", "mm").code == 0

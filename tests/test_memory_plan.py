@@ -27,7 +27,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import refusal
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.worlds.small_worlds import catalog, settings
 
 GIB = 1024**3

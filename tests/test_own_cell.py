@@ -1,17 +1,18 @@
-"""What users bring, end to end: a bin and a part as STL in all formats, catalogs at the ends of what fits, materials, light maps."""
+"""What users bring, end to end: a bin and a part as STL in all formats, catalogs at the ends of what fits, materials, light maps. What
+cannot be used is one line and exit code 2 before anything is simulated, and nothing is written."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 import zarr
 from PIL import Image
 from pxr import Usd, UsdGeom
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
@@ -29,11 +30,13 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE
 from synpick_warp.scenes.types import Material
 from synpick_warp.stages.render.scene import build_render_scene, pack_texels
+from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import PICKING
+from tests.builders import PICKING, mistake
 from tests.harness.bake_server import TINY
+from tests.harness.pieces import depth_within
 from tests.worlds.bin_meshes import bracket, sloped_bin
-from tests.worlds.model_files import box, glb, put
+from tests.worlds.model_files import OBJ, box, exported, glb, put
 from tests.worlds.shapes import UPRIGHT, camera, entry, even_light, sheet, sun
 from tests.worlds.small_worlds import QUICK
 from tests.worlds.toy_scene import ToyScene, render
@@ -50,12 +53,6 @@ unit = "mm"
 """
 MAX_DEPTH = 2e-3
 """Largest depth of a part in the bin in any step [m]; 0.16 mm were measured in 76,488 poses of twelve picks."""
-
-
-def deepest(pieces, points: np.ndarray) -> float:
-    """Largest depth of points (N, 3) in convex pieces [m]."""
-    planes = (ConvexHull(piece.vertices.astype(float)).equations for piece in pieces)
-    return max(float(-(points @ each[:, :3].T + each[:, 3]).max(axis=1).min()) for each in planes)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +96,8 @@ def test_parts_stay_within_the_mesh_in_every_step(baked):
     world = Rotation.from_quat(poses[:, 3:]).as_matrix() @ points.T + poses[:, :3, None]
     local = Rotation.from_quat(place[3:]).inv().apply(world.transpose(0, 2, 1).reshape(-1, 3) - place[:3])
     assert len(poses) > 100
-    assert deepest(one.pieces, local) < MAX_DEPTH
+    assert one.pieces
+    assert depth_within(one.pieces, local) < MAX_DEPTH
     inside = np.abs(local[:, :2]) < np.array(one.sizes.opening) / 2 + MAX_DEPTH
     assert (inside.all(axis=1) | (local[:, 2] > one.sizes.height - MAX_DEPTH)).all()
 
@@ -225,3 +223,82 @@ def test_a_picture_does_not_depend_on_the_unit_of_its_light_map(device):
         pictures.append(render(toy, device).color.astype(int))
     assert pictures[0].mean() > 50
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
+# ---- what cannot be used ----
+
+LOOK = "pose = { position = [0.0, -0.4, 1.1], look_at = [0.0, 0.0, 0.1], up = [0.0, 1.0, 0.0] }"
+CAMERA = f'[[camera]]\nname = "left"\nresolution = [320, 240]\nfov = 60.0\n{LOOK}\n'
+FILE = f'[[camera]]\nname = "left"\nfile = "FILE"\n{LOOK}\n'
+BIN = '[bins]\nkind = "own"\n[[bin]]\nname = "a"\n'
+PARTS = '[bake]\nmodels = "parts"\n'
+IN_MM = PARTS + '[objects]\nunit = "mm"\n'
+LIGHTS = '[bake]\nlights = "lights"\n'
+TRANSPOSED = "image_width: 320\nimage_height: 240\ncamera_matrix: [275, 0, 0, 0, 274.6, 0, 163, 117, 1]\n"
+ROW = '[[object_rows]]\nid = 1\nname = "long"\ndiameter = 0.14\nmass = 0\n'
+
+
+def looks(setting: str) -> str:
+    return f"[randomize]\n{setting}\n"
+
+
+CASES = {
+    "transposed file": (FILE.replace("FILE", "transposed.yaml"), "transposed.yaml (OpenCV): the camera matrix is written column by column"),
+    "no file": (FILE.replace("FILE", "gone.yaml"), "gone.yaml; a path in a file of settings is relative to that file"),
+    "bin lower than its floor": (BIN + "outer_size = [0.615, 0.373, 0.004]\n", "bin[0].wall is "),
+    "corners without room": (BIN + "floor_size = [0.035, 0.319]\n", "bin a: floor_size: a length of 0.035 m is too small"),
+    "camera below a mesh's floor": (
+        CAMERA + BIN + 'file = "bin.stl"\nplace = "file"\n',
+        "in cell.toml; allowed: positions above the bin's floor, z > 1.5",
+    ),
+    "parts in millimetres": (PARTS, 'did you mean objects.unit = "'),
+    "part larger than a compartment": (IN_MM + BIN + "compartments = [6, 6]\n", "long: too large for the bin"),
+    "part larger than the budget": (IN_MM + "[arrangement]\nvolume = 1e-5\n", "arrangement.volume is 1e-05 m³, but the smallest object, "),
+    "part without mass": (IN_MM + ROW, "object_rows[0].mass is 0 in cell.toml; "),
+    "no parts": ('[bake]\nmodels = "empty"\n', "empty: it contains no models; "),
+    "texture of a part that is cut": ('[bake]\nmodels = "skin"\n', "skin/t.png: not readable as an image ("),
+    "light that is not finite": (LIGHTS, "lights/a.hdr has radiance that is infinite or not a number"),
+    "no textures": (looks('bin_textures = "missing"'), "missing cannot be read"),
+    "empty textures": (looks('table_textures = "empty"'), "empty has 0 images"),
+    "damaged textures": (
+        looks('background_textures = "cut"') + "[render]\ntable_size = [1, 1]\n",
+        "randomize.background_textures: none of the 2 images of",
+    ),
+    "a damaged texture": (looks('table_textures = "half"') + "[objects]\nstrict = true\n", "half/b.jpg"),
+    "background without floor": (looks('background_textures = "half"'), "render.table_size"),
+    "value beyond": (looks("bin_metallic = 2.0"), "randomize.bin_metallic is 2.0"),
+    "choice beyond": (looks("lamps = { choice = [0, 9] }"), "randomize.lamps is "),
+    "mean beyond": (looks("object_hue = { normal = [400.0, 1.0] }"), "randomize.object_hue is "),
+    "colour of two": (looks("bin_color = [0.1, 0.2]"), "randomize.bin_color is "),
+    "colour beyond": (looks("bin_color = { uniform = [[0, 0, 0], [1, 1, 255]] }"), "randomize.bin_color is "),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_cannot_be_baked_is_one_line(tmp_path, monkeypatch, case):
+    for name in ("tick", "tick_parts"):
+        monkeypatch.setattr(Simulation, name, lambda *_, **__: pytest.fail("a tick is simulated"))
+    monkeypatch.chdir(tmp_path)
+    text, said = CASES[case]
+    picture = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (64, 64, 3)).astype(np.uint8))[1].tobytes()
+    radiance = np.full((8, 16, 3), [[[0.5, np.inf, 0.5]]], np.float32)
+    files = {
+        "cell.toml": f'preset = "smoke"\n{text}',
+        "transposed.yaml": TRANSPOSED,
+        "bin.stl": exported(sloped_bin().apply_translation((0.0, 0.0, 1.5)), "stl"),
+        "parts/long.stl": exported(trimesh.creation.box((90.0, 80.0, 70.0)), "stl"),
+        "skin/a.obj": OBJ,
+        "skin/a.mtl": "newmtl skin\nmap_Kd t.png\n",
+        "skin/t.png": picture[:3000],
+        "cut/a.png": picture[:3000],
+        "cut/b.webp": b"",
+        "half/a.png": picture,
+        "half/b.jpg": picture[:40],
+        "lights/a.hdr": cv2.imencode(".tiff", radiance)[1].tobytes(),  # Unlike a radiance map, it can hold any number.
+    }
+    for name, content in files.items():
+        put(Path(name), content)
+    Path("empty").mkdir()
+    before = sorted(Path().rglob("*"))
+    assert said in mistake("bake", "--config", "cell.toml", "--device", "cpu", "--mode", "move", "--out", "deep/data")
+    assert sorted(Path().rglob("*")) == before

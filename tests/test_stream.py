@@ -30,7 +30,7 @@ from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name
 from synpick_warp.stages.view_ring import CameraGroup, ViewRing, view_sizes, views_per_batch
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.views.frames import FrameBatch, SelectedRows
-from tests.twins.depth_png import encode_depth
+from tests.twins.encodings import encode_depth
 from tests.worlds.shapes import even_light, sun
 from tests.worlds.small_worlds import settings
 from tests.worlds.trajectories import ticks

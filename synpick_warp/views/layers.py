@@ -7,9 +7,9 @@ To add a layer:
 1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits: "raw" is for integers, which files hold as they are;
    files of all others are RGB with 16 bits. A constant that kernel and encoding share stands in `codes.py`;
 2. write its value at a pixel in `kernels/render/images/layers.py`, and name its kernel in `KERNELS` (`stages/render/layers.py`);
-3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/test_layer_codec.py`;
+3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/dataset/test_layers.py`;
    tests fail until both are there. Known answers belong in `tests/render/images/test_layers.py`, a row in the table of
-   `exporters/README.md`; `tests/dataset/test_layer_bake.py` bakes it by itself. A drawing in `apps/viz/false_colors.py` is optional.
+   `exporters/README.md`; the former bakes it by itself. A drawing in `apps/viz/false_colors.py` is optional.
 """
 
 from __future__ import annotations

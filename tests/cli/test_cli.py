@@ -30,7 +30,7 @@ from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
 from synpick_warp.factory.memory_plan import Term
 from synpick_warp.stages import timing
 from tests.builders import mistake
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.system.test_processes import refuse  # Writer processes import its module, which imports little.
 
 

@@ -38,8 +38,8 @@ from synpick_warp.system.processes.worker import ProcessError
 from synpick_warp.views.frames import EpisodeEnd
 from tests.builders import mistake
 from tests.harness import scripted_bake
-from tests.harness.entries import episode_content
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
+from tests.worlds.box_sets import episode_content
 from tests.worlds.small_worlds import catalog, settings
 
 CONFIG = settings()

@@ -27,10 +27,9 @@ from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScra
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
 from synpick_warp.system.codecs import depth_png, jpeg
 from synpick_warp.system.inputs.image_files import decode_image
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.harness.probe import probe
-from tests.twins.depth_png import SEGMENT, encode_depth, filter_rows
-from tests.twins.jpeg_entropy import code_blocks, code_interval
+from tests.twins.encodings import SEGMENT, code_blocks, code_interval, encode_depth, filter_rows
 
 transform = probe(transform_block)
 

@@ -35,7 +35,7 @@ from synpick_warp.apps.evaluation.truth import PoseTable, instance_speeds, read_
 from synpick_warp.errors import CatalogError, DatasetError, ResultError
 from synpick_warp.scenes.assets.ply import read_ply_vertices
 from tests.builders import refusal
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, OBJECTS, PERIOD, PRISM, SPEED, VISIBILITY, moved, shapes
 from tests.worlds.model_files import ascii_ply, put
 

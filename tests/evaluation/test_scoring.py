@@ -35,10 +35,9 @@ from synpick_warp.apps.evaluation.scoring import ALL, METRICS, PER_INSTANCE, mak
 from synpick_warp.apps.evaluation.tables import FORMATS, render, summarize
 from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.scenes.assets.models_info import FileModelInfo
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.twins import pose_errors as twin
-from tests.worlds.evaluation_set import BOX, BRICK, OBJECTS, PRISM, SIDES, VISIBILITY, moved
-from tests.worlds.noisy_tracks import join_tables
+from tests.worlds.evaluation_set import BOX, BRICK, OBJECTS, PRISM, SIDES, VISIBILITY, join_tables, moved
 
 NAMES = {BRICK: "brick", BOX: "a_box & co"}
 VISIBLE = sum(fraction >= 0.1 for fraction in VISIBILITY)

@@ -15,7 +15,7 @@ from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGE
 from synpick_warp.stages.render.scene import build_grid, pack_half3_array
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.aimed_views import aimed_views
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 
 
 class FlatDenoiser:

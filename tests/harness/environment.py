@@ -1,9 +1,18 @@
-"""Environment of child processes that import the checkout from any working directory."""
+"""What child processes that import the checkout need from any working directory, and the default device of the settings that tests use."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+VARIABLE = "SYNPICK_TEST_DEVICE"
+"""Environment variable that holds it, so that worker processes of a test run inherit it."""
+
+
+def default_device() -> str:
+    """The first device of `pytest --device`; cpu outside of pytest."""
+    return os.environ.get(VARIABLE, "cpu")
+
 
 ROOT = Path(__file__).resolve().parents[2]
 

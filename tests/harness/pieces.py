@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import collections
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -52,3 +52,9 @@ def filled(pieces: Iterable[ConvexPiece], points: np.ndarray, margin: float = 0.
 def felt(pieces: Iterable[ConvexPiece], origin: tuple[float, ...], direction: tuple[float, ...]) -> float:
     """Distance along a ray to the first of some pieces [m]."""
     return min(first_hit(piece.vertices, piece.faces, origin, direction) for piece in pieces)
+
+
+def depth_within(pieces: Sequence[ConvexPiece], points: np.ndarray) -> float:
+    """Depth of the deepest of points (N, 3) inside convex pieces [m]; below 0 outside of all."""
+    planes = (ConvexHull(piece.vertices.astype(float)).equations for piece in pieces)
+    return max((float(-(points @ each[:, :3].T + each[:, 3]).max(axis=1).min()) for each in planes), default=-np.inf)

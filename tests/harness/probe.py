@@ -10,7 +10,7 @@ import warp as wp
 from warp._src.codegen import Struct
 from warp._src.types import is_array, type_to_warp
 
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 
 _probes: dict[str, list[Probe]] = {}
 """Probes by the folder that declares them. They share a Warp module: a folder of tests compiles once."""

@@ -25,7 +25,7 @@ from synpick_warp.testing import box_views
 from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from tests.worlds import trajectories
-from tests.worlds.attempt_records import seen_object
+from tests.worlds.trajectories import seen_object
 
 FRAMES = 2
 INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}

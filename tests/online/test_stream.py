@@ -22,10 +22,9 @@ from synpick_warp.online import stream as online
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.views.layer_codec import decode_layer, encode_layer
-from tests.dataset.test_drawn_cameras import CELL
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
-from tests.worlds.cells import make_camera
+from tests.worlds.cells import CELL, make_camera
 from tests.worlds.small_worlds import QUICK, settings
 
 View = dict[str, np.ndarray]

@@ -18,7 +18,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.scenes import build
 from synpick_warp.scenes.bins import guide_walls
 from synpick_warp.scenes.types import Catalog
-from tests.harness.fuzz import fuzz_examples
+from tests.harness.hostile import fuzz_examples
 from tests.twins import arrangement
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
 

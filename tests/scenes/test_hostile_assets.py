@@ -29,8 +29,7 @@ from synpick_warp.scenes.assets.asset_files import MAX_ROWS
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
-from tests.harness.fuzz import fuzz_examples, start_isolation
-from tests.harness.hostile import LEAVES, places, removed, replaced
+from tests.harness.hostile import LEAVES, fuzz_examples, places, removed, replaced, start_isolation
 from tests.worlds.model_files import FACES, ascii_ply, binary_ply, exported, load_models, pack_glb, pack_png, put, unpack_glb
 
 SECONDS = 5.0

@@ -17,7 +17,7 @@ from synpick_warp.scenes.embedded.skies import HEIGHT, skies
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
 from synpick_warp.stages.render.light_tables import precompute_environment
-from tests.harness.fuzz import start_isolation
+from tests.harness.hostile import start_isolation
 from tests.worlds.model_files import pack_png
 
 SECONDS = 5.0

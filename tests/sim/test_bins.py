@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import warp as wp
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Mode, Phase, Stream
@@ -18,12 +17,12 @@ from synpick_warp.factory.assembly import fit_to_catalog
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.build import GRIPPER_BODIES
-from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing.exporters import digests
 from tests.builders import STIRRING, bake_boxes
+from tests.harness.pieces import depth_within
 from tests.twins import rng
 from tests.worlds.bin_meshes import round_bin, sloped_bin, tote
 from tests.worlds.kernel_worlds import BIN, KernelWorlds
@@ -216,12 +215,6 @@ def first_frames(config: Config, worlds: int) -> dict[int, tuple[int, np.ndarray
         if len(found) == config.bake.episodes:
             return found
     raise AssertionError(f"{len(found)} of {config.bake.episodes} episodes began")
-
-
-def depth_within(pieces: Sequence[ConvexPiece], points: np.ndarray) -> float:
-    """Depth of the deepest of points (N, 3) inside convex pieces [m]; below 0 outside of all."""
-    planes = (ConvexHull(piece.vertices.astype(float)).equations for piece in pieces)
-    return max((float(-(points @ each[:, :3].T + each[:, 3]).max(axis=1).min()) for each in planes), default=-np.inf)
 
 
 MOST_DEPTH = 2e-3

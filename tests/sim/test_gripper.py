@@ -24,7 +24,7 @@ from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState, world_sizes
 from tests.harness.probe import probe
-from tests.twins import gripper as twin
+from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import EagerPhysics
 from tests.worlds.kernel_worlds import KernelWorlds

@@ -17,7 +17,7 @@ from synpick_warp.kernels.structs import SuctionData
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
-from tests.sim.test_cup_rays import ARM, SQUARE
+from tests.sim.test_suction import ARM, SQUARE
 from tests.twins import suction as twin
 from tests.worlds.hanging import Hanging
 from tests.worlds.kernel_worlds import GRIPPER_DOFS, KernelWorlds, filled

@@ -15,8 +15,7 @@ from synpick_warp.stages.sim import sleep
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.harness.world_states import Rows, check_arrays, check_branches, differing
 from tests.worlds.kernel_worlds import filled
-from tests.worlds.sights import CALM, brief
-from tests.worlds.small_worlds import report
+from tests.worlds.small_worlds import CALM, brief, report
 
 SLEEP = {"physics__sleep": 2e-4}
 CREEP = 5e-4

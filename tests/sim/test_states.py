@@ -17,8 +17,7 @@ from synpick_warp.newton_patches import history
 from synpick_warp.stages.sim import states
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.harness.world_states import Rows, check_arrays, check_branches, differing, find_arrays, watch
-from tests.worlds.sights import CALM, brief
-from tests.worlds.small_worlds import BOX, CUBE, catalog
+from tests.worlds.small_worlds import BOX, CALM, CUBE, brief, catalog
 
 WORLDS, TICKS = 4, 3
 RESTLESS = {"settle__stuck_depth": 1e-7, "settle__stuck_time": 0.05}

@@ -21,8 +21,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport, read_tick
 from tests.twins.raycast import rotation_of
 from tests.worlds.kernel_worlds import filled
-from tests.worlds.sights import CALM, SHORT, picking
-from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, catalog, run_ticks, settings
+from tests.worlds.small_worlds import ANGLE, BOX, CALM, COARSE, CUBE, SHORT, catalog, picking, run_ticks, settings
 
 LONGEST = 200
 GRAVITY = 9.81

@@ -35,7 +35,7 @@ from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.cuda_model import ModelArray, ModelDevice
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.memory_tables import queued_ticks
 from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings

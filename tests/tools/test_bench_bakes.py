@@ -19,9 +19,9 @@ from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.stages.render.renderer import Renderer
-from tests.harness.entries import episode_content
 from tests.harness.processes import wait_for
 from tests.tools.test_reports import SHORT_PICKS
+from tests.worlds.box_sets import episode_content
 from tools.bench import __main__ as bench
 from tools.bench import bakes, run, scaling
 from tools.bench.bakes import CleanedSet, Cleaner, Tally, Usage, measure_usage

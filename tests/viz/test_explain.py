@@ -28,8 +28,8 @@ from synpick_warp.testing.box_views import config
 from synpick_warp.testing.exporters import export
 from tests.builders import mistake, refusal
 from tests.harness.charts import near, picture_of
-from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
 from tests.worlds.cells import cell_config, make_camera
+from tests.worlds.trajectories import attempt, nothing_seen, record, seen, seen_object
 
 EPISODES = (0, 1)
 TOP, LEFT = explain.MARGIN + explain.HEAD, explain.MARGIN

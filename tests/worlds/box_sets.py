@@ -1,20 +1,23 @@
-"""Finished data sets of boxes, written by the exporters without a bake: two episodes of three frames and cameras, three instances."""
+"""Finished data sets of boxes, written by the exporters without a bake: two episodes of three frames and cameras, three instances; and
+the content of manifest entries of episodes, as a bake gives it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
+from synpick_warp.codes import Ending
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.picks import PicksExporter
+from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.testing.box_views import config
 from synpick_warp.testing.exporters import FRAMES, export
 from synpick_warp.testing.picks import pick_batch
 from synpick_warp.views.frames import EpisodeEnd
-from tests.harness.entries import episode_content
 from tests.worlds import trajectories
 
 EPISODES = (0, 2)
@@ -50,3 +53,9 @@ def write_pick_set(folder: Path) -> Path:
     settings = (folder / CONFIG_FILE).read_text()
     (folder / CONFIG_FILE).write_text(settings.replace('formats = ["bop"]', 'formats = ["bop", "picks"]'))
     return folder
+
+
+def episode_content(episode: int, frames: int = 3, attempts: Sequence[dict[str, Any]] = ()) -> dict[str, Any]:
+    """Entry of a finished episode, without its files."""
+    row = EpisodeOutcome(episode, 0, Ending.FINISHED, frames, 0.1, "pick" if attempts else "move", 3, len(attempts), 1, 0, 2)
+    return {"episode": episode, "row": row.as_json(), "attempts": [attempt | {"episode": episode} for attempt in attempts]}

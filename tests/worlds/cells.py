@@ -56,3 +56,22 @@ def check_valid(folder: Path) -> None:
 def check_same(ours: Path, theirs: Path) -> None:
     """Two data sets have the same bytes, but for their settings."""
     assert {name for name, _ in digests(ours).items() ^ digests(theirs).items()} <= {"config.toml"}
+
+
+CELL = (
+    make_camera(
+        "drawn",
+        **SIDE,
+        matrix=camera_matrix(82.5, 82.38, 49.14, 35.25),
+        distortion=[-0.12, 0.08, 0.0005, -0.0003, 0.0],
+        jitter={
+            "position": {"normal": [0.0, 0.01]},
+            "rotation": {"uniform": [-1.0, 1.5]},
+            "focal_length": {"choice": [-0.02, 0.03], "weights": [1, 3]},
+            "center": {"normal": [0.5, 1.0]},
+        },
+    ),
+    make_camera("still", fov=40.0),
+    make_camera("hand", (0.12, 0.02, 0.4), (0.02, 0.0, -0.1), fov=70.0, fixed_to="gripper"),
+)
+"""Drawn anew by each episode behind a lens, still, and carried by the gripper."""

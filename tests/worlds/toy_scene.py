@@ -1,4 +1,4 @@
-"""Small analytic scenes and their rendering: shapes under simple lights."""
+"""Small analytic scenes and their rendering: shapes under simple lights; views of many boxes, placed at random, without physics."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.codes import Effect
+from synpick_warp.configs.schema import FAST, Bop, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers, view_buffer_sizes
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import first_views, make_views
+from synpick_warp.testing.box_views import catalog
+from synpick_warp.views.frames import FrameBatch
 from tests.twins.masks import bits_of, masks_of_buffers
 from tests.worlds.shapes import (
     FLAT,
@@ -27,6 +31,7 @@ from tests.worlds.shapes import (
     box,
     entry,
     even_light,
+    random_pile,
     sheet,
     surface,
 )
@@ -182,3 +187,38 @@ def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Rende
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     renderer.render_gbuffer(snapshot(toy, device), views_of(toy, device), out)
     return out, renderer
+
+
+def dense_toy(count: int, lenses: tuple[Camera, ...], room: int, seed: int = 0) -> ToyScene:
+    """A world of `count` boxes of the catalog of `box_views`, in a heap that reaches beyond the images."""
+    placed = random_pile(np.random.default_rng(seed), 2, count, (-0.4, -0.3, -0.2), (0.4, 0.3, 0.1))
+    return ToyScene(list(catalog().entries), [placed], lenses, instances=room, config=Config(bop=Bop(depth_scale=0.1)))
+
+
+def dense_batch(toy: ToyScene, device: wp.Device) -> FrameBatch:
+    """The world's views by all cameras, as frame 0 of episode 0, with run boundaries."""
+    scene, count = build_scene(toy, device), len(toy.cameras)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, count)
+    out = allocate_view_buffers(count, scene.width, scene.height, toy.instances, device)
+    world = snapshot(toy, device)
+    renderer.render(world, first_views(count, count, toy.instances, device), out)
+    sizes = boundary_sizes(view_buffer_sizes(count, scene.width, scene.height, toy.instances))
+    scratch, boundaries = (allocate(kind, sizes, device) for kind in (BoundaryScratch, BoundaryBuffers))
+    list_boundaries(scratch, count, out, boundaries)
+    entries = world.catalog_index.numpy()[0]
+    ids = np.append([entry.obj_id for entry in toy.entries], -1)[entries].astype(np.int32)
+    images = {name: array.numpy() for name, array in (vars(out) | vars(boundaries)).items() if name not in ("effects", "bundle")}
+    return FrameBatch(
+        **images,
+        episode=np.zeros(count, np.int32),
+        camera=np.arange(count, dtype=np.int32),
+        frame=np.zeros(count, np.int32),
+        time=np.zeros(count),
+        object_id=np.tile(ids, (count, 1)),
+        pose=np.tile(world.pose.numpy()[0], (count, 1, 1)),
+        effects=np.zeros((count, len(Effect)), np.float32),
+        light_name=np.full(count, "even"),
+        light_yaw=np.zeros(count, np.float32),
+        light_exposure=np.zeros(count, np.float32),
+        light_direction=np.zeros((count, 3), np.float32),
+    )

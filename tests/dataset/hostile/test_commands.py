@@ -20,8 +20,7 @@ from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
 from tests.builders import PICKED, bake_boxes, once, run
-from tests.harness.fuzz import fuzz_examples
-from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
+from tests.harness.hostile import LEAVES, WHOLE, fuzz_examples, places, removed, replaced
 
 TINY = PICKED | {
     "bake.device": "cpu",

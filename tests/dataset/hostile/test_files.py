@@ -35,10 +35,10 @@ from synpick_warp.exporters.trajectory.arrays import STEPS
 from synpick_warp.system.inputs.image_files import decode_image, image_size
 from synpick_warp.system.inputs.tar_files import list_members
 from synpick_warp.testing.exporters import LENSES
-from tests.harness.fuzz import fuzz_examples
-from tests.harness.hostile import places, replaced
+from tests.harness.hostile import fuzz_examples, places, replaced
 from tests.worlds import trajectories
 from tests.worlds.box_sets import write_set
+from tests.worlds.model_files import pack_png
 
 SIZE = LENSES[0].width, LENSES[0].height
 
@@ -53,9 +53,7 @@ def open_set(folder: Path, exporter: type = BopExporter) -> synpick_warp.DataSet
 
 def bomb(width: int, height: int) -> bytes:
     """A PNG that states a size and has hardly any data."""
-    parts = (b"IHDR" + struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0), b"IDAT" + zlib.compress(bytes(100)), b"IEND")
-    chunks = (struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in parts)
-    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+    return pack_png(width, height, (b"IDAT", zlib.compress(bytes(100))), depth=16, kind=2)
 
 
 UNKNOWN = (b"", b"II*\x00" + bytes(100), b"\xff\xd8\xff\xc0\x00\x11\x08\xff\xff\xff\xff\x03", b"\xff\xd8" + b"\xff\xe0\x00\x02" * 10_000)

@@ -28,8 +28,7 @@ from synpick_warp.exporters.bop.shared import targets
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.factory.episodes import BakeSummary
-from tests.harness.fuzz import fuzz_examples
-from tests.harness.hostile import LEAVES, WHOLE, hostile_contents, places, replaced
+from tests.harness.hostile import LEAVES, WHOLE, fuzz_examples, hostile_contents, places, replaced
 from tests.harness.scripted_bake import ATTEMPT, bake, make_victim, small_settings, snapshot
 
 CONFIG = small_settings()

@@ -31,7 +31,7 @@ from synpick_warp.stages.render.view_setup import make_shot
 from synpick_warp.system.hardware.device import pick_device
 from tests.builders import refusal
 from tests.harness.aimed_views import aimed_views
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.memory_tables import device_arrays
 from tests.worlds.shapes import UPRIGHT, box, camera, entry
 from tests.worlds.toy_scene import ANNOTATIONS, ToyScene, assert_same, render

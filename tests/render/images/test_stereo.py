@@ -19,8 +19,7 @@ from synpick_warp.stages.render.layers import sensor_parameters
 from synpick_warp.stages.render.scene import blank_scene
 from synpick_warp.stages.render.stereo import StereoRenderer, count_disparities
 from synpick_warp.stages.render.view_setup import first_views
-from tests.twins.layers import render_layers
-from tests.twins.stereo import matching_costs, path_costs
+from tests.twins.layers import matching_costs, path_costs, render_layers
 from tests.worlds.shapes import UPRIGHT, box, camera, entry, sheet, surface
 from tests.worlds.toy_scene import ToyScene
 

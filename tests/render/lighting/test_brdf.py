@@ -17,7 +17,7 @@ from synpick_warp.stages.render import scene
 from synpick_warp.stages.render.light_tables import build_environment_cdf, environment_cdf, measure_albedo
 from synpick_warp.stages.render.scene import normal_gradient
 from tests.harness.brdf_probe import evaluate, evaluate_discs, sample, toward
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.probe import probe
 from tests.worlds.shapes import UPRIGHT, ball, box, camera, entry, sun
 from tests.worlds.toy_scene import ToyScene, render

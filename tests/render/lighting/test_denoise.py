@@ -18,7 +18,7 @@ from synpick_warp.stages.render.denoised import PATH_LISTS, build_coarse_grid
 from synpick_warp.stages.render.sampling_rates import interleaved_threads
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.denoise_probe import FlatDenoiser
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.probe import probe
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)

@@ -36,9 +36,8 @@ from synpick_warp.testing.exporters import digests, exporting, finish
 from synpick_warp.views.frames import most_words, paint_masks
 from tests.harness.aimed_views import aimed_views
 from tests.twins.masks import masks_of_batch, pack_into
-from tests.worlds.dense_views import dense_toy
 from tests.worlds.shapes import DOWN, camera
-from tests.worlds.toy_scene import ToyScene, build_scene, make_renderer, render_gbuffer, snapshot, with_render
+from tests.worlds.toy_scene import ToyScene, build_scene, dense_toy, make_renderer, render_gbuffer, snapshot, with_render
 
 # ---- pool of words ----
 

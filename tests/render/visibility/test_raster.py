@@ -20,7 +20,7 @@ from synpick_warp.scenes.types import Camera, Fixture, TriangleMesh
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.system.hardware.device import pick_device
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.trace_probe import trace_gbuffer
 from tests.twins.layers import PreviousFrame, annotated, render_layers
 from tests.twins.masks import bits_of, masks_of_buffers

@@ -22,7 +22,7 @@ from synpick_warp.kernels.render.visibility.camera import (
 from synpick_warp.kernels.render.visibility.variants import kernel_for, kernel_of_views
 from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.render.view_setup import pair_views
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.probe import probe
 from tests.twins.raycast import rotation_of
 from tests.worlds.shapes import ball, box, camera, entry, random_pile, random_rotation, sheet

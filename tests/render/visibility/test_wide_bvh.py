@@ -23,7 +23,7 @@ from synpick_warp.stages.render import wide_bvh
 from synpick_warp.stages.render.wide_bvh import ABSENT, MAX_COORDINATE, build_levels, build_wide_bvh, needed_stack
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.bvh_probe import hit_every_triangle, query_warp, query_wide, visits_of
-from tests.harness.devices import default_device
+from tests.harness.environment import default_device
 from tests.harness.probe import probe
 from tests.twins.raycast import first_hit
 from tests.worlds.shapes import UPRIGHT, ball, box, camera, entry
