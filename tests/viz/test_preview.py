@@ -37,7 +37,6 @@ from synpick_warp.exporters.bop.view import write_rendered_layer
 from synpick_warp.testing.box_views import cameras, config
 from synpick_warp.testing.exporters import export
 from tests.builders import mistake
-from tests.harness.hostile import replaced
 from tests.harness.scripted_bake import bake, settings
 
 FRAMES = 5
@@ -240,17 +239,6 @@ def test_a_set_without_masks_and_with_png_colour(tmp_path):
     assert write_contact_sheet(tmp_path / "set", tmp_path / "sheet.jpg", 2).is_file()
 
 
-def wrong(name: str, place: tuple, value: object) -> Callable[[Path], None]:
-    """Harm of a scene: another value in each image's entry of scene_{name}.json."""
-
-    def harm(scene: Path) -> None:
-        path = scene / f"scene_{name}.json"
-        content = json.loads(path.read_text())
-        path.write_text(json.dumps({frame: replaced(entry, place, value) for frame, entry in content.items()}))
-
-    return harm
-
-
 def shrunk(name: str, dtype: type) -> Callable[[Path], None]:
     """Harm of a scene: images of 5 x 3 px."""
     data = cv2.imencode(".png", np.zeros((3, 5), dtype))[1].tobytes()
@@ -270,13 +258,6 @@ def shrunk(name: str, dtype: type) -> Callable[[Path], None]:
         (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], r"^[a-z]+/train_pbr/.* is not an image"),
         (shrunk("depth", np.uint16), r"depth/.*\.png has 5 x 3 pixels; the images of this camera have"),
         (shrunk("mask_visib", np.uint8), r"mask_visib/.*\.png has 5 x 3 pixels; the images of this camera have"),
-        (wrong("gt", (0,), "x"), r"scene_gt\.json is damaged: expected object, got str"),
-        (wrong("gt", (0, "obj_id"), []), r"expected int, got array"),
-        (wrong("gt_info", (0, "px_count_visib"), "3"), r"expected int, got str"),
-        (wrong("gt_info", (0, "bbox_obj"), [1e300] * 4), r"expected int"),
-        (wrong("gt_info", (0, "visib_fract"), float("nan")), r"JSON is malformed"),
-        (wrong("camera", ("depth_scale",), None), r"expected float, got null"),
-        (wrong("camera", ("cam_R_w2c",), 3), r"expected array, got int"),
         (lambda scene: shutil.rmtree(scene), "has no complete scene"),
         (lambda scene: shutil.rmtree(scene.parent.parent, ignore_errors=True), "there is no folder"),
     ],

@@ -143,6 +143,13 @@ def test_an_image_that_does_not_fit_its_camera_is_named(tmp_path, name, content,
         ("gt", (0,), [], r"do not agree about image 0"),
         ("gt_info", (0, 0, "bbox_visib"), [1, 2, 3], r"of length >= 4"),
         ("gt_info", (0, 0, "px_count_all"), -5, r"expected int >= 0"),
+        ("gt", (0, 0), "x", r"scene_gt\.json is damaged: expected object, got str"),
+        ("gt", (0, 0, "obj_id"), [], r"expected int, got array"),
+        ("gt_info", (0, 0, "px_count_visib"), "3", r"expected int, got str"),
+        ("gt_info", (0, 0, "bbox_obj"), [1e300] * 4, r"expected int"),
+        ("gt_info", (0, 0, "visib_fract"), float("nan"), r"JSON is malformed"),
+        ("camera", (0, "depth_scale"), None, r"expected float, got null"),
+        ("camera", (0, "cam_R_w2c"), 3, r"expected array, got int"),
     ],
 )
 def test_a_wrong_annotation_is_named_with_file_and_place(tmp_path, name, place, value, said):
