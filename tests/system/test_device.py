@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -94,7 +95,10 @@ def test_a_shipped_module_is_taken_if_it_is_of_the_same_sources_and_versions(dev
 
 
 def test_the_shipped_modules_are_those_of_the_present_sources():
-    """`python -m tools.narrow_phase` compiles them again."""
+    """`python -m tools.narrow_phase` compiles them again. With other versions than these, a bake compiles what it does not find."""
+    made_for = {"warp-lang": "1.19.0", "newton": "1.8.0"}
+    if made_for != {name: metadata.version(name) for name in made_for}:
+        pytest.skip("the modules are shipped for other versions")
     expected = {f"{build.shipped_key()}/{name}" for build in shipped_builds() for each in ARCHITECTURES for name in build.names(each)}
     with ZipFile(SHIPPED) as archive:
         assert set(archive.namelist()) == expected
