@@ -300,11 +300,10 @@ def test_a_file_with_a_hole_of_terabytes_is_not_read(narrow, tmp_path):
 
 
 def test_a_full_disk_leaves_no_probe(tmp_path, monkeypatch):
-    def no_space(path: Path, _: bytes) -> None:
-        path.touch()
-        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+    def no_space(**_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", no_space)
+    monkeypatch.setattr(files.tempfile, "TemporaryFile", no_space)
     with pytest.raises(OutputError, match="No space left on device"):
         files.check_output_folder(tmp_path)
     assert list(tmp_path.iterdir()) == []
