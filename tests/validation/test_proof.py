@@ -33,12 +33,21 @@ def test_a_data_set_proves_itself(picked_set):
     assert len(drawn) == 2
 
 
+def _replace(path: Path, data: bytes, record: Path) -> None:
+    """Replace a file, and its SHA-256 in the record."""
+    digests = [hashlib.sha256(content).hexdigest().encode() for content in (path.read_bytes(), data)]
+    path.write_bytes(data)
+    record.write_bytes(record.read_bytes().replace(*digests))
+
+
 def _recorded(path: Path, folder: Path) -> None:
-    """Change the last byte of a file, and its record, as if the bake had written so."""
-    before = hashlib.sha256(path.read_bytes()).hexdigest()
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
-    for lines in (folder / "manifest").glob("0*.sha256"):
-        lines.write_text(lines.read_text().replace(before, hashlib.sha256(path.read_bytes()).hexdigest()))
+    """Change the last byte of a file of the first episode, as if the bake had written so."""
+    lines, entry = folder / "manifest/000000.sha256", folder / "manifest/000000.json"
+    before = lines.read_bytes()
+    _replace(path, path.read_bytes()[:-1] + b"x", lines)
+    after = lines.read_bytes()
+    lines.write_bytes(before)
+    _replace(lines, after, entry)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +58,7 @@ def _recorded(path: Path, folder: Path) -> None:
     ],
 )
 def test_a_difference_is_named(copy, change, said):
-    path = next(iter(sorted((copy / "train").rglob("mask_visib/*.png"))))
+    path = next(iter(sorted((copy / "train").rglob("rgb/*"))))
     change(path, copy)
     with boxes():
         found = run("prove", copy, "--share", 1.0)
