@@ -1,4 +1,4 @@
-"""Schedules of claiming workers: the claims, work queue, ledger and finalization of the product, over a bake that only waits.
+"""Simulated schedules of claiming workers: real claims, work queue, ledger and finalization; generating an episode only takes virtual time.
 
 Workers start together, die and are replaced, freeze, and their requests fail; what must hold is checked at each write.
 """
@@ -139,7 +139,7 @@ class Schedule:
         run._finalize_once(log, claims, Path())
 
     def _make(self, log: Ledger, work: run._Work, episode: int, process: Process) -> None:
-        """Make an episode, which takes a while or longer than the lease, and commit it, unless its lease is lost."""
+        """Simulate the generation of an episode, which may exceed the lease time, then commit the episode unless the lease was lost."""
         self.made += 1
         clock.sleep(random.uniform(0.0, LONGEST_EPISODE))
         if self._drawn and self._freezes < FREEZES and self.simulation.draw.random() < FREEZE:

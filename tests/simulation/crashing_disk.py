@@ -1,6 +1,6 @@
-"""Crash points of a folder: the n-th change to it, and all later ones, raise `Dead` in place of being made, as if the process were killed.
+"""Fault injection into the file system: from the n-th modification of a folder on, each raises `Dead`, as if the process were killed there.
 
-In a power cut, files that were not synchronized are cut off, too.
+A power cut additionally truncates the files that were not flushed by fsync.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ sys.addaudithook(_watch)
 
 
 class CrashingDisk:
-    """Context manager that counts the changes to a folder, and crashes at one of them."""
+    """Context manager that counts the modifications of a folder, and simulates a crash at one of them."""
 
     def __init__(self, folder: Path, crash_at: int = 0) -> None:
         """`crash_at`: number of the change from 1 on; 0: none."""
         self.changes = 0
         self._folder, self._crash_at = str(folder), crash_at
         self._synced = {path.stat().st_ino for path in folder.rglob("*") if path.is_file()}
-        """Inodes of the files that were there, or were synchronized."""
+        """Inodes of the files that a power cut leaves intact: those that existed at the start, and those that were flushed by fsync."""
         self._patch = pytest.MonkeyPatch()
 
     def __enter__(self) -> Self:
@@ -50,7 +50,7 @@ class CrashingDisk:
         self._patch.undo()
 
     def see(self, event: str, arguments: tuple[Any, ...]) -> None:
-        """Count a change, or crash."""
+        """Audit hook: count a modification, or crash."""
         path = os.fspath(arguments[0]) if isinstance(arguments[0], (str, os.PathLike)) else ""
         if event == "open":
             mode, flags = arguments[1], arguments[2]
@@ -63,11 +63,11 @@ class CrashingDisk:
             raise Dead
 
     def _sync(self, handle: int) -> None:
-        """fsync, by which a file outlives a power cut."""
+        """Replacement of `os.fsync`: records the file, and does not flush it."""
         self._synced.add(os.fstat(handle).st_ino)
 
     def cut_power(self) -> None:
-        """Cut off all files that were not synchronized."""
+        """Truncate all files that were not flushed to half of their size."""
         for root, _, names in os.walk(self._folder):
             for name in names:
                 path = os.path.join(root, name)

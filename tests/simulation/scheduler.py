@@ -17,25 +17,25 @@ import pytest
 from synpick_warp.system import clock
 
 START = 1.8e9
-"""Virtual time at the start [s since 1970]."""
+"""Initial virtual time [s since 1970]."""
 LONGEST = 1e6
-"""Virtual duration of a simulation from which on it counts as hung [s]."""
+"""Maximum virtual duration of a simulation [s]."""
 
 
 class Dead(BaseException):
-    """The process was killed: raised by its threads at whatever they do next, so that no code of theirs has an effect."""
+    """Raised in each thread of a killed process at its next scheduling point, and at all later ones."""
 
 
 class HungError(AssertionError):
-    """No thread can ever go on, or the simulation takes too long."""
+    """Deadlock: no thread can continue; or the simulation exceeds LONGEST."""
 
 
 class Process:
-    """Process of a simulation: killed as a whole, or frozen for a time, as by a suspended machine."""
+    """Simulated operating system process: it can be killed, with all of its threads, or suspended for a time."""
 
     def __init__(self, name: str) -> None:
         self.name, self.dead, self.frozen = name, False, 0.0
-        """Until when it is frozen: virtual time [s]."""
+        """`frozen`: virtual time up to which it is suspended [s]."""
 
 
 class _Task:

@@ -33,7 +33,7 @@ CONFIG = scripted_bake.small_settings()
 SENSORS = scripted_bake.settings(2, ("bop",)).with_values({"bop.layout": "multisensor", "bop.keypoints": 4, "bop.coco": False})
 PICKS = scripted_bake.settings(2, ("bop", "picks"))
 EVERY = 16
-"""Crash points are tested in this many turns: the first with the fast tests, of some cases the others with the slow ones."""
+"""Stride of the crash points of one test: fast tests take the first residue, slow tests the others, of some cases."""
 
 
 BAKES = {
@@ -42,7 +42,7 @@ BAKES = {
     "several sensors": (lambda out: None, lambda out: scripted_bake.bake(out, SENSORS)),
     "picks": (lambda out: None, lambda out: scripted_bake.bake(out, PICKS, picks=True)),
 }
-"""What is there before, and the bake that crashes and is repeated, by name."""
+"""Initial state of the folder, and the bake that crashes and is then repeated, by name of the case."""
 
 
 def turns(*cases: str, all_of: str) -> list[Any]:
@@ -59,7 +59,8 @@ def expected(tmp_path_factory) -> dict[str, bytes]:
 
 
 def crash(folder: Path, prepare: Callable[[Path], object], change: Callable[[Path], object], turn: int, *, power: bool) -> dict[int, Path]:
-    """Crash `change` at every EVERYth of its changes to a prepared folder; returns the folders by the number of the change."""
+    """Run `change` on prepared folders, each with a simulated crash at another modification, every EVERY-th; returns the folder of each
+    crash point, by its number."""
     prepare(folder / "counted")
     with CrashingDisk(folder / "counted") as disk:
         change(folder / "counted")

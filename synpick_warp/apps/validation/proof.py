@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import random
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,8 +23,8 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
+from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import DatasetError, SynpickError
-from synpick_warp.exporters.writing.checksums import checksum
 from synpick_warp.factory.pipeline import bake_episodes, with_measures
 from synpick_warp.system.progress import Progress
 
@@ -33,7 +34,7 @@ class Proof(NamedTuple):
 
     episodes: list[int]
     files: int
-    """Files of these episodes and constants, as far as they were compared."""
+    """Number of compared files, of these episodes and of the constants."""
     problem: str
 
 
@@ -71,19 +72,22 @@ def _compare(folder: Path, again: Path, episodes: list[int]) -> Proof:
         then, now = (read_checksums(each, entry) for each in (folder, again))
         for name in sorted(then | now):
             files += 1
-            if then.get(name) != now.get(name) or not (folder / name).is_file():
-                return Proof(episodes, files, _describe(folder / name, again / name, then.get(name)))
+            if then.get(name) != now.get(name):
+                return Proof(episodes, files, _describe(folder, again, name, then))
+        if problem := check_files(folder, then).problem:  # The records are equal; the files may have changed since.
+            return Proof(episodes, files, problem)
         if (folder / f"{entry}.json").read_bytes() != (again / f"{entry}.json").read_bytes():
             return Proof(episodes, files, f"{folder / entry}.json differs from that of a new bake, but no file that it lists")
     return Proof(episodes, files, "")
 
 
-def _describe(path: Path, again: Path, recorded: str | None) -> str:
-    """Describe how a file differs from that of a new bake."""
-    if recorded is None or not again.is_file():
-        return f"{path} is not in the data set, but in a new bake" if recorded is None else f"{path} is not in a new bake"
-    if not path.is_file() or checksum(path) != recorded:
-        return f"{path} is missing, or has changed since it was written"
-    old, new = path.read_bytes(), again.read_bytes()
+def _describe(folder: Path, again: Path, name: str, recorded: Mapping[str, str]) -> str:
+    """Describe how a file of the data set differs from that of a new bake, given its recorded checksums."""
+    path = folder / name
+    if name not in recorded or not (again / name).is_file():
+        return f"{path} is {'only' if name not in recorded else 'not'} in a new bake"
+    if problem := check_files(folder, {name: recorded[name]}).problem:
+        return problem
+    old, new = path.read_bytes(), (again / name).read_bytes()
     place = next((index for index, pair in enumerate(zip(old, new, strict=False)) if pair[0] != pair[1]), min(len(old), len(new)))
     return f"{path} differs from byte {place:,} on: {len(old):,} bytes here, {len(new):,} in a new bake"

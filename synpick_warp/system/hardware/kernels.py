@@ -58,8 +58,8 @@ class ModuleBuild(NamedTuple):
         return all((self._folder / name).exists() for name in self.names())
 
     def shipped_key(self) -> str:
-        """Folder of its files in an archive of `take_shipped`: versions of Warp and of CUDA's compiler, and the hash of all its sources and
-        options, so that nothing stale is taken."""
+        """Key of the module in the archive of precompiled modules: versions of Warp and of CUDA's compiler, and the hash of its sources and
+        options. A module compiled from anything else has another key."""
         compiler = ".".join(map(str, context.runtime.toolkit_version or ()))
         return f"warp-{wp.config.version}-cuda-{compiler}/{self.module.get_module_hash(self.block).hex()}"
 
