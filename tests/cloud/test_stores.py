@@ -1,5 +1,5 @@
-"""Stores by their contract: objects, order, limits, conditions; requests that fail for a while, and for good; places and secrets. Bakes on
-a Ray cluster, and launchers: the worker script under the variables of its schedulers, and files that name what there is."""
+"""Object stores: reads, ordered listings, size limits, conditional writes, retries, permanent errors, URLs, secrets in messages. Also bakes
+on a Ray cluster, and launchers: the worker script with each scheduler's environment variables, and the names in their files."""
 
 from __future__ import annotations
 

@@ -315,12 +315,12 @@ def test_sweeps_choose_the_largest_of_equal_weights_also_for_modes_without_estim
 # ---- charts ----
 
 WIDTH, LEFT, RIGHT, BOTTOM = 1400, 171, 1380, 103
-"""Width of a picture, and frame of the panels [px], the lower edge from below."""
+"""Width of a plot, and edges of its panels [px]; the lower edge is counted from the bottom of the image."""
 RED = PALETTE[1]
 
 
 def rows_at(picture: np.ndarray, column: float, color: str, panel: int) -> np.ndarray:
-    """Height of a colour's pixels in a column of the lowest panel, 0 at its lower edge, 1 at its upper."""
+    """Heights of the pixels of a colour in one column of the lowest panel: 0 at the lower edge, 1 at the upper."""
     rows = np.flatnonzero(near(picture, color)[:, round(column)])
     return (len(picture) - BOTTOM - 0.5 - rows) / panel
 

@@ -1,5 +1,5 @@
-"""Bins: tote, pallet, table and rows of one's own, measured with rays: visual meshes and collision shapes agree; their settings. Heads of
-all kinds of gripper: closed meshes, cups where they are said to be, collision shapes that end where the picture does."""
+"""Bins (tote, pallet, table, custom rows): ray casts show that visual meshes and collision shapes agree; settings. Gripper heads of all
+kinds: closed meshes, positions of the cups, extents of the collision shapes equal to those of the visual meshes."""
 
 from __future__ import annotations
 

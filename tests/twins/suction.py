@@ -148,7 +148,8 @@ def corner_place(code: int, corner: np.ndarray) -> np.ndarray:
 
 
 def force(offset, velocity, stiffness: float, damping: float, limit: float, mass: float, step: float) -> np.ndarray:
-    """k (g - x') - d v' with v' = v + h F / m and x' = x + h v', solved for F by a linear system; its length is at most the limit."""
+    """Implicit spring-damper force F = k (g - x') - d v' with v' = v + h F / m and x' = x + h v': the solution of a linear system, with its
+    norm clamped to the limit."""
     # Unknowns F and v': F + (k h + d) v' = k (g - x), v' - h F / m = v.
     matrix = np.array([[1.0, stiffness * step + damping], [-step / mass, 1.0]])
     free = np.linalg.solve(matrix, np.stack([stiffness * np.asarray(offset, float), np.asarray(velocity, float)]))[0]

@@ -156,11 +156,11 @@ LIGHTS = 1
 SHORT = QUICK_PICKS | {"bake.mode": "pick", "perception.resolution": [320, 180]}
 """Settings of short attempts."""
 CALM = {"pick.appear_height": 0.3, "pick.lift_height": 0.3, "pick.lift_speed": 0.6, "pick.near_speed": 0.2}
-"""Changes to SHORT under which a descent takes several ticks, and what hangs at the end of a lift does not swing."""
+"""Overrides on SHORT with slower motion: the descent takes several ticks, and a lifted object does not swing at the end."""
 
 BRIEF = COARSE | SHORT | {"arrangement.max_objects": 3, "pick.failures": 1, "perception.resolution": [160, 90]}
 BRIEF |= {"physics.guide_height": 0.4, "bake.mode": "mixed", "bake.episodes": 8}
-"""Settings under which an attempt takes few and short ticks."""
+"""Overrides under which an attempt takes few ticks, each of little computation."""
 
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
@@ -170,11 +170,12 @@ def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
 
 
 def brief(device: Any, worlds: int, **changed: Any) -> Simulation:
-    """Small worlds of BRIEF, with changes; on a GPU as many as agree with larger numbers to the bit."""
+    """Simulation with settings BRIEF and overrides; on a GPU with at least MIN_GPU_WORLDS worlds, so that results do not depend on the
+    number."""
     worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
     return picking(settings(**BRIEF | {"bake__worlds": worlds} | changed), catalog(), device)
 
 
 def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:
-    """Worlds that can see; `other` goes to the simulation."""
+    """Simulation with perception; `other`: further arguments of `Simulation`."""
     return Simulation(config, objects, LIGHTS, device, render_scene(config, objects, device), **other)

@@ -183,6 +183,7 @@ def prove(
     """
     if not 0.0 < share <= 1.0:
         raise ConfigError(f"--share is {share:g}; allowed: above 0, to 1")
+    check_range("--seed", seed, 0, _MAX_SAMPLE)
     place = find_data_set(folder, "synpick-warp prove DIR")
     from synpick_warp.apps.validation.proof import prove as bake_again
     from synpick_warp.cli.display import make_console, make_progress
