@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import resource
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -184,6 +185,8 @@ _REMEDIES = {
 }
 _MEMORY = ("memory", "failed to map segment", "unable to allocate")
 """Parts of the messages of other libraries that ran out of memory, in lower case."""
+_NO_ERROR = "without exception set"
+"""What the interpreter says of an extension, or of itself, that ran out of memory without raising `MemoryError`."""
 _FILES = "too many open files"
 _NO_THREAD = "can't start new thread"
 
@@ -200,6 +203,8 @@ def describe_limit(error: BaseException) -> str | None:
             return f"no thread can be started; {_REMEDIES[errno.EAGAIN]}"
         if isinstance(each, MemoryError) or (foreign and any(part in low for part in _MEMORY)):
             return f"memory is exhausted{f' ({text})' if text else ''}; {_REMEDIES[errno.ENOMEM]}"
+        if isinstance(each, SystemError) and _NO_ERROR in low and resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+            return f"a library failed without a reason, as some do without memory ({text}); {_REMEDIES[errno.ENOMEM]}"
         if foreign and _FILES in low:
             return f"{text}; {_REMEDIES[errno.EMFILE]}"
     return None

@@ -306,11 +306,14 @@ def test_closed_descriptors_are_taken_before_any_file(tmp_path):
         (RuntimeError("can't start new thread"), "no thread can be started; close other programs, or raise the limit of processes"),
         (OSError(24, "Too many open files"), "[Errno 24] Too many open files; raise the limit of open files (ulimit -n)"),
         (ImportError("x.so: failed to map segment from shared object"), "memory is exhausted (x.so: failed to map segment"),
+        (SystemError("error return without exception set"), "a library failed without a reason, as some do without memory (error return "),
         (ImportError("x.so: cannot open shared object file: Too many open files"), "x.so: cannot open shared object file: Too many "),
     ],
 )
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_a_limit_is_one_line(monkeypatch, capsys, error, said, wrapped):
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (1 << 30, 1 << 30))
+
     def fail(*_, **__):
         if wrapped:
             raise ValueError("a consequence") from error
@@ -322,7 +325,7 @@ def test_a_limit_is_one_line(monkeypatch, capsys, error, said, wrapped):
     assert line.startswith(f"synpick-warp: error: {said}")
 
 
-OTHERS = [RuntimeError("a fault of ours"), ImportError("no module named x"), OSError(5, "Input/output error"), ZeroDivisionError()]
+OTHERS = [RuntimeError("a fault of ours"), ImportError("no module named x"), OSError(5, "Input/output error"), SystemError("error")]
 
 
 @pytest.mark.parametrize("error", OTHERS)

@@ -117,7 +117,7 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path):
         (b'{"count": 1e999}', r"number out of range - at \$.count"),
         (b'{"count": ' + b"9" * 5000 + b"}", "out of range"),
         (b"{}", "missing required field count"),
-        (b'{"count": 1, "name": "\xff"}', "codec can't decode"),
+        (b'{"count": 1, "name": "\xff"}', "codec can't decode|invalid UTF-8"),
     ],
 )
 def test_json_errors_name_source_place_and_advice(data, message):

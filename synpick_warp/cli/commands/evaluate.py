@@ -116,8 +116,6 @@ def show_table(table: str, out: Path | None, end: str) -> None:
 
 def draw_pictures(data_set: DataSet, scored: Evaluation, settings: Settings, track: tuple[int, int] | None) -> dict[str, bytes]:
     """File name -> PNG file: the figures, and a sheet of the worst estimate of each object for each method, if there are images for it."""
-    from synpick_warp.apps.estimation.failures import draw_failures, find_failures
-    from synpick_warp.apps.estimation.run import read_object_models
     from synpick_warp.apps.evaluation.figures import draw_figures, file_names
     from synpick_warp.apps.evaluation.run import object_names
     from synpick_warp.exporters.writing.png import encode_png
@@ -125,6 +123,10 @@ def draw_pictures(data_set: DataSet, scored: Evaluation, settings: Settings, tra
 
     attempts = {index: [int(attempt["frame"]) for attempt in data_set[index].attempts] for index in data_set if data_set.has_store}
     figures = draw_figures(scored.truth, scored.methods, scored.scores, settings, track, attempts)
+    # Not before: the simulator's libraries crash without memory, where the charts' library has an error.
+    from synpick_warp.apps.estimation.failures import draw_failures, find_failures
+    from synpick_warp.apps.estimation.run import read_object_models
+
     truth, by_name = scored.truth, {each.name: each for each in scored.scores}
     sheets, objects = {}, object_names(data_set)
     for method, name in zip(scored.methods, file_names([method.name for method in scored.methods]), strict=True):
