@@ -1,7 +1,5 @@
 """Builders that tests share: settings of quick bakes, boxes in place of models, what is baked once for all, commands in this process."""
 
-from __future__ import annotations
-
 import fcntl
 import io
 import json

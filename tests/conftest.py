@@ -1,7 +1,5 @@
 """Configuration of pytest: devices, hypothesis profile, real data."""
 
-from __future__ import annotations
-
 import gc
 import itertools
 import os

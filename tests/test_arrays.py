@@ -1,7 +1,5 @@
 """Declarations of arrays, with which allocation and memory table agree; arguments of launches and members of structs, found by names."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Records of attempts from scripted ticks, each once, with what was seen before it and what came of it; codes and rows of episodes."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, is_dataclass
 

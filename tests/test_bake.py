@@ -1,7 +1,5 @@
 """Bakes from settings to files: the same bytes every time, truth that fits the images, grasp trials, what is left when something fails."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -1,7 +1,5 @@
 """Inputs of users in tests/cases, one row each: what a command says of them, or what is right."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Random numbers on device and host, and low-discrepancy sequences; nothing depends on the kind of processor: the same bits with other
 kernels of BLAS, other SIMD, other variants of the C library."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 import json

@@ -1,8 +1,6 @@
 """Distractors, which occlude others, but have no labels and are no targets; and all that can be randomized at once: the same bytes in any
 number of worlds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rules of the house: sizes, folders, packages, links, words."""
 
-from __future__ import annotations
-
 import ast
 import fnmatch
 import functools

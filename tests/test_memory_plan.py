@@ -1,7 +1,5 @@
 """Memory plan: oversized settings are refused in one line before anything is loaded, and what fits is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

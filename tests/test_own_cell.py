@@ -1,8 +1,6 @@
 """What users bring, end to end: a bin and a part as STL in all formats, catalogs at the ends of what fits, materials, light maps. What
 cannot be used is one line and exit code 2 before anything is simulated, and nothing is written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Documents: fenced lines of the README and of the page on a cell of one's own run as written, links lead somewhere, each arrow of a
 frame's way in kernels/README.md is followed by calls and launches of a bake, and the Python API offers what exists."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import importlib

@@ -1,7 +1,5 @@
 """CUDA streams of renderer, encoders and solver: caching, synchronization at a switch, fallback without partitions; the scoped profiler."""
 
-from __future__ import annotations
-
 import json
 import random
 import time

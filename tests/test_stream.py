@@ -1,7 +1,5 @@
 """From ticks to frame batches: which views, in which order, in which batches, with what in them; selections of ticks, waits for copies."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The command line: options, exit codes, one line for a mistake, nothing left behind."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

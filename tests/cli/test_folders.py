@@ -1,8 +1,6 @@
 """Default folders: where a bake writes without --out, which data set the other commands read, and outputs that replace nothing;
 folders of any depth."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Command new-cell: what it writes of calibrations, bins and parts, that its examples are valid, and what is refused."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

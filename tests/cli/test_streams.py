@@ -1,8 +1,6 @@
 """What people see of a command, and what the system does not grant: streams that are closed, full, without a reader or ASCII; memory,
 threads and open files."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,7 +1,5 @@
 """Calibration files as other programs write them: equal intrinsics, and one line for what is wrong; lenses against OpenCV's."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

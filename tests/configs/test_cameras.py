@@ -1,7 +1,5 @@
 """[[camera]] tables and look-at cameras: what they mean, how they are written, where they project, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

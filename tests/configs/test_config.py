@@ -1,7 +1,5 @@
 """Loading, validation and serialization of the configuration; constraints between settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

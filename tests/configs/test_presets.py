@@ -1,7 +1,5 @@
 """Presets and splits: what they change, random numbers, changes of every row, ranges of episodes; the reference of all settings."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -1,8 +1,6 @@
 """Conversion of data sets: byte equality with a bake of the format, resuming, and errors in one line, also of trajectories that lack
 something. A package of others (tests/plugins) adds a format, a gripper and a layer, which are known as ours are."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import importlib

@@ -2,8 +2,6 @@
 and rectified; of cameras that have files of some images only: of every third frame, depth and masks without colour, or the reverse; and
 of cameras drawn anew by each episode, or carried by the gripper: files against formulas, in float64."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """BOP folders from other sources: every command that reads takes them with what they have, and says in one line what they lack."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,8 +1,6 @@
 """Layers from settings to files: what a small bake leaves agrees with its own depth, masks and poses. Their PNG codec: values read back
 equal those written, within the quantization steps that the notes state."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

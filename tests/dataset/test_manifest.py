@@ -1,8 +1,6 @@
 """Manifest of a data set: settings that must match on resume, messages about differences, completeness of entries, checksum lists, and
 their verification."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

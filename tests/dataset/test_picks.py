@@ -1,8 +1,6 @@
 """Simulated picks: tables of episodes and views, maps, arrays of suctionnetAPI, and what a damaged or missing table says. Their pictures:
 interpolated maps, sentences on trials, sheets, the report's section, and scores."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

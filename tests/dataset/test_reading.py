@@ -2,8 +2,6 @@
 arrays that went in, in metres, lazily, whatever the format; tracks of instances over cameras and time. Samples of PyTorch are these views,
 also in pickled copies and in batches; the decoder for shards against webdataset itself."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Images encoded on the device: JPEGs are those of libjpeg, depth PNGs those of the twin, read by the decoders of the field."""
 
-from __future__ import annotations
-
 import io
 import zlib
 from types import SimpleNamespace

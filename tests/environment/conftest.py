@@ -1,7 +1,5 @@
 """A small environment of whole picks, which the tests of this room share."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Environment of whole picks, and of twists: seeds, rewards, resets, states, and actions that are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

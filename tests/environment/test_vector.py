@@ -1,7 +1,5 @@
 """The face to Gymnasium, and arguments that are refused; what needs Gymnasium is skipped where it is not installed."""
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Poses by GICP: observed points of boxes lie on the model, disturbed poses come back; and the command, whose files `eval` scores."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

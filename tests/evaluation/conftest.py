@@ -1,7 +1,5 @@
 """The small data set that evaluations share, and its ground truth. Read only."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

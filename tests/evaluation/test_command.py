@@ -1,7 +1,5 @@
 """Command `eval`: tables, files, the BOP toolkit's command, and one line for each mistake."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

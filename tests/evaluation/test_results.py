@@ -1,7 +1,5 @@
 """Result files, target lists and ground truth: what is read, what is written, and one line with a number for each fault."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,8 +1,6 @@
 """Scores from poses to tables: perfect poses, known offsets, symmetries, misses, several hypotheses, all styles;
 matching as of the BOP toolkit."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

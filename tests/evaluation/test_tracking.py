@@ -1,8 +1,6 @@
 """Tracking over time: association of estimates, the paper's filter on analytic trajectories, and the sweep of its weight. Charts: what is
 drawn where, gaps, legends, files; refused input; and that no data or name breaks the drawing."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

@@ -2,8 +2,6 @@
 produce; memory and open files of the writers (leak test); tables of simulated picks as a Parquet reader finds them. LeRobot data sets
 by the real pool: tables by pyarrow against the simulation, videos by PyAV, whose bytes depend neither on freed memory nor on the CPU."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

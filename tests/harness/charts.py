@@ -1,7 +1,5 @@
 """Pictures of charts, rendered in this process: a process of its own for each would take a second."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

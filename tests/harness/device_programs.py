@@ -1,7 +1,5 @@
 """Stand-ins for the processes of devices: they speak the protocol of `factory.worker`, and simulate nothing."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """What child processes that import the checkout need from any working directory, and the default device of the settings that tests use."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 python -m tests.harness.fingerprints FOLDER    # prints them as JSON; `test_determinism` compares kinds of processors
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

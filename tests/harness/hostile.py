@@ -1,8 +1,6 @@
 """Hostile copies of JSON files: truncated, of other types, nested too deeply, with a wrong value at each leaf. Fuzz tests: number of
 examples, short in the suite, longer by SYNPICK_FUZZ_EXAMPLES; what does not count as an input's time."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os

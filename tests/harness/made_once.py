@@ -1,7 +1,5 @@
 """Memory of what takes most of the time to build small worlds, and follows from its arguments alone; and no wait for disks."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Memory tables: what a plan says of a bake's own arrays."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from synpick_warp.configs.schema import Config

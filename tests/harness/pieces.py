@@ -1,7 +1,5 @@
 """Assertions and measurements on convex pieces and closed meshes."""
 
-from __future__ import annotations
-
 import collections
 from collections.abc import Iterable, Sequence
 

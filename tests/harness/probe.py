@@ -1,7 +1,5 @@
 """Probe kernels: device functions called from tests, one thread a row of arguments."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 
@@ -12,7 +10,7 @@ from warp._src.types import is_array, type_to_warp
 
 from tests.harness.environment import default_device
 
-_probes: dict[str, list[Probe]] = {}
+_probes: "dict[str, list[Probe]]" = {}
 """Probes by the folder that declares them. They share a Warp module: a folder of tests compiles once."""
 
 

@@ -1,7 +1,5 @@
 """Helpers to wait for, inspect and kill processes."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

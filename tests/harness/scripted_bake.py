@@ -1,7 +1,5 @@
 """Bake without simulation: episodes of scripted views and ticks go through output folder, exporters, commit and lists, in this process."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

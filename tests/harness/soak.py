@@ -5,8 +5,6 @@
 prints progress lines, and at the end JSON: samples of memory [B] and of open files, each summed over the bake and its writers.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

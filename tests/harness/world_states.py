@@ -7,8 +7,6 @@ Arrays: every device array that a simulation reaches is found. What is no state,
 ticks, by NaN or by numbers of an earlier tick, and then the state is loaded into its own worlds: nothing may change.
 """
 
-from __future__ import annotations
-
 import types
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence

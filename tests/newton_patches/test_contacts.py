@@ -1,7 +1,5 @@
 """Contacts: matching, in which one without a partner takes the nearest one left; manifolds; and friction."""
 
-from __future__ import annotations
-
 import newton
 import numpy as np
 import pytest

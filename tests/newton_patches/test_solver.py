@@ -1,8 +1,6 @@
 """Fused solver: results are bitwise identical to those of Newton's separate kernels. Broad phase: the same contacts as with Newton's, from
 fewer pairs; narrow phase: which kernels are compiled."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from functools import cache, partial

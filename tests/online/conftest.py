@@ -1,7 +1,5 @@
 """Streams and bakes of the same small settings: two episodes of boxes."""
 
-from __future__ import annotations
-
 import pytest
 
 from synpick_warp.configs.schema import LAYERS

@@ -1,7 +1,5 @@
 """PyTorch dataset of a stream, with PyTorch itself; skipped where it is not installed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

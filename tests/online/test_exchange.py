@@ -1,7 +1,5 @@
 """Ring of batches: consumers read after the rendering, and the renderer waits for them, also on streams of their own; and `render`."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 

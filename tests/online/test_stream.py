@@ -1,7 +1,5 @@
 """Online generator: the views of a bake in memory, whatever is chosen of them; and nothing is left of a stream that was left."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import subprocess

@@ -1,8 +1,6 @@
 """Clutter graph: edges from votes, minimum feedback arc sets, transitive closure; of few instances and of as many as eight words hold.
 Occlusion votes along contours of synthetic images, and the graphs that follow from them."""
 
-from __future__ import annotations
-
 import networkx as nx
 import numpy as np
 import pytest

@@ -1,8 +1,6 @@
 """Segmentation of images of ids: components, contours, distances, grasp points and visible areas; known answers, then OpenCV and SciPy.
 The images: G-buffers of camera 0 without the gripper, and the number of views of a batch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

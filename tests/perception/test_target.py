@@ -1,8 +1,6 @@
 """Choice of the target instance, and of grasp points on it where the surface is flat. Grasp poses: inverse kinematics of the gripper, grasp
 points and normals of surfaces with known answers."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A small data set of all formats, and a copy of it in which every name is hostile."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page in a real Chromium: no message, no request, nothing hostile runs, and what is to be pressed answers."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,8 +1,6 @@
 """The page as text: what it has, what it may run, sets of every shape, bad input in one line; its markup, and its pictures. Plots: their
 values are those of the statistics, Vega-Lite compiles them, names are values only. Findings: each is raised where a person would."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

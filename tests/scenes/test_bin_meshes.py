@@ -1,7 +1,5 @@
 """Bins from meshes: what is measured, that collision shapes fill the solid and nothing free, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Bins (tote, pallet, table, custom rows): ray casts show that visual meshes and collision shapes agree; settings. Gripper heads of all
 kinds: closed meshes, positions of the cups, extents of the collision shapes equal to those of the visual meshes."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path

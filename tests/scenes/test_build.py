@@ -1,7 +1,5 @@
 """The simulation model: layout, number of body slots, and selection of body variants."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import newton

@@ -1,7 +1,5 @@
 """The object catalog: BOP folders, other meshes, mass and density, concavity, and errors."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Collision shapes: simplified hulls, mass properties, convex decomposition and its cache."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The embedded objects: watertight, with the right sizes, masses, label orientation and symmetries."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

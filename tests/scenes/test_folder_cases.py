@@ -1,7 +1,5 @@
 """Model and light folders of strangers: one bad file leaves the others, names and layouts are as exporters write them."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

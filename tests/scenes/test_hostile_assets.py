@@ -1,7 +1,5 @@
 """Hostile model folders and light maps, also by fuzzing: one line or valid content; nothing outside is read or written, no hang."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

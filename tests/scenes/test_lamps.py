@@ -1,7 +1,5 @@
 """Sun and lamp extraction, and suns of sIBL sets: direction, irradiance, sample points, and that no light is lost or counts twice."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

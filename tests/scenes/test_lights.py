@@ -1,7 +1,5 @@
 """Environment maps: orientation, sIBL sets, and hostile or invalid files: one line at once, nothing outside is read."""
 
-from __future__ import annotations
-
 import os
 import struct
 import time

@@ -1,7 +1,5 @@
 """Mesh import: PLY, STL, GLB and STEP, materials, colours, textures of any depth, and invalid files."""
 
-from __future__ import annotations
-
 import json
 import re
 import struct

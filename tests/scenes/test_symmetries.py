@@ -1,7 +1,5 @@
 """Symmetries of objects: detected on bodies whose groups are known, declared in the object table, and written as BOP has them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,8 +1,6 @@
 """OBJ and MTL import: spellings of the same, options of textures, PBR, what is missing or ignored, textures that repeat; polygons. Vertex
 normals of meshes without any: creases, seams, degenerate triangles, and what must not notice split vertices."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

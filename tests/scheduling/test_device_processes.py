@@ -1,7 +1,5 @@
 """Processes of devices: what they report, how they are stopped and lost, that none outlives the bake; and the bytes of bakes on several."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,8 +1,6 @@
 """Sizes that settings leave open: worlds from episodes, and batches, worlds and writers from free memory; the order of episodes; fills by
 `arrangement.counts`, and capacities of a world for contacts, pairs and rows: what raises them, and that piles stay below."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 from typing import Any

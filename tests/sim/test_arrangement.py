@@ -1,7 +1,5 @@
 """Which episode a world gets; its mode, objects and light, and where the objects fall from."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

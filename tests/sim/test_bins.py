@@ -1,7 +1,5 @@
 """Bins of worlds: which one an episode draws and where; that everything is in its frame; and piles at rest in bins, also in full ones."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,8 +1,6 @@
 """The gripper: force law, corners and setpoint, without a physics engine; then simulated under its drive, alone in worlds: free, following,
 against wall and floor; and how its joints turn and tilt."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 

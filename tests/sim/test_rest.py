@@ -1,7 +1,5 @@
 """When a pile rests, what is dropped again, and how episodes end: scripted bodies, without a physics engine."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

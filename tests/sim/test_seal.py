@@ -1,7 +1,5 @@
 """Seals in the real physics: force, break and swing; and their wrench against a NumPy twin."""
 
-from __future__ import annotations
-
 from functools import reduce
 from types import SimpleNamespace
 

@@ -1,8 +1,6 @@
 """Whole worlds: what physics must hold, and how episodes end; captured graphs give bitwise the ticks of single launches. That an episode
 is the same in any world: `test_trajectory_bake`."""
 
-from __future__ import annotations
-
 import ctypes
 from collections import defaultdict
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Island sleeping: objects at rest fall asleep; touched ones wake and move as if never asleep; checkpoints are exact."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

@@ -1,7 +1,5 @@
 """Exact states: branches continue as their episodes do, nothing is forgotten, and what does not fit is refused."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ class Scene:
     own: list[Rows]
 
     @classmethod
-    def of(cls, simulation: Simulation) -> Scene:
+    def of(cls, simulation: Simulation) -> "Scene":
         every, queue = range(simulation.layout.worlds), simulation.state.next_episode.numpy().copy()
         scene = cls(simulation, simulation.get_state(every), queue, watch(simulation, every, TICKS))
         scene.reset()

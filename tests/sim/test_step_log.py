@@ -3,8 +3,6 @@
 The laws of motion and of impedance, in every step of a baked episode, are checked by tools.checks.trajectory (`test_trajectory_bake`).
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

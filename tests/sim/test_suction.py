@@ -1,8 +1,6 @@
 """Suction rays: plates, edges, reach, concave objects, neighbours; bodies stay at their poses. Vacuum of a cup on plates, rings, gratings,
 pins, balls and blocks: the force that it holds follows from geometry, and so does what is lifted."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from types import SimpleNamespace

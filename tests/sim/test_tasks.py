@@ -1,7 +1,5 @@
 """How attempts begin, go on and end, on worlds without physics."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

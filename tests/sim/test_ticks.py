@@ -3,8 +3,6 @@
 First on the device; then on a model of a GPU that executes its streams in random order; last, what a snapshot says of the frame before.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import random

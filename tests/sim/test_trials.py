@@ -1,8 +1,6 @@
 """Grasp trials: moments of choice, outcomes as of attempts, labels that do not depend on worlds, and grasps that are refused; grasp
 candidates: shares, strata, weights, uniform pixels, grasps on surfaces, and independence of the world."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

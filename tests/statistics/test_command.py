@@ -1,7 +1,5 @@
 """Command `stats`: text, JSON and CSV say the same, sets of every shape give what they have, and bad input is one line."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

@@ -1,8 +1,6 @@
 """Figures: known answers on a hand-made data set, twins in NumPy, merges that equal the whole, and the comparison with the paper. AUC,
 calibration and bootstrap: known answers by hand, brute force over pairs, and intervals that cover what they should."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import itertools

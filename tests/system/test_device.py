@@ -1,8 +1,6 @@
 """Compilation ahead of launches: dry launches run nothing and name modules, which are compiled once, in threads; SM partitions of a GPU.
 Warm-up: it launches what a bake launches, writes caches only, and counts what was compiled."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import subprocess

@@ -1,8 +1,6 @@
 """Untrusted input: paths stay inside their folder, reads are bounded, every mistake is one line; crops of PNG files; tables as text.
 Hostile settings: TOML files and `--set` values of any content give a configuration or one line, at once."""
 
-from __future__ import annotations
-
 import os
 import time
 import tomllib

@@ -1,8 +1,6 @@
 """The machine: usable CPU cores and free memory; cache folders, whose replacement is a note that names folder and variable; other threads
 that may launch kernels."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -1,7 +1,5 @@
 """Processes and signals: requests to stop, interrupts that libraries swallow, isolated calls that end alone, pools of workers."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import math

@@ -1,7 +1,5 @@
 """Benchmarks of bakes: their rows, and the process that verifies and deletes episodes. Measured values are not asserted."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """Benchmarks of pictures alone, and beside other simulators and renderers; without their libraries one line. No times are asserted."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

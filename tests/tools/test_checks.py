@@ -2,8 +2,6 @@
 figures: runs as JSON, the newest of each stage, and READMEs whose tables follow from them; the table of clients: readers that agree,
 that disagree, that fail, that are not there (pycocotools alone, as everyone has it)."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Comparisons: of data sets, by file and key, pixel, index or line in it; of outputs between devices; of two checkouts by the guard."""
 
-from __future__ import annotations
-
 import io
 import json
 import operator

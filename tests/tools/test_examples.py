@@ -1,8 +1,6 @@
 """Examples of training: a network on the stream of tiny boxes; the picker on drawn boxes whose tops are flat in the middle alone. Skipped
 without PyTorch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The report on photographs: known scores, augmentation that keeps labels on objects, tiny trainings; skipped without PyTorch."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

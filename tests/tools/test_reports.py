@@ -1,7 +1,5 @@
 """Reports and benchmarks: statistics and bounds, and that they run on small worlds or known data. Measured values are not asserted."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """Sampling of modes, objects and drop poses in NumPy, from the laws in the docstrings of kernels.sim.arrangement and drop."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

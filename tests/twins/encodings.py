@@ -1,8 +1,6 @@
 """Depth PNG data in NumPy and whole numbers, from the laws in `system.codecs.depth_png` and kernels.encoding.png's docstrings, and
 entropy-coded segments of baseline JPEG, from ITU-T T.81, annex F, and the tables of `system.codecs.jpeg`."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measure of periodic image artefacts (Welch, 1967): windowed power spectra at grid frequencies, relative to neighbouring frequencies."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from synpick_warp.codes import Segment

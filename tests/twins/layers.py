@@ -1,8 +1,6 @@
 """Annotations of toy scenes: rendered layers, and NumPy twins of projection, rigid motion, pixel counts and bounding boxes; semi-global
 matching of a rectified pair, written from its formulas."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """NumPy twin of amodal masks in boxes: packed from mask images, and unpacked to these pixel by pixel."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """NumPy and OpenCV reference implementations of segmentation and grasp points, and a harness that feeds synthetic images of ids."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Synthetic images of piles, segmented by OpenCV, and NumPy reference implementations of grasp planning."""
 
-from __future__ import annotations
-
 import itertools
 from types import SimpleNamespace
 from typing import Any
@@ -104,7 +102,7 @@ class PlannerHarness:
         self.planner = GraspPlanner(Perception(exact_cycle=self.scene.perception.exact_cycle), self.images, self.arrays)
 
     @classmethod
-    def unseen(cls, device: Any, views: int, instances: int, **options: Any) -> PlannerHarness:
+    def unseen(cls, device: Any, views: int, instances: int, **options: Any) -> "PlannerHarness":
         """Views that show nothing, for tests that set the observation."""
         return cls(device, [np.full((4, 4), -1)] * views, [np.ones((4, 4))] * views, instances, **options)
 

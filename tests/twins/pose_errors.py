@@ -3,8 +3,6 @@
 Written after them, one pair at a time; the toolkit itself is not on the package index.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ray casting in float64: a reference G-buffer, hits of rays on a mesh; and whether a mesh is closed and consistently oriented."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Counter-based SplitMix64 in NumPy: the twin of kernels.rng. All functions take arrays as well as scalars."""
 
-from __future__ import annotations
-
 import numpy as np
 
 GAMMA = np.uint64(0x9E3779B97F4A7C15)

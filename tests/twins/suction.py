@@ -1,8 +1,6 @@
 """The cup's rays and seals in NumPy, from the laws in the kernels' docstrings: triangle by triangle, and by whole matrices; and the
 gripper's corners, setpoint and force, from those of kernels.sim.gripper."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace

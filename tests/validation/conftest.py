@@ -1,8 +1,6 @@
 """A small data set to validate: of boxes, rendered analytically, as scenes and shards; and foreign BOP layouts that are made of it:
 T-LESS, YCB-V, ITODD, BOP-Industrial (several sensors), imagewise."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import tarfile

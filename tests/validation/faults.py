@@ -1,8 +1,6 @@
 """Faults to plant in a copy of a correct data set: the rule that must find each, words of its message, and how it is planted. Plants are
 functions of the set's folder that edit annotations, images, masks or bytes."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,8 +1,6 @@
 """The command `validate`: exit codes, lines, JSON, rules, options; and the same result from several processes. Of hostile and broken
 folders it ends with violations or with one line, never with a traceback, and touches nothing else."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

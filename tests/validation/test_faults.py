@@ -2,8 +2,6 @@
 deviations within the tolerance are reported and no errors; gross and logical faults are still found. Measures against known answers and
 brute force: masks, shifts, diameters, TIFF headers, symmetries."""
 
-from __future__ import annotations
-
 import json
 from types import SimpleNamespace
 from typing import Any

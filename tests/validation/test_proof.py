@@ -1,7 +1,5 @@
 """Proofs by replication: the episodes that a seed draws are baked again; what differs is named, and so is what cannot be compared."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path

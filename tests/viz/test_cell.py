@@ -2,8 +2,6 @@
 and the command on folders of models and data sets.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Attempts drawn from a data set's files: what is in the picture and where, the words, and what happens to damaged files."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,8 +1,6 @@
 """The drawn clutter graph: edges that run downward, and nothing that overlaps; hostile records are drawn, or their line is named. Scene
 graphs of data sets: edges by forces and masks, the order, and what a bake's files say of them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import time

@@ -1,7 +1,5 @@
 """Contact sheets: what is on them, and what happens without a data set."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

@@ -1,7 +1,5 @@
 """Meshes of bins for tests: solids of boxes, with known floors, walls and dividers [m]."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,8 +1,6 @@
 """Finished data sets of boxes, written by the exporters without a bake: two episodes of three frames and cameras, three instances; and
 the content of manifest entries of episodes, as a bake gives it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path

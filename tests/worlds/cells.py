@@ -1,7 +1,5 @@
 """Cells with cameras of their own: rows of [[camera]] tables, and bakes of boxes that are stirred under them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Small data set for evaluations, written without a bake: two episodes, objects with known symmetries on straight paths; and synthetic
 estimates around analytic trajectories: rest, constant velocity, constant rotation rate; with noise, outliers and gaps."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

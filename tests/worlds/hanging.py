@@ -1,7 +1,5 @@
 """Boxes of given masses attached to cups in the real physics, lifted by a scripted gripper."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Worlds without a physics engine: state and constants of kernels, with bodies at fixed poses."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Model files made by hand: a tetrahedron as PLY and OBJ, pictures, and any mesh."""
 
-from __future__ import annotations
-
 import json
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Scripted worlds: tick reports written by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import fields
 from types import SimpleNamespace

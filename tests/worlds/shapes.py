@@ -1,7 +1,5 @@
 """Shapes, materials, lights and cameras of small analytic scenes; poses are x, y, z [m] and a quaternion x, y, z, w."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

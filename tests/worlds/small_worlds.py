@@ -1,7 +1,5 @@
 """Small scenes that simulate quickly, also with perception: boxes and an L of two boxes, and settings of episodes of a second or two."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

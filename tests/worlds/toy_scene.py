@@ -1,7 +1,5 @@
 """Small analytic scenes and their rendering: shapes under simple lights; views of many boxes, placed at random, without physics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

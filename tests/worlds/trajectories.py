@@ -1,8 +1,6 @@
 """Tick batches with physics arrays of pseudo-random values seeded by episode and frame, zarr stores made of them, and records of attempts,
 as attempts.jsonl has them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Small USD data sets: objects made of one or two boxes that drift through an episode; one of them is picked."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 from pathlib import Path

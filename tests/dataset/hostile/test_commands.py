@@ -1,7 +1,5 @@
 """Hostile copies of a data set: whatever one of its files says, reading ends with a result or with one line, never with a traceback."""
 
-from __future__ import annotations
-
 import functools
 import json
 import shutil

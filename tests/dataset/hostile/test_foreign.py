@@ -1,7 +1,5 @@
 """What does not belong into a data set: planted names and rights, pipes and sockets, what file managers leave, counts without data."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import errno

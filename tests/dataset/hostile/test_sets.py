@@ -1,8 +1,6 @@
 """Hostile data sets: edited, damaged or made by somebody else; resume, verify and merge neither read, write nor remove outside of them. By
 known faults, and by fuzz: any record, checksum list, scene or shard ends in one line."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

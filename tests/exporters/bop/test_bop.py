@@ -1,8 +1,6 @@
 """BOP writer: data sets written by the real pool from views of boxes, read back with OpenCV and json. Multisensor layout: one scene per
 episode whose files equal those of the classic layout. Of both, bop_dataset_params.py, run on a stand-in for the toolkit's module."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

@@ -2,8 +2,6 @@
 projections, and visibility against ray casts. YOLO labels against the views; and outlines of masks, which are exact for readers that fill
 polygons by OpenCV and by pycocotools. A tick and views of 200 instances in all formats, from lists and from words, checked in float64."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

@@ -1,8 +1,6 @@
 """Webdataset shards written by the real pool from views of boxes, read back with webdataset, tarfile, OpenCV and pycocotools. Their card,
 as Hugging Face's `datasets` reads it, offline and in a process of its own; size categories; licence."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import io

@@ -1,8 +1,6 @@
 """Zarr store: exporter contract, and its content as read by plain zarr, compared with the batches that were written. Of a bake, recorded
 trajectories obey the laws of motion, and bytes depend neither on worlds nor on the lead of physics."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil

@@ -1,8 +1,6 @@
 """USD data sets as files: exporter contract, assets, references, and USD's own validators. Bakes: bodies projected by USD's cameras match
 BOP's masks pixel by pixel; an episode's own materials stand in place of those of the assets, also after a conversion."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

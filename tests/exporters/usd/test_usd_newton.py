@@ -1,7 +1,5 @@
 """Newton imports USD episodes: same bodies, masses, poses of the first frame, and collision shapes."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 
 import newton

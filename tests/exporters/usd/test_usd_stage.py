@@ -1,7 +1,5 @@
 """Layers of USD episodes: poses, visibility, cameras and lights, read with USD's own functions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

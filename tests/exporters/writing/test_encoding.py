@@ -1,8 +1,6 @@
 """PNG encoder: OpenCV and Pillow decode the pixels that were encoded. Its deflate does not depend on the stream's address. Run-length
 encoding: runs of masks from run boundaries of images, and COCO's counts."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import zlib

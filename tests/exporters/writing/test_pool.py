@@ -1,7 +1,5 @@
 """Writer process pool: order, back-pressure, failures, processes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

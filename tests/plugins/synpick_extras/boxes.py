@@ -1,7 +1,5 @@
 """A format of a few lines: a folder of images and boxes for each scene. Writer processes import this module, so it imports little."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

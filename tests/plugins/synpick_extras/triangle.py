@@ -1,7 +1,5 @@
 """Gripper with three suction cups at the corners of a triangle."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from synpick_warp.configs.cell.gripper import SUCTION_ARRAY, Gripper

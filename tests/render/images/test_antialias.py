@@ -1,7 +1,5 @@
 """Anti-aliasing and supersampled shading: coverage against known geometry, no change beside discontinuities, means of pixels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

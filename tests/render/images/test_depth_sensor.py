@@ -1,7 +1,5 @@
 """Depth sensor model: noise, disparity quantization and invalid pixels against their laws, on scenes of known depth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

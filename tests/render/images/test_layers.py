@@ -1,7 +1,5 @@
 """Annotation layers: known normals, albedo, NOCS, class ids and flow, flow against poses in float64; analytic suction maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Post-processing: tone curves and camera effects against their laws and a NumPy twin."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from types import SimpleNamespace

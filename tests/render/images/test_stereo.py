@@ -1,7 +1,5 @@
 """Active stereo camera: infrared pair against its geometry and light, matched depth against known planes, NumPy's twin and OpenCV."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """BRDF, sample points and importance sampling of environment maps; specular anti-aliasing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

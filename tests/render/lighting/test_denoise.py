@@ -1,7 +1,5 @@
 """Variance-guided denoiser on synthetic input, orders of coarse pixels, and lists of those that trace paths."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import warp as wp

@@ -1,7 +1,5 @@
 """Modes of the renderer: known amounts of light, the same annotations, the path-traced reference, and the error of the denoised light."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

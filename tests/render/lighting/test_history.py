@@ -1,7 +1,5 @@
 """Temporal accumulation: what is remembered and what is forgotten; queued paths have the light of paths that one thread traces."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace

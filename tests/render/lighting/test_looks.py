@@ -1,7 +1,5 @@
 """Shading and randomized looks: textures, exposure and tables of light; draws follow their distributions, records say what is shown."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Lamp shadows: packed bytes against NumPy, boxes of moving bodies, reused rays, and the known profile of a straight edge."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """G-buffer: depth, segmentation ids, amodal masks, pixel counts and boxes; known sizes, float64 and a NumPy twin; up to 251 instances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

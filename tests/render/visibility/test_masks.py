@@ -1,7 +1,5 @@
 """Masks: the pool of their words, lists of run boundaries and ground truth of views, against loops, NumPy and known answers."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import fields, replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Triangle rasterizer, behind pinholes and lenses: its G-buffer equals that of ray tracing, of float64 and of OpenCV, for any triangles."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

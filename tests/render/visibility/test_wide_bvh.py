@@ -1,7 +1,5 @@
 """Rays: queries of the wide BVH against a test of every triangle, and the empty interior of the tote, which they skip."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

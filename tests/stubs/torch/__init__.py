@@ -1,7 +1,5 @@
 """Stand-in for PyTorch where it is not installed: the few functions that batches need, on NumPy arrays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from torch.utils import data  # noqa: F401  # as `import torch` has it
@@ -10,7 +8,7 @@ from torch.utils import data  # noqa: F401  # as `import torch` has it
 class Tensor(np.ndarray):
     """Array with the methods of a tensor that tests and the README use."""
 
-    def float(self) -> Tensor:
+    def float(self) -> "Tensor":
         return self.astype(np.float32)
 
 

@@ -1,7 +1,5 @@
 """Stand-in for torch.utils.data: a DataLoader whose workers are copies made by pickle, in this process."""
 
-from __future__ import annotations
-
 import pickle
 import random
 from collections.abc import Callable, Iterator
