@@ -138,11 +138,7 @@ def draw_training_views(episodes: list[Episode]) -> Image:
 
 
 def draw_pick(episode: Episode) -> list[Image]:
-    """Frames of the episode's first successful attempt, seen from the side.
-
-    Raises:
-        SynpickError: No attempt succeeded.
-    """
+    """Frames of the episode's first successful attempt, seen from the side. Raises SynpickError: no attempt succeeded."""
     attempt = next((attempt for attempt in episode.attempts if attempt["picked"]), None)
     if attempt is None:
         raise SynpickError("no attempt of the episode picked anything; choose another seed")
@@ -153,11 +149,8 @@ def draw_pick(episode: Episode) -> list[Image]:
 
 
 def draw_cell(folder: Path) -> Image:
-    """Picture of the robot cell that the first STEPS code blocks of the page make in a folder without a CELL: CELL/cell.png.
-
-    Raises:
-        SynpickError: A block failed.
-    """
+    """Picture of the robot cell that the first STEPS code blocks of the page make in a folder without a CELL: CELL/cell.png. Raises
+    SynpickError: a block failed."""
     command, root = f'synpick-warp() {{ {shlex.quote(sys.executable)} -m synpick_warp "$@"; }}\n', str(PAGE.parents[1])
     for language, text in re.findall(r"```(bash|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[:STEPS]:
         program = [sys.executable, "-c", text] if language == "python" else ["bash", "-e", "-c", command + text]

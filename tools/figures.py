@@ -82,11 +82,7 @@ def _commit() -> str | None:
 
 
 def read_runs(folder: Path = RESULTS) -> dict[str, Run]:
-    """Runs of the files in a folder, by file name.
-
-    Raises:
-        msgspec.ValidationError: A file is no run.
-    """
+    """Runs of the files in a folder, by file name. Raises msgspec.ValidationError: a file is no run."""
     return {path.name: msgspec.json.decode(path.read_bytes(), type=Run) for path in sorted(folder.glob("*.json"))}
 
 

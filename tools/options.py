@@ -130,11 +130,7 @@ def make_parser(
 
 def configure(options: argparse.Namespace, fixed: Mapping[str, object], defaults: Mapping[str, object] | None = None) -> Config:
     """Load the settings of a tool: `--config`, overridden by `defaults`, `--set`, then shared options (with `--config` those given), then
-    by `fixed`.
-
-    Raises:
-        ConfigError: A setting is unknown or out of its range.
-    """
+    by `fixed`. Raises ConfigError: a setting is unknown or out of its range."""
     overrides: dict[str, object] = dict(defaults or {}) | dict(parse_assignment(text) for text in options.set)
     preset = getattr(options, "config", None)
     for name, setting in SETTINGS.items():

@@ -63,10 +63,7 @@ def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: s
         indexed: Pattern of the names of files that indices are made of.
         source: Its object, for messages.
 
-    Raises:
-        DatasetError: It is damaged, too large, or has files that no index is made of.
-        OutputError: The folder cannot be written.
-    """
+    Raises DatasetError: it is damaged, too large, or has files that no index is made of; OutputError: the folder cannot be written."""
     try:
         stream = zlib.decompressobj(31)
         plain = stream.decompress(data, MAX_BUNDLE)

@@ -30,13 +30,9 @@ AHEAD = 256
 
 def finalize_store(ledger: Ledger, folder: Path) -> int:
     """Finalize a data set: writes the indices over all episodes, if all are done and the indices do not cover them yet. Returns the number
-    of episodes that are not done; 0: the data set is finished. `folder`: an empty one, for temporary files.
-
-    Raises:
-        DatasetError: An index file is damaged.
-        OutputError: The temporary folder cannot be written.
-        StoreError: An object was deleted that the indices are made of, another plan was finalized at once, or the store does not answer.
-    """
+    of episodes that are not done; 0: the data set is finished. `folder`: an empty one, for temporary files. Raises DatasetError: an index
+    file is damaged; OutputError: the temporary folder cannot be written; StoreError: an object was deleted that the indices are made of,
+    another plan was finalized at once, or the store does not answer."""
     if ledger.finished():
         return 0
     if missing := sum(map(len, ledger.remaining(ledger.layout.plan()))):

@@ -79,11 +79,8 @@ class Copier:
             digest: Expected SHA-256; None: unchecked.
             limit: Largest size [B].
 
-        Raises:
-            DatasetError: Its checksum differs, or its name leads out of the folder.
-            OutputError: The folder cannot be written.
-            SizeError: It is larger.
-        """
+        Raises DatasetError: its checksum differs, or its name leads out of the folder; OutputError: the folder cannot be written;
+        SizeError: it is larger."""
         path, state = path_inside(self.folder, name, self.store.url, DatasetError), hashlib.sha256()
         if path.exists():
             return True
@@ -308,10 +305,7 @@ def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = 
         limit: Size of the cache of episodes [B]; the last one is kept whatever its size.
         episodes: Indices of the episodes to show; None: all.
 
-    Raises:
-        DatasetError: The prefix has no data set.
-        StoreError: The store cannot be read.
-    """
+    Raises DatasetError: the prefix has no data set; StoreError: the store cannot be read."""
     return StoreDataSet(StoreCache(url, limit), episodes)
 
 

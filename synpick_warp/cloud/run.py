@@ -130,9 +130,7 @@ def bake_into_store(
     Returns:
         Summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their chunks.
 
-    Raises:
-        SynpickError: An error that the user can correct; done episodes stay, and the same bake resumes.
-    """
+    Raises SynpickError: an error that the user can correct; done episodes stay, and the same bake resumes."""
     job = replace(job, config=with_measures(job.config, devices))
     ranges = DataLayout.of(job.config).plan_shard(job.splits, shard)
     ledger = open_ledger(job)

@@ -54,10 +54,8 @@ def start_bake(
         workers: Number of the engine's workers.
         crew: Receives number and time of the workers of an engine, or of claiming ones on these devices, for a display.
 
-    Raises:
-        ConfigError: Claims share out the episodes, and so does `shard`; a cluster's devices are its own.
-        SynpickError: As `run.bake_into_store`.
-    """
+    Raises ConfigError: claims share out the episodes, and so does `shard`; a cluster's devices are its own; SynpickError: as
+    `run.bake_into_store`."""
     job, crew = replace(job, splits=tuple(splits)), crew or Crew()
     if (claim or engine) and shard != (0, 1):
         raise ConfigError("workers that claim share out the episodes among them; drop the shard")

@@ -47,9 +47,7 @@ def check_value(key: str, value: object, item: Setting, source: str) -> Any:
         value: The value as parsed from TOML.
         source: Where the value comes from, for messages, such as "in my.toml".
 
-    Raises:
-        ConfigError: The value has the wrong type or length, is not finite, or lies outside the setting's range.
-    """
+    Raises ConfigError: the value has the wrong type or length, is not finite, or lies outside the setting's range."""
     hint = ""
     try:
         result = _convert(item.parse(value) if item.parse else value, item.kind)

@@ -87,9 +87,7 @@ class Views:
             min_visibility: Instances with a smaller visible fraction, or without visible pixels, are left out of a sample.
             transform: Called with each sample, which also has its `episode`, `camera` and `frame`; must be picklable for workers.
 
-        Raises:
-            DatasetError: There is no such data set, split, camera or field, or a value is out of range.
-        """
+        Raises DatasetError: there is no such data set, split, camera or field, or a value is out of range."""
         if wrong := [name for name in fields if name not in FIELDS and name not in LAYERS]:
             near = suggest(str(wrong[0]), [*FIELDS, *LAYERS])
             raise DatasetError(f"there is no field {wrong[0]}{near}; fields: {', '.join(FIELDS)}; layers: {', '.join(LAYERS)}")

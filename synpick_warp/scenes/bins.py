@@ -59,12 +59,8 @@ class Bin:
 
 
 def make_bins(sizes: Iterable[BinSizes]) -> tuple[Bin, ...]:
-    """Build bins.
-
-    Raises:
-        ConfigError: The sizes of a bin do not fit each other, its mesh cannot be used or is not the one that was measured, or all bins
-            together have more than MAX_SHAPES collision shapes.
-    """
+    """Build bins. Raises ConfigError: the sizes of a bin do not fit each other, its mesh cannot be used or is not the one that was
+    measured, or all bins together have more than MAX_SHAPES collision shapes."""
     bins = tuple(map(_make_bin, sizes))
     if (count := sum(len(one.pieces) for one in bins)) > MAX_SHAPES:
         raise ConfigError(f"{len(bins)} bins have {count} collision shapes; allowed: {MAX_SHAPES}; use fewer, or simplify their meshes")
@@ -177,12 +173,9 @@ def rim_height(tote: Tote) -> float:
 
 
 def tote_fixture(tote: Tote, more: Sequence[Patch] = ()) -> Fixture:
-    """Build the visual mesh: a closed shell for the tote, one for each rib, and `more`, with which its interior is not empty.
-
-    Raises:
-        ConfigError: The rim does not fit into the outer size, the floor is larger than the rim or too small for its rounded corners, or the
-            tote is lower than three walls.
-    """
+    """Build the visual mesh: a closed shell for the tote, one for each rib, and `more`, with which its interior is not empty. Raises
+    ConfigError: the rim does not fit into the outer size, the floor is larger than the rim or too small for its rounded corners, or the
+    tote is lower than three walls."""
     _check(tote)
     wall, top = tote.wall, rim_height(tote)
     under = top - wall
@@ -216,12 +209,8 @@ def tote_interior(tote: Tote) -> Interior:
 def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
     """Build the convex collision shapes: floor, four walls and four corners, with inner faces that coincide with the visual mesh.
 
-    The walls follow the draft, from below the floor to the rim, and extend to the edge of the flange. A corner's inner face is one plane
-    at 45° tangent to the visible rounding, from which it deviates by at most 8 % of the radius.
-
-    Raises:
-        ConfigError: As `tote_fixture`.
-    """
+    The walls follow the draft, from below the floor to the rim, and extend to the edge of the flange. A corner's inner face is one plane at
+    45° tangent to the visible rounding, from which it deviates by at most 8 % of the radius. Raises ConfigError: as `tote_fixture`."""
     _check(tote)
     top = rim_height(tote)
     outer = np.maximum(np.array(tote.outer_size[:2]) / 2, np.array(tote.rim_size) / 2 + MIN_WALL)

@@ -112,9 +112,7 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
     Args:
         rules: Whether objects repeat in an episode: the values by `find_repeat_rules`.
 
-    Raises:
-        ConfigError: No object fits into the volume budget, or `count_entries` refuses a part.
-    """
+    Raises ConfigError: no object fits into the volume budget, or `count_entries` refuses a part."""
     if arrangement.counts:
         most = count_entries(arrangement.counts, catalog)[:, 1]
         compounds = sum(int(number) for number, entry in zip(most, catalog.entries, strict=True) if len(entry.pieces) > 1)

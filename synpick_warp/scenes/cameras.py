@@ -34,11 +34,8 @@ _MIN_DISTANCE = 1e-6
 def make_cameras(rig: Rig) -> tuple[Camera, ...]:
     """Build the cameras of a rig, in OpenCV's convention (x right, y down, z forward).
 
-    With a field of view fx = fy = (W / 2) / tan(fov / 2), and the principal point is the middle of the image.
-
-    Raises:
-        ConfigError: A camera's position is its look-at point, or its up vector is zero or parallel to its viewing direction.
-    """
+    With a field of view fx = fy = (W / 2) / tan(fov / 2), and the principal point is the middle of the image. Raises ConfigError: a
+    camera's position is its look-at point, or its up vector is zero or parallel to its viewing direction."""
     return tuple(_make_camera(rig.label(index), row) for index, row in enumerate(rig.rows))
 
 

@@ -137,11 +137,7 @@ _MOST_NAMED = 12
 def count_entries(counts: Counts, catalog: Catalog) -> np.ndarray:
     """Least and largest number of each entry of the catalog in an episode (entry, 2) int32; zero without counts.
 
-    A part is the name of an object, or its obj_id.
-
-    Raises:
-        ConfigError: There is no such object, or there are several.
-    """
+    A part is the name of an object, or its obj_id. Raises ConfigError: there is no such object, or there are several."""
     numbers = np.zeros((len(catalog.entries), 2), np.int32)
     for part, low, high in counts:
         named = [index for index, entry in enumerate(catalog.entries) if entry.name == part]
@@ -174,10 +170,7 @@ def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, 
 
 def check_fill(arrangement: Arrangement, guide_height: float, catalog: Catalog, bins: Sequence[BinSizes]) -> None:
     """Refuse parts by `counts` that do not fit into each bin with walls, at the densest packing of spheres, or between its guide walls.
-
-    Raises:
-        ConfigError: They do not, or `count_entries` refuses a part.
-    """
+    Raises ConfigError: they do not, or `count_entries` refuses a part."""
     if not arrangement.counts:
         return
     most = count_entries(arrangement.counts, catalog)[:, 1]

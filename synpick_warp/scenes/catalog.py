@@ -57,10 +57,8 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         config: Settings: bake.models, objects, object_rows, bins, arrangement.volume, distractors of randomize.
         cache_dir: Folder in which collision shapes are cached; None: `default_cache_dir()`.
 
-    Raises:
-        CatalogError: The folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has an
-            invalid mass. Or time or memory does not suffice for a file.
-    """
+    Raises CatalogError: the folder cannot be used, or none of its objects: a file is damaged, an object does not fit into the tote or has
+    an invalid mass. Or time or memory does not suffice for a file."""
     rules = _Rules(config.objects, config.object_rows, config.cell.bins, config.randomize.surfaces)
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
     if not config.arrangement.counts:

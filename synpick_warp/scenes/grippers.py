@@ -195,11 +195,8 @@ def hinge_patch(gripper: Gripper) -> Patch:
 
 
 def make_cup_array(gripper: Gripper) -> Head:
-    """Build the head of the cups `gripper.cups`, with a plate or the body of `gripper.mesh`.
-
-    Raises:
-        ConfigError: The mesh cannot be used, or is not the one that was measured.
-    """
+    """Build the head of the cups `gripper.cups`, with a plate or the body of `gripper.mesh`. Raises ConfigError: the mesh cannot be used,
+    or is not the one that was measured."""
     if gripper.mesh:
         return _mesh_head(gripper)
     top, sides = PLATE[0], _sides(gripper)
@@ -287,11 +284,8 @@ def make_head(gripper: Gripper) -> Head:
 
 
 def check_reach(gripper: Gripper, suction: Suction, catalog: Catalog) -> None:
-    """Refuse cups of which none can lie on an object that is gripped at the tool centre point.
-
-    Raises:
-        ConfigError: The nearest cup is farther from it than the largest diameter of the catalog.
-    """
+    """Refuse cups of which none can lie on an object that is gripped at the tool centre point. Raises ConfigError: the nearest cup is
+    farther from it than the largest diameter of the catalog."""
     nearest = min(math.hypot(*place) for place in make_head(gripper).cups)
     largest = max(entry.diameter for entry in catalog.entries)
     if nearest - suction.radius > largest:
@@ -323,21 +317,15 @@ class ToolBody:
 
 
 def measure_tool(gripper: Gripper) -> dict[str, Gripper]:
-    """Section, for `override_config`, of a gripper with the checksum of its mesh; none if it has it.
-
-    Raises:
-        ConfigError: The mesh cannot be used as a tool's body.
-    """
+    """Section, for `override_config`, of a gripper with the checksum of its mesh; none if it has it. Raises ConfigError: the mesh cannot be
+    used as a tool's body."""
     checksum = read_body(gripper).checksum if gripper.mesh else ""
     return {} if checksum == gripper.mesh_checksum else {"gripper": replace(gripper, mesh_checksum=checksum)}
 
 
 def read_body(gripper: Gripper) -> ToolBody:
-    """Read the mesh of a gripper, or return it as it was read before in this process.
-
-    Raises:
-        ConfigError: It cannot be used as a tool's body.
-    """
+    """Read the mesh of a gripper, or return it as it was read before in this process. Raises ConfigError: it cannot be used as a tool's
+    body."""
     return read_measured(_body, replace(gripper, mesh_checksum=""), gripper.mesh, "gripper.mesh")
 
 

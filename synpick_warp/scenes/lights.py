@@ -68,10 +68,8 @@ def load_lights(folder: str, report: Callable[[str], None] = ignore, strict: boo
         folder: The folder; empty: the embedded maps.
         strict: Whether the first map that cannot be used is an error.
 
-    Raises:
-        LightError: The folder does not exist or contains no map that can be used, two have the same name, or time or memory of this
-            machine does not suffice for one.
-    """
+    Raises LightError: the folder does not exist or contains no map that can be used, two have the same name, or time or memory of this
+    machine does not suffice for one."""
     if not folder:
         return skies()
     root = Path(folder)
@@ -251,11 +249,8 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """Decode an image in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed.
-
-    Raises:
-        LightError: It is too large, or of a format that is known but not read.
-    """
+    """Decode an image in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed. Raises LightError: it is
+    too large, or of a format that is known but not read."""
     data = read_file(path, MAX_MAP_FILE, LightError)
     if data.startswith(_EXR) or path.suffix.lower() == ".exr":
         raise LightError(f"{path}: OpenEXR maps are not read; save it as Radiance (.hdr)")
@@ -320,9 +315,7 @@ def _canonical_radiance(data: bytes, path: Path) -> tuple[bytes, Callable[[np.nd
     Returns:
         The file with another header, and what turns its image as the header said, and divides by its exposure. None: it has no such header.
 
-    Raises:
-        LightError: The colours are not RGB.
-    """
+    Raises LightError: the colours are not RGB."""
     lines, at = [], 0
     while (end := data.find(b"\n", at, _MAX_HEADER)) >= 0:
         line = data[at:end].rstrip(b"\r")

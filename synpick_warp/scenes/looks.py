@@ -72,10 +72,8 @@ def load_textures(key: str, folder: str, report: Callable[[str], None], strict: 
         key: The setting that names the folder.
         strict: Whether the first image that cannot be used is an error.
 
-    Raises:
-        CatalogError: The folder does not exist, or has no image that can be used, or too many, or time or memory of this machine does not
-            suffice for one.
-    """
+    Raises CatalogError: the folder does not exist, or has no image that can be used, or too many, or time or memory of this machine does
+    not suffice for one."""
     if not folder:
         return ()
     try:

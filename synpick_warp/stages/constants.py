@@ -68,10 +68,7 @@ def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
         sections: Sections of the settings, or other objects with attributes; booleans become integers.
         derived: Members that no section holds under their name or in their unit.
 
-    Raises:
-        AttributeError: A member is in neither.
-        TypeError: `derived` names something that is no member.
-    """
+    Raises AttributeError: a member is in neither; TypeError: `derived` names something that is no member."""
     unknown = derived.keys() - kind.vars.keys()
     if unknown:
         raise TypeError(f"{kind.key} has no members {sorted(unknown)}")

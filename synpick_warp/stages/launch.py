@@ -60,9 +60,7 @@ def launch(
         block_dim: Threads of a block on the GPU.
         given: Arguments that no object has under the parameter's name, by this name, with or without suffix.
 
-    Raises:
-        TypeError: No source has an argument, or several have it, or an argument is none of the kernel's.
-    """
+    Raises TypeError: no source has an argument, or several have it, or an argument is none of the kernel's."""
     arguments = _find_arguments(kernel, sources, out, given)
     device = next(array.device for array in _arrays(arguments))
     wp.launch(kernel_for(kernel, *arguments), dim=dim, inputs=arguments, device=device, block_dim=block_dim)

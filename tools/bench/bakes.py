@@ -160,11 +160,8 @@ class Cleaner:
 
 @contextlib.contextmanager
 def clean_up_behind(layout: DataLayout, out: Path) -> Iterator[Cleaner]:
-    """Context manager: verify the episodes of a bake to `out` while it runs, and delete their files.
-
-    Raises:
-        DatasetError: An episode was damaged.
-    """
+    """Context manager: verify the episodes of a bake to `out` while it runs, and delete their files. Raises DatasetError: an episode was
+    damaged."""
     folders = tuple(map(str, shared_files(load_exporter_classes(layout.formats), layout).folders))
     with Cleaner(CleanedSet(out, folders)) as cleaner:
         yield cleaner

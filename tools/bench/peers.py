@@ -59,11 +59,7 @@ CHECKED_VIEWS = 6
 
 
 def check_installed(peers: tuple[str, ...]) -> None:
-    """Look for the peers' libraries.
-
-    Raises:
-        SynpickError: One is missing.
-    """
+    """Look for the peers' libraries. Raises SynpickError: one is missing."""
     modules = dict.fromkeys(module for peer in peers for module in PEERS[peer])
     if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
         raise SynpickError(f"--compare {','.join(peers)} needs {' and '.join(missing)}: pip install 'synpick-warp[peers]'")

@@ -198,11 +198,8 @@ def number_settings(counts: Counts, number: int) -> dict[str, Any]:
 
 
 def _measure_instances(bench: Bench) -> Iterator[MeasuredRow]:
-    """Time of a tick, contacts and memory of piles of equal workpieces in one bin, DROP_TICKS after the drop and REST_TICKS later.
-
-    Raises:
-        ConfigError: A number does not fit into the bin, or into the device's memory.
-    """
+    """Time of a tick, contacts and memory of piles of equal workpieces in one bin, DROP_TICKS after the drop and REST_TICKS later. Raises
+    ConfigError: a number does not fit into the bin, or into the device's memory."""
     config, device = bench.config, bench.device
     varied = [config.with_values(number_settings(config.arrangement.counts, number)) for number in bench.instances]
     catalog, bins = load_catalog(max(varied, key=lambda each: each.arrangement.max_objects)), make_bins(config.cell.bins)

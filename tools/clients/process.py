@@ -56,11 +56,8 @@ def run_module(client: str, python: str, module: str, *arguments: str) -> tuple[
 
 
 def interpreters(names: Iterable[str], every: tuple[str, ...], given: list[str]) -> Iterator[tuple[str, str]]:
-    """Name and interpreter of each row: the one of this process, or those of options NAME=PATH, where a name may be "all".
-
-    Raises:
-        ValueError: An option is not NAME=PATH with the name of a client.
-    """
+    """Name and interpreter of each row: the one of this process, or those of options NAME=PATH, where a name may be "all". Raises
+    ValueError: an option is not NAME=PATH with the name of a client."""
     chosen: dict[str, list[str]] = {}
     for text in given:
         name, _, path = text.partition("=")

@@ -53,11 +53,7 @@ def main() -> None:
 
 
 def run_command(arguments: list[str]) -> Iterator[Any]:
-    """Run a command of the package; yields all modules of which it has loaded kernels.
-
-    Raises:
-        SystemExit: The command has failed.
-    """
+    """Run a command of the package; yields all modules of which it has loaded kernels. Raises SystemExit: the command has failed."""
     sys.argv = [PACKAGE, *arguments]
     try:
         runpy.run_module(PACKAGE, run_name="__main__", alter_sys=True)

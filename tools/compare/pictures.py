@@ -164,11 +164,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[PictureDifference]:
-    """Render settled piles on both devices and compare all outputs; first those of the denoised mode.
-
-    Raises:
-        SynpickError: Models or lights cannot be used, or a pile does not come to rest.
-    """
+    """Render settled piles on both devices and compare all outputs; first those of the denoised mode. Raises SynpickError: models or lights
+    cannot be used, or a pile does not come to rest."""
     catalog = load_catalog(config, report=console.print)
     lights = load_lights(config.bake.lights)
     simulation = Simulation(with_enough_worlds(config, devices[0]), catalog, len(lights), devices[0])
@@ -189,11 +186,7 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
 
 def settle_piles(simulation: Simulation, count: int) -> Snapshot:
     """Simulate `count` piles until rest, one a world; returns each in the tick in which it begins to act. World w has light map w % their
-    number.
-
-    Raises:
-        SynpickError: A pile does not come to rest.
-    """
+    number. Raises SynpickError: a pile does not come to rest."""
     arrays = {item.name: getattr(simulation.record.snapshot, item.name) for item in fields(Snapshot)}
     piles: dict[int, dict[str, np.ndarray]] = {}
     for _ in range(MAX_TICKS):

@@ -65,11 +65,8 @@ class LayerImages:
 def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
     """Compare two folders; returns counts by type of file (`layer_of`), and the first difference as one line (empty: none).
 
-    Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
-
-    Raises:
-        DatasetError: A folder is missing or empty.
-    """
+    Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists. Raises
+    DatasetError: a folder is missing or empty."""
     names = [_list_files(folder) for folder in (first, second)]
     layers: dict[str, LayerImages] = {}
     first_difference = ""

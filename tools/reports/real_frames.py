@@ -74,11 +74,7 @@ class RealFrame:
 
 
 def read_frames(folder: Path) -> list[RealFrame]:
-    """Read all annotated frames of a folder, by name.
-
-    Raises:
-        DatasetError: There are none, or a file is missing or damaged.
-    """
+    """Read all annotated frames of a folder, by name. Raises DatasetError: there are none, or a file is missing or damaged."""
     names = sorted(path.name.removesuffix("-poses.json") for path in folder.glob("*-poses.json"))
     if not names:
         raise DatasetError(f"{folder} has no frames (SSSS_FFFFFF-poses.json)")
@@ -123,12 +119,8 @@ def _image(path: Path) -> np.ndarray:
 
 
 def write_data_set(folder: Path, models: Path, out: Path) -> Path:
-    """Write the frames of a folder as a BOP data set, with the BOP models of their objects [mm]; returns its folder `out`.
-
-    Raises:
-        DatasetError: A frame or a model is missing or damaged.
-        OutputError: `out` exists, or cannot be written.
-    """
+    """Write the frames of a folder as a BOP data set, with the BOP models of their objects [mm]; returns its folder `out`. Raises
+    DatasetError: a frame or a model is missing or damaged; OutputError: `out` exists, or cannot be written."""
     frames = read_frames(folder)
     if out.exists():
         raise OutputError(f"{out} exists; name a new folder")

@@ -81,10 +81,7 @@ def write_report(
         paper: Whether the paper's numbers stand beside; None: if the objects are the paper's.
         threads, report: As of `compute_statistics`, whose errors are raised.
 
-    Raises:
-        ChartError: The charts' library cannot run.
-        OutputError: The file cannot be written.
-    """
+    Raises ChartError: the charts' library cannot run; OutputError: the file cannot be written."""
     check_out(out)
     read_vega()
     statistics = compute_statistics(data_set, threads=threads, report=report)

@@ -220,11 +220,8 @@ def compute_statistics(
         threads: Maximum number of processes; 0: one per CPU core.
         report: Receives the progress: unit, done, total.
 
-    Raises:
-        ConfigError: The settings are missing or damaged.
-        DatasetError: There is no episode, or a file is missing or damaged.
-        ProcessError: A process died.
-    """
+    Raises ConfigError: the settings are missing or damaged; DatasetError: there is no episode, or a file is missing or damaged;
+    ProcessError: a process died."""
     return assemble(data_set, collect(data_set, depth_views, threads or count_cores(), report))
 
 

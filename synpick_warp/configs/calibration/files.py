@@ -81,10 +81,8 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
         model: Distortion model, where the file does not name it: four coefficients in a file of OpenCV may be of both.
         pixel_center: Image coordinates of the first pixel's centre in the file, 0 or 0.5 [px]; None: those of its format.
 
-    Raises:
-        ConfigError: The file cannot be read or is of no such format, a value is missing or impossible, or a distortion model is not
-            rendered.
-    """
+    Raises ConfigError: the file cannot be read or is of no such format, a value is missing or impossible, or a distortion model is not
+    rendered."""
     tree = read_document(path)
     trees = [tree] if _format(tree) else [part for part in tree.values() if isinstance(part, dict) and _format(part)]
     if not trees:

@@ -108,9 +108,7 @@ class DataLayout:
             shard: (i, n): only indices with index % n == i.
             name: Name of the shard in messages, such as that of the option.
 
-        Raises:
-            ConfigError: An unknown split, an invalid shard, or a shard without episodes.
-        """
+        Raises ConfigError: an unknown split, an invalid shard, or a shard without episodes."""
         check_shard(shard, name)
         planned = self.plan(names, shard)
         if not any(planned):

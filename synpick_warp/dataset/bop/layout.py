@@ -55,11 +55,7 @@ class Listing:
         return self.root / self.name(entry)
 
     def read(self, entry: str, limit: int) -> bytes:
-        """Read a listed file.
-
-        Raises:
-            DatasetError: It cannot be read, or is larger than `limit` [B].
-        """
+        """Read a listed file. Raises DatasetError: it cannot be read, or is larger than `limit` [B]."""
         if entry not in self.files:
             raise DatasetError(f"there is no file {self.name(entry)}")
         return read_file(self.path(entry), limit, DatasetError)

@@ -104,9 +104,7 @@ def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray
     Args:
         linear: Whether the image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are.
 
-    Raises:
-        CatalogError: The image is too large, of another format, or damaged.
-    """
+    Raises CatalogError: the image is too large, of another format, or damaged."""
     if data.startswith(EXR_MAGIC):
         light = decode_exr(data, source, MAX_TEXTURE_PIXELS)
         return np.rint(255.0 * (np.clip(light, 0.0, 1.0) if linear else linear_to_srgb(light))).astype(np.uint8)
@@ -247,9 +245,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
     Returns:
         New texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8.
 
-    Raises:
-        CatalogError: The atlas is too large.
-    """
+    Raises CatalogError: the atlas is too large."""
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:
@@ -304,9 +300,7 @@ def decode_exr(data: bytes, source: str, most: int) -> np.ndarray:
     Args:
         most: Maximum number of pixels, which is checked by the header.
 
-    Raises:
-        CatalogError: The image is too large, damaged or has no such channels.
-    """
+    Raises CatalogError: the image is too large, damaged or has no such channels."""
     try:
         low, high = OpenEXR.File(io.BytesIO(data), header_only=True).header()["dataWindow"]
         width, height = (int(size) for size in np.subtract(high, low, dtype=np.int64) + 1)

@@ -108,9 +108,7 @@ def read_isolated(
     Yields:
         What the function returned, or as `error` why there is nothing.
 
-    Raises:
-        SynpickError: As `error`: time or memory does not suffice, so that elsewhere the same file might be read.
-    """
+    Raises SynpickError: as `error`: time or memory does not suffice, so that elsewhere the same file might be read."""
     for (file, *_), result in zip(calls, run_isolated(function, calls, limits), strict=True):
         if isinstance(result, Failure):
             advice = smaller if result.by_machine else repair
@@ -185,11 +183,8 @@ def read_referred(folder: Path, name: str, owner: object, limit: int) -> tuple[P
     """Read a file of up to `limit` bytes that the model file `owner` refers to, within the object's folder only (`asset_scope`).
 
     A name that is not there is also tried with Windows' separators, in other letter case, and in the folders where exporters put textures.
-
-    Raises:
-        MissingFileError: There is no such file.
-        CatalogError: The name leads out of the folder, or the file is too large or not a regular file.
-    """
+    Raises MissingFileError: there is no such file; CatalogError: the name leads out of the folder, or the file is too large or not a
+    regular file."""
     scope = _scope.get() or AssetScope(folder)
     path = locate(folder, name, owner, CatalogError, scope.root)
     if not os.path.lexists(path):
@@ -216,9 +211,7 @@ def locate(folder: Path, name: str, owner: object, error: type[SynpickError], ro
     Args:
         root: Folder that the name must not lead out of; None: `folder`.
 
-    Raises:
-        SynpickError: As `error`: the name leads out of the folder.
-    """
+    Raises SynpickError: as `error`: the name leads out of the folder."""
     path, fault = folder, None
     try:
         path = path_inside(folder, name, owner, error)

@@ -24,11 +24,8 @@ _VERTEX = re.compile(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read an STL file. Equal corners become one vertex; the triangles' own normals are not used, since they are often wrong.
-
-    Raises:
-        CatalogError: The file cannot be read, or is too large.
-    """
+    """Read an STL file. Equal corners become one vertex; the triangles' own normals are not used, since they are often wrong. Raises
+    CatalogError: the file cannot be read, or is too large."""
     data = read_file(path, MAX_MESH_FILE, CatalogError)
     count = int.from_bytes(data[80:_HEADER], "little")
     # Binary files may begin with "solid" as well, and text with any word: the announced size decides first.
@@ -85,11 +82,7 @@ _CHORD, _ANGLE = 0.05, 0.3
 
 
 def read_step(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read a STEP file, all of its bodies, in metres.
-
-    Raises:
-        CatalogError: cascadio is not installed, or the file cannot be read.
-    """
+    """Read a STEP file, all of its bodies, in metres. Raises CatalogError: cascadio is not installed, or the file cannot be read."""
     data = read_file(path, MAX_TEXT_MESH, CatalogError)
     try:
         cascadio: Any = importlib.import_module("cascadio")

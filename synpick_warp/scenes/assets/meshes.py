@@ -88,9 +88,8 @@ def read_mesh(path: Path, unit: float, options: MeshOptions = MeshOptions(), rep
         unit: Length of the file's unit [m]; STEP files name their own.
         report: Called with one line if features of the file are ignored or replaced.
 
-    Raises:
-        CatalogError: The file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not replaced.
-    """
+    Raises CatalogError: the file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not
+    replaced."""
     notes = Notes(options.substitute)
     if path.suffix.lower() in STEP_SUFFIXES:
         unit, options = 1.0, replace(options, unit=options.unit and "of the file")
@@ -108,10 +107,7 @@ def read_mesh(path: Path, unit: float, options: MeshOptions = MeshOptions(), rep
 
 def read_measured(function: Callable[[Any], Any], settings: Any, file: str, owner: str) -> Any:
     """What `function(settings)` reads of a mesh file, in an isolated process, or read before in this process unless the file has changed.
-
-    Raises:
-        ConfigError: The mesh cannot be used by its `owner`.
-    """
+    Raises ConfigError: the mesh cannot be used by its `owner`."""
     path = Path(file)
     try:
         stat = path.stat()
@@ -140,9 +136,7 @@ def read_cell_mesh(
         file, unit, report: As of `read_mesh`; the unit by its name.
         sides, likely: Least and largest longest side [m], and those by which another unit is proposed, as value of the setting `key`.
 
-    Raises:
-        CatalogError: As `read_mesh`; or the file is no mesh, has too many triangles, or is too small or too large.
-    """
+    Raises CatalogError: as `read_mesh`; or the file is no mesh, has too many triangles, or is too small or too large."""
     path = Path(file)
     if path.suffix.lower() not in SUFFIXES:
         raise CatalogError(f"{path} is no mesh; allowed: {', '.join(SUFFIXES)}")

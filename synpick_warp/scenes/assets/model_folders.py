@@ -60,9 +60,7 @@ def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
         report: Called with each line on what is ignored.
         fault: Called with the error of each object that cannot be used; it may raise it.
 
-    Raises:
-        CatalogError: The folder is missing, cannot be listed or contains no models.
-    """
+    Raises CatalogError: the folder is missing, cannot be listed or contains no models."""
     if not folder.is_dir():
         raise CatalogError(f"models folder {folder}: no such folder; give one of BOP models, or of {_READ}; {PATH_RULE}")
     try:

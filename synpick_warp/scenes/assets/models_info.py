@@ -80,11 +80,7 @@ class FileModelInfo:
 
 
 def bop_obj_id(file: Path) -> int | None:
-    """The obj_id in the name of a BOP model (obj_NNNNNN.ply); None for other files.
-
-    Raises:
-        CatalogError: The number is too large.
-    """
+    """The obj_id in the name of a BOP model (obj_NNNNNN.ply); None for other files. Raises CatalogError: the number is too large."""
     match = _NAME.fullmatch(file.name)
     if match is None:
         return None
@@ -106,9 +102,7 @@ def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[Catalo
         fault: Called with the error of an object that has no entry, or one whose diameter or symmetries are invalid. If it does not
             raise it, the object has no entry in the result.
 
-    Raises:
-        CatalogError: The file is not valid JSON.
-    """
+    Raises CatalogError: the file is not valid JSON."""
     entries = read_entries(path)
     infos = {}
     for obj_id in obj_ids if entries is not None else ():
@@ -139,9 +133,7 @@ def check_against_mesh(info: FileModelInfo, vertices: np.ndarray, diameter: floa
     Returns:
         The entry, converted if its lengths are in metres, and what is wrong with it.
 
-    Raises:
-        CatalogError: The mesh is in metres, where the entry is in millimetres.
-    """
+    Raises CatalogError: the mesh is in metres, where the entry is in millimetres."""
     low = vertices.min(axis=0).astype(np.float64)
     size = vertices.max(axis=0) - low
     info, said = compare_sizes(info, low, size, diameter)
@@ -239,11 +231,8 @@ def _check_symmetries(info: FileModelInfo, vertices: np.ndarray, diameter: float
 def read_entries(path: Path) -> dict[str, Any] | None:
     """Read the objects' entries in models_info.json as they are, by obj_id in decimal; None if the file is missing.
 
-    Keys are integers in decimal: "000001" is object 1. Others have no object, and are left out.
-
-    Raises:
-        CatalogError: The file is not a JSON object, nested too deeply to be written again, or gives an object twice.
-    """
+    Keys are integers in decimal: "000001" is object 1. Others have no object, and are left out. Raises CatalogError: the file is not a JSON
+    object, nested too deeply to be written again, or gives an object twice."""
     if not os.path.lexists(path):
         return None
     content = read_json(path, dict[str, Any], CatalogError, f"repair it, {_ADVICE}", MAX_INFO)

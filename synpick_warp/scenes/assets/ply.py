@@ -82,12 +82,8 @@ def read_ply_file(path: Path) -> bytes:
 
 def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
     """Name and content of the texture that a PLY header names in a line `comment TextureFile NAME` (in any case), inside the file's folder;
-    None if there is none.
-
-    Raises:
-        MissingFileError: There is no such file.
-        CatalogError: The file cannot be used, or the header is none of PLY or names several.
-    """
+    None if there is none. Raises MissingFileError: there is no such file; CatalogError: the file cannot be used, or the header is none of
+    PLY or names several."""
     names = _read_header(data, path).textures
     if len(set(names)) > 1:
         raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; keep one")
@@ -95,11 +91,8 @@ def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
 
 
 def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it.
-
-    Raises:
-        CatalogError: The file cannot be read or has no triangles, or its texture is missing.
-    """
+    """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it. Raises CatalogError: the file
+    cannot be read or has no triangles, or its texture is missing."""
     data = read_ply_file(path)
     with reading_as("PLY", path):
         part = _ply_part(_read_elements(data, path), path, notes)
@@ -115,11 +108,8 @@ def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
 
 
 def read_ply_vertices(path: Path) -> np.ndarray:
-    """Read the vertices of a PLY file as they are stored (V, 3) float64, in the file's unit; faces and texture are not read.
-
-    Raises:
-        CatalogError: The file cannot be read, has no vertices, or one that is not finite.
-    """
+    """Read the vertices of a PLY file as they are stored (V, 3) float64, in the file's unit; faces and texture are not read. Raises
+    CatalogError: the file cannot be read, has no vertices, or one that is not finite."""
     data = read_ply_file(path)
     with reading_as("PLY", path), quiet_decoding():
         vertices = _columns(_read_elements(data, path).get("vertex", _Element()), ("x", "y", "z"))

@@ -65,9 +65,7 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
     Returns:
         One part per material.
 
-    Raises:
-        CatalogError: The file or one that it refers to cannot be used.
-    """
+    Raises CatalogError: the file or one that it refers to cannot be used."""
     text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
     if text.count("\n") > 4 * MAX_ROWS:
         raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
@@ -184,9 +182,7 @@ def normalize_text(text: str, path: Path, ignored: list[str]) -> str:
     Args:
         ignored: What is left out is added to it.
 
-    Raises:
-        CatalogError: A face refers to vertex 0.
-    """
+    Raises CatalogError: a face refers to vertex 0."""
     text = join_lines(text).replace("\t", " ")
     text = _OUTDATED.sub("f ", _INDENT.sub("", text))
     text = _MATERIAL.sub(lambda match: " ".join(match[0].split()), text)
@@ -281,9 +277,7 @@ class TexturePixels(ImageCache):
         Returns:
             The image (H, W, 3) uint8.
 
-        Raises:
-            CatalogError: It is missing or damaged, or all images together have too many pixels.
-        """
+        Raises CatalogError: it is missing or damaged, or all images together have too many pixels."""
         plain = name.partition(" #")[0].strip()
         name = plain if plain and is_missing(library.parent, name, library) else name
         path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
@@ -296,11 +290,7 @@ def join_lines(text: str) -> str:
 
 
 def parse_library(text: str, library: Path) -> dict[str, MtlMaterial]:
-    """Parse a material library.
-
-    Raises:
-        CatalogError: A colour is not finite.
-    """
+    """Parse a material library. Raises CatalogError: a colour is not finite."""
     materials: dict[str, MtlMaterial] = {}
     current: MtlMaterial | None = None
     for line in join_lines(text).split("\n"):
@@ -399,11 +389,8 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
 
 
 def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:
-    """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps.
-
-    Raises:
-        CatalogError: An image is damaged, or missing and not replaced.
-    """
+    """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps. Raises
+    CatalogError: an image is damaged, or missing and not replaced."""
     notes.ignored += material.ignored
     images = {
         key: notes.image(lambda name=name, key=key: pixels.read(name, material.library, key != "map_kd"))

@@ -65,11 +65,8 @@ class _Faces:
 
 
 def make_colliders(vertices: np.ndarray, faces: np.ndarray, surface: BinSurface) -> tuple[ConvexPiece, ...]:
-    """Build the collision shapes of a mesh, vertices (V, 3) [m], z up, and faces (F, 3), with the surface of its inside.
-
-    Raises:
-        CatalogError: There are more than MAX_PIECES.
-    """
+    """Build the collision shapes of a mesh, vertices (V, 3) [m], z up, and faces (F, 3), with the surface of its inside. Raises
+    CatalogError: there are more than MAX_PIECES."""
     found = _visible_faces(vertices, faces, surface)
     tolerance = TOLERANCE
     while True:

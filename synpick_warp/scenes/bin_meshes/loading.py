@@ -24,18 +24,13 @@ def load_settings(
     Args:
         preset_or_file, settings, source, splits: As of `load_config`.
 
-    Raises:
-        ConfigError: As of `load_config`, or a mesh cannot be used.
-    """
+    Raises ConfigError: as of `load_config`, or a mesh cannot be used."""
     return load_config(preset_or_file, settings, source=source, splits=splits, measure=measure_meshes)
 
 
 def measure_meshes(rows: tuple[BinRow, ...], gripper: Gripper) -> dict[str, Any]:
-    """Settings, for `override_config`, with what the meshes of bins and gripper measure; none if they have it.
-
-    Raises:
-        ConfigError: A mesh cannot be used.
-    """
+    """Settings, for `override_config`, with what the meshes of bins and gripper measure; none if they have it. Raises ConfigError: a mesh
+    cannot be used."""
     if not any(row.file for row in rows) and not gripper.mesh and not gripper.mesh_checksum:
         return {}
     # Readers of meshes take a while to import.

@@ -60,21 +60,14 @@ class BinModel:
 
 
 def measure_bins(rows: tuple[BinRow, ...]) -> dict[str, tuple[BinRow, ...]]:
-    """Setting, for `override_config`, of [[bin]] tables with what their meshes measure; none if they have it.
-
-    Raises:
-        ConfigError: A mesh cannot be used as a bin.
-    """
+    """Setting, for `override_config`, of [[bin]] tables with what their meshes measure; none if they have it. Raises ConfigError: a mesh
+    cannot be used as a bin."""
     found = tuple(replace(row, measured=read_bin(row).measured) if row.file else row for row in rows)
     return {} if found == rows else {"bin": found}
 
 
 def read_bin(row: BinRow) -> BinModel:
-    """Read the mesh of a bin, or return it as it was read before in this process.
-
-    Raises:
-        ConfigError: It cannot be used as a bin.
-    """
+    """Read the mesh of a bin, or return it as it was read before in this process. Raises ConfigError: it cannot be used as a bin."""
     return read_measured(_model, replace(row, measured=None, weight=1.0), row.file or "", f"bin {row.name}")
 
 
@@ -117,11 +110,8 @@ def _model(row: BinRow) -> BinModel:
 def _make_pieces(
     row: BinRow, mesh: TriangleMesh, corners: np.ndarray, surface: BinSurface, places: list[Compartment], holes: np.ndarray
 ) -> tuple[ConvexPiece, ...]:
-    """Collision shapes of a bin: those of its mesh, which must agree with it, or a closed box.
-
-    Raises:
-        CatalogError: The mesh needs too many, or they differ from it.
-    """
+    """Collision shapes of a bin: those of its mesh, which must agree with it, or a closed box. Raises CatalogError: the mesh needs too
+    many, or they differ from it."""
     if row.collision == BOX:
         return make_box(surface, places, find_opening(surface, places))
     advice = f', or set collision = "{BOX}", which closes its holes' if len(holes) else ""

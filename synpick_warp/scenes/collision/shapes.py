@@ -78,9 +78,7 @@ def collision_shapes(
     Returns:
         The shape of each mesh, or an error if it has none because it has no volume.
 
-    Raises:
-        CatalogError: Time or memory does not suffice for objects, all of which are named.
-    """
+    Raises CatalogError: time or memory does not suffice for objects, all of which are named."""
     jobs = [
         _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
     ]

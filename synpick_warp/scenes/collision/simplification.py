@@ -97,10 +97,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
         points: (N, 3) [m].
         max_vertices: Maximum number of vertices, at least MIN_VERTICES.
 
-    Raises:
-        CatalogError: The points are coplanar, or nearly so.
-        ValueError: `max_vertices` is below MIN_VERTICES.
-    """
+    Raises CatalogError: the points are coplanar, or nearly so; ValueError: `max_vertices` is below MIN_VERTICES."""
     if max_vertices < MIN_VERTICES:
         raise ValueError(f"max_vertices is {max_vertices}, but must be at least {MIN_VERTICES}")
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
@@ -120,11 +117,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull:
-    """Convex hull of points (N, 3).
-
-    Raises:
-        CatalogError: The points are coplanar.
-    """
+    """Convex hull of points (N, 3). Raises CatalogError: the points are coplanar."""
     try:
         return ConvexHull(points)
     except QhullError as error:
@@ -314,11 +307,8 @@ def _add_frame(area: np.ndarray, normal: np.ndarray, principal: np.ndarray) -> t
 def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> ConvexHull:
     """Hull of the vertices of an intersection of half-spaces, each moved inward by `shift` gaps.
 
-    Computed in coordinates along the principal axes, in standard deviations: for flat hulls Qhull would merge dual points otherwise.
-
-    Raises:
-        QhullError: It is empty or unbounded.
-    """
+    Computed in coordinates along the principal axes, in standard deviations: for flat hulls Qhull would merge dual points otherwise. Raises
+    QhullError: it is empty or unbounded."""
     normal, offset = matmul(facets.normal[chosen], facets.axes), facets.offset[chosen] - shift * facets.gap[chosen]
     length = norm(normal)
     normal, offset = normal / length[:, None], offset / length
@@ -336,11 +326,8 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
 
 
 def _chebyshev_center(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Chebyshev center: the center of the largest ball inside an intersection of half-spaces, by linear programming.
-
-    Raises:
-        QhullError: The intersection is empty.
-    """
+    """Chebyshev center: the center of the largest ball inside an intersection of half-spaces, by linear programming. Raises QhullError: the
+    intersection is empty."""
     constraints = np.column_stack([normal, np.ones(len(normal))])
     result = linprog((0.0, 0.0, 0.0, -1.0), constraints, offset, bounds=[(None, None)] * 3 + [(0.0, None)])
     if not result.success or result.x[3] < _EMPTY:

@@ -38,9 +38,7 @@ def add_symmetries(
     Returns:
         The entry with symmetries, and lines on what was found, or on what is declared and does not hold.
 
-    Raises:
-        CatalogError: With `objects.strict`, a declared symmetry does not hold; or the declared ones generate too many.
-    """
+    Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or the declared ones generate too many."""
     if row is not None and (row.symmetries_discrete or row.symmetries_continuous):
         return _declared(info, found, diameter, row, objects.strict, origin)
     if objects.symmetries != DETECT or info.symmetries_discrete or info.symmetries_continuous:

@@ -124,9 +124,7 @@ class DeviceArray:
             dl_device: Device that the consumer asks for.
             copy: Whether the consumer asks for a copy, which stays valid when the batch has expired.
 
-        Raises:
-            BufferError: The batch has expired, or the consumer asks for another device.
-        """
+        Raises BufferError: the batch has expired, or the consumer asks for another device."""
         if dl_device is not None and tuple(dl_device) != self.__dlpack_device__():
             raise BufferError(f"this array lies on {self.device}; import it there, then move it")
         array = self._valid()
@@ -137,11 +135,8 @@ class DeviceArray:
         return array.__dlpack__(stream=_NO_ORDER)
 
     def numpy(self) -> np.ndarray:
-        """The array on the host: on the CPU the buffer itself, on a GPU a copy, for which the host waits.
-
-        Raises:
-            BufferError: The batch has expired.
-        """
+        """The array on the host: on the CPU the buffer itself, on a GPU a copy, for which the host waits. Raises BufferError: the batch has
+        expired."""
         array = self._valid()
         self._gate.admit_current()
         return array.numpy()

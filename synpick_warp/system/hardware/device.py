@@ -33,9 +33,7 @@ def pick_device(name: str) -> wp.Device:
     Args:
         name: "cpu", "cuda:N", or "auto": the first GPU if there is one, else the CPU.
 
-    Raises:
-        DeviceError: The name has another form, or there is no such GPU.
-    """
+    Raises DeviceError: the name has another form, or there is no such GPU."""
     start_warp()
     count = wp.get_cuda_device_count()
     if name == "auto":
@@ -58,9 +56,7 @@ def pick_devices(names: Sequence[str]) -> tuple[str, ...]:
         names: Different GPUs, or "cpu" once per process, since a process simulates on one core. `ALL` alone: every GPU, or the CPU if there
             is none.
 
-    Raises:
-        DeviceError: There is no such device, a GPU is named twice, or the CPU beside a GPU.
-    """
+    Raises DeviceError: there is no such device, a GPU is named twice, or the CPU beside a GPU."""
     if not names:
         raise DeviceError(f"--devices names none; {_DEVICES}")
     if list(names) == [ALL]:
@@ -102,11 +98,8 @@ def opening_context(device: wp.Device | None) -> Iterator[None]:
 def start_warp() -> None:
     """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept.
 
-    A kernel cache that cannot be written is replaced by a temporary one, with a note.
-
-    Raises:
-        CacheError: There is no room for a temporary one.
-    """
+    A kernel cache that cannot be written is replaced by a temporary one, with a note. Raises CacheError: there is no room for a temporary
+    one."""
     os.environ.setdefault(*_CONNECTIONS)  # CUDA reads it when it starts.
     wp.config.log_level = wp.LOG_WARNING
     wp.config.cuda_output = wp.config.cuda_output or "cubin"  # A new driver would compile PTX instead, one module after the other.

@@ -36,9 +36,7 @@ class SmPartition:
         Args:
             reserved: Number of reserved SMs; CUDA rounds up, with compute capability 9 to a multiple of 8.
 
-        Raises:
-            DeviceError: The driver is missing or too old, or the device has too few SMs.
-        """
+        Raises DeviceError: the driver is missing or too old, or the device has too few SMs."""
         self.device = device
         self._driver = _load_driver()
         ordinal, groups = ctypes.c_int(), ctypes.c_uint(1)
@@ -58,9 +56,7 @@ class SmPartition:
             on_reserved: Whether to use the reserved SMs instead of the main ones.
             priority: CUDA stream priority; lower values have higher priority.
 
-        Raises:
-            DeviceError: The driver is too old, or a CUDA call failed.
-        """
+        Raises DeviceError: the driver is too old, or a CUDA call failed."""
         stream = ctypes.c_void_p()
         context = self._reserved if on_reserved else self._main
         self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), context, _NON_BLOCKING, priority)

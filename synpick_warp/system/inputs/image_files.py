@@ -55,9 +55,7 @@ def decode_image(
     Returns:
         Image (H, W[, 3]), blue first.
 
-    Raises:
-        SynpickError: As `error`, in one line: it is not an image of that size.
-    """
+    Raises SynpickError: as `error`, in one line: it is not an image of that size."""
     stated = None if data.startswith(_TIFF) else image_size(data)
     if stated is None:
         raise error(f"{source} is not an image: neither PNG nor JPEG")

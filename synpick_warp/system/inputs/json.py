@@ -26,9 +26,7 @@ def decode_json(data: bytes, schema: type[_Content], source: object, error: type
         source: Where it comes from, for messages: a path, or a path with a line number.
         advice: End of the message: what to do.
 
-    Raises:
-        SynpickError: As `error`, in one line: not JSON, or not of this schema.
-    """
+    Raises SynpickError: as `error`, in one line: not JSON, or not of this schema."""
     try:
         return msgspec.json.decode(data, type=schema)
     except (ValueError, RecursionError) as fault:  # msgspec's errors are ValueErrors.

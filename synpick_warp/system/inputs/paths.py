@@ -21,8 +21,7 @@ def path_inside(folder: Path, name: str, source: object, error: type[SynpickErro
         folder: The folder that must contain the path.
         name: Relative name with "/" between its parts, as read from the file `source`.
 
-    Raises:
-        SynpickError: As `error`: the name is empty, absolute, has parts "..", control characters, or leads out of the folder by a link.
+    Raises SynpickError: as `error`: the name is empty, absolute, has parts "..", control characters, or leads out of the folder by a link.
     """
     parts = PurePosixPath(name).parts
     if not parts or len(name) > MAX_NAME or ".." in parts or name.startswith("/") or not name.isprintable():

@@ -32,8 +32,7 @@ def list_members(shard: Path, advice: str = _ADVICE, *, extended: bool = False) 
         extended: Whether extended headers (POSIX.1-2001) are passed over, which shards of others have for times of fractions of a second;
             those that rename or resize a member are never taken.
 
-    Raises:
-        DatasetError: The file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
+    Raises DatasetError: the file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
     """
     check_regular_file(shard, MAX_SHARD, DatasetError)
     members = []

@@ -25,10 +25,7 @@ def parse_place(place: Path | str) -> Path | str:
     """Parse the place of a data set: the path of a folder, or the URL of a prefix in an object store, without a slash at its end.
 
     `Path` collapses "://" to ":/", which is a store in a `Path` alone; file URLs are text, as "file:/host/x" might have named a host.
-
-    Raises:
-        StoreError: The scheme is unknown, or the URL is not of the form of its scheme.
-    """
+    Raises StoreError: the scheme is unknown, or the URL is not of the form of its scheme."""
     match = _URL.fullmatch(str(place))
     scheme = match[1].lower() if match else ""
     if match is None or (match[3] and not match[2] and scheme not in (*SCHEMES, FILE)):

@@ -125,9 +125,7 @@ def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
         For each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
         `Failure`.
 
-    Raises:
-        ProcessError: No process can be started.
-    """
+    Raises ProcessError: no process can be started."""
     if not calls:
         return
     links = _Links()

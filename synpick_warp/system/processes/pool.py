@@ -141,9 +141,7 @@ class WorkerPool:
             drain: Receive available results first, so that a process that waits for its answer to be read takes the task. Needless if
                 the caller bounds the unanswered tasks, and both tasks and results are small.
 
-        Raises:
-            DeadProcessError: A process died.
-        """
+        Raises DeadProcessError: a process died."""
         future: TaskFuture = TaskFuture()
         if self._runs_here:
             try:

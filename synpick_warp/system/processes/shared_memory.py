@@ -41,11 +41,7 @@ def shared_bytes(sizes: Iterable[int]) -> int:
 def allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
     """Allocate anonymous shared memory (memfd): file handle and mapping. Unlike /dev/shm, containers do not limit its size.
 
-    The caller closes the handle when it has been passed on; the mapping stays valid.
-
-    Raises:
-        OSError: Memory or descriptors are used up.
-    """
+    The caller closes the handle when it has been passed on; the mapping stays valid. Raises OSError: memory or descriptors are used up."""
     open_standard_descriptors()
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create("synpick-warp")
@@ -70,9 +66,7 @@ class SharedSlots:
             slot_bytes: Maximum size of the arrays of one task, see `shared_bytes` [B].
             copy_threads: Threads that copy arrays; 0: `put` itself does.
 
-        Raises:
-            OSError: Memory or descriptors are used up.
-        """
+        Raises OSError: memory or descriptors are used up."""
         self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
         self.free = list(range(count))
         """Indices of the slots that no task uses."""

@@ -85,9 +85,7 @@ def start_process(
         environment: Environment variables that it has besides those of this process.
         has_threads: Whether its libraries start as many threads as those of this process.
 
-    Raises:
-        OSError: Processes, memory or descriptors are used up.
-    """
+    Raises OSError: processes, memory or descriptors are used up."""
     ours, theirs = socket.socketpair()
     with ours, theirs, contextlib.ExitStack() as copies:
         # A lock that was taken while a standard stream was closed has that stream's number.

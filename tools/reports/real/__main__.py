@@ -175,22 +175,14 @@ class TrainingOutcome:
 
 
 def check_ids(labels: list[np.ndarray]) -> None:
-    """Check that the networks have a class for each object of label images.
-
-    Raises:
-        ConfigError: An obj_id is larger than MODELS.
-    """
+    """Check that the networks have a class for each object of label images. Raises ConfigError: an obj_id is larger than MODELS."""
     largest = max(int(label.max(initial=0)) for label in labels)
     if largest > MODELS:
         raise ConfigError(f"an object has obj_id {largest}; allowed here: 1 to {MODELS}, those of YCB-Video")
 
 
 def settings_of(options: argparse.Namespace, seed: int, device: Any) -> Config:
-    """Settings of the stream of a seed.
-
-    Raises:
-        ConfigError: A setting is wrong.
-    """
+    """Settings of the stream of a seed. Raises ConfigError: a setting is wrong."""
     fixed: dict[str, object] = {"bake.worlds": options.worlds, "bake.seed": options.seed + 1000 * seed}
     fixed |= {"render.views_per_batch": VIEWS_PER_BATCH, "bake.device": device.alias}
     config = configure(options, fixed)
@@ -264,11 +256,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> None:
-    """Train and score with all seeds of a command line; results are written after each, and printed.
-
-    Raises:
-        SynpickError: A setting is wrong, models or lights cannot be used, or files cannot be written.
-    """
+    """Train and score with all seeds of a command line; results are written after each, and printed. Raises SynpickError: a setting is
+    wrong, models or lights cannot be used, or files cannot be written."""
     config = settings_of(options, 0, device)
     few, held = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS))), ViewPool(HELD_OUT_VIEWS, 0)
     held.fill(stream_views(few, HELD_OUT, HELD_OUT_VIEWS), HELD_OUT_VIEWS)

@@ -352,11 +352,8 @@ class _Trainer:
 def train(batches: Generator[tuple[torch.Tensor, torch.Tensor]], recipe: Recipe, classes: int, device: torch.device, seed: int) -> Trained:
     """Train a network on views of a stream. Training starts when a first part of the pool is filled; the rest is filled during training.
 
-    `batches`: images (B, 3, H, W) and obj_ids (B, H, W) uint8 of the stream; a batch is valid until the next one.
-
-    Raises:
-        SynpickError: Settings, models or lights cannot be used.
-    """
+    `batches`: images (B, 3, H, W) and obj_ids (B, H, W) uint8 of the stream; a batch is valid until the next one. Raises SynpickError:
+    settings, models or lights cannot be used."""
     pool, trainer = ViewPool(min(recipe.views, recipe.capacity), seed), _Trainer(recipe, classes, device, seed)
     pool.fill(batches, math.ceil(FIRST * pool.capacity), FILLING * recipe.seconds)
     first, pace = pool.seen, min(PACE, recipe.passes)

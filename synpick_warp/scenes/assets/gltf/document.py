@@ -229,11 +229,8 @@ class Gltf(msgspec.Struct):
 
 
 def read_document(path: Path, notes: Notes, data: bytes | None = None) -> tuple[Gltf, list[bytes]]:
-    """Read a .glb or .gltf file, or decode `data` in its place, and the buffers that it refers to.
-
-    Raises:
-        CatalogError: The file is damaged, exceeds a limit, refers to a file outside of its folder, or needs an unknown extension.
-    """
+    """Read a .glb or .gltf file, or decode `data` in its place, and the buffers that it refers to. Raises CatalogError: the file is
+    damaged, exceeds a limit, refers to a file outside of its folder, or needs an unknown extension."""
     data = read_file(path, MAX_MESH_FILE, CatalogError) if data is None else data
     if data[:4] == b"glTF" or path.suffix.lower() == ".glb":
         header, chunks = _split_chunks(data, path)

@@ -66,9 +66,7 @@ def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshP
     Args:
         data: Content to decode in place of the file's.
 
-    Raises:
-        CatalogError: The file or one that it refers to cannot be used.
-    """
+    Raises CatalogError: the file or one that it refers to cannot be used."""
     document, buffers = read_document(path, notes, data)
     with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
         return _Reader(path, document, buffers, notes).parts()
