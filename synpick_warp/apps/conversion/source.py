@@ -18,6 +18,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from synpick_warp._version import __version__
 from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset.export import ExportSettings
 from synpick_warp.configs.dataset.splits import DataLayout
@@ -165,6 +166,11 @@ class ConversionSource:
         """Content digests of objects and lights, as the manifest records them."""
         return self._manifest.get(INPUTS, {})
 
+    @property
+    def version(self) -> str:
+        """Version of synpick-warp that baked it; others may digest the same objects and lights otherwise."""
+        return self._manifest["versions"]["synpick-warp"]
+
     def check_contents(self, needed: Collection[Content]) -> None:
         """Check that it has what formats are made of: all attributes and arrays of the trajectories, but of images only that there are any.
         Raises DatasetError if it lacks something, or that is damaged."""
@@ -241,6 +247,9 @@ class StoredContext(ExportContext):
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, lambda line: None)
         looks = load_looks(config.randomize, lambda line: None)
         if said := describe_inputs(digest_inputs(catalog, lights, looks), source.inputs):
+            if source.version != __version__:
+                other = f"were digested by synpick-warp {source.version}, this is {__version__}; convert with that version"
+                raise DatasetError(f"{said} of {source.folder} are needed, but {other}")
             raise DatasetError(f"{said} of {source.folder} have changed since its bake, but are needed; restore them")
         return catalog, lights, looks
 

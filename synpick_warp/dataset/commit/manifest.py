@@ -102,6 +102,8 @@ YOUNGER_SETTINGS: dict[str, Any] = {f"{section}.{name}": value for section, tabl
 YOUNGER_SETTINGS |= {"camera": [], "bin": []}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
+_ADDED = ("bop", "polygons", False)
+"""Section, name and value before of a setting that manifests of 0.2.0 lack, and later ones always have."""
 _YOUNGER_KEYS = ("symmetries_discrete", "symmetries_continuous")
 """Keys of object rows that older manifests lack: left out if they are empty."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
@@ -210,7 +212,10 @@ def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
     younger = {key: value for key, value in YOUNGER_SETTINGS.items() if "." in key and value is not None and key not in FREE_SETTINGS}
     before = {key: value for key, value in younger.items() if key.split(".")[1] not in settings.get(key.split(".")[0], {})}
     config = override_config(load_config(str(path), {}), before)
-    said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": settings})
+    ours, (section, name, value) = make_manifest(config)["settings"], _ADDED
+    if name not in settings.get(section, {}) and ours[section][name] == value:
+        del ours[section][name]
+    said = describe_differences({"settings": ours}, {"settings": settings})
     if said:
         raise DatasetError(f"{path} does not match the manifest: {said}")
     return config
