@@ -299,11 +299,7 @@ for _name, _lines in EXAMPLES.items():
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code.
-
-    Args:
-        arguments: Command line without the program's name; None: `sys.argv`.
-    """
+    """Run the command line and return the exit code. `arguments`: command line without the program's name; None: `sys.argv`."""
     with safe_streams() as output:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
         flush_output()

@@ -58,9 +58,7 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew:
         engine: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
         workers: Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu.
 
-    Returns:
-        Summary of the workers that ended.
-    """
+    Returns the summary of the workers that ended."""
     job = replace(job, config=with_measures(job.config, ()))
     address = find_address(engine)
     ray = import_ray(address)

@@ -127,10 +127,8 @@ def bake_into_store(
         workers: Number of claiming workers, which begin at about the same time; 0: unknown.
         summary: Receives the episodes bake by bake, for a caller that ends this by an exception; None: a new one.
 
-    Returns:
-        Summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their chunks.
-
-    Raises SynpickError: an error that the user can correct; done episodes stay, and the same bake resumes."""
+    Returns the summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their
+    chunks. Raises SynpickError: an error that the user can correct; done episodes stay, and the same bake resumes."""
     job = replace(job, config=with_measures(job.config, devices))
     ranges = DataLayout.of(job.config).plan_shard(job.splits, shard)
     ledger = open_ledger(job)

@@ -106,13 +106,10 @@ def count_slots(arrangement: Arrangement, rules: Iterable[bool], catalog: Catalo
 
     The object that exceeds the budget, if `fill` keeps it, has its slot as well. Where `counts` are set, they suffice for the largest ones.
 
-    A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
-    Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
-
-    Args:
-        rules: Whether objects repeat in an episode: the values by `find_repeat_rules`.
-
-    Raises ConfigError: no object fits into the volume budget, or `count_entries` refuses a part."""
+    A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula. Slots cost
+    time whether used or not, and compound ones most: their count is minimized first, then that of single slots. `rules`: whether objects
+    repeat in an episode: the values by `find_repeat_rules`. Raises ConfigError: no object fits into the volume budget, or `count_entries`
+    refuses a part."""
     if arrangement.counts:
         most = count_entries(arrangement.counts, catalog)[:, 1]
         compounds = sum(int(number) for number, entry in zip(most, catalog.entries, strict=True) if len(entry.pieces) > 1)
@@ -260,11 +257,8 @@ def _add_slots(
     slots: tuple[int, int],
     drawn: np.ndarray,
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Add the body slots for objects. A slot has as many shapes as the largest of the objects that episodes can have, `drawn`.
-
-    Returns:
-        Variant of each catalog entry (entry) int32, 0 of those that no episode has, and the empty variants of single and compound slots.
-    """
+    """Add the body slots for objects. A slot has as many shapes as the largest of the objects that episodes can have, `drawn`. Returns the
+    variant of each catalog entry (entry) int32, 0 of those that no episode has, and the empty variants of single and compound slots."""
     variant, empty = np.zeros(len(catalog.bodies), np.int32), []
     damping = {
         "steel:rigid_body_angular_damping": physics.angular_damping,

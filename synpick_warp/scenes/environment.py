@@ -197,9 +197,7 @@ def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.n
         points: Sample points of each, a power of two.
         whole: The map (rows, 2 rows, 3) that contrast and shares refer to, if a sun was taken from it before; None: `radiance`.
 
-    Returns:
-        The map without the lamps, and the lamps, those with the largest irradiance of a surface that faces up first.
-    """
+    Returns the map without the lamps, and the lamps, those with the largest irradiance of a surface that faces up first."""
     directions, solid_angles = map_directions(len(radiance))
     luminance = dot(radiance, LUMINANCE)
     total = solid_angles * (luminance if whole is None else dot(whole, LUMINANCE))
@@ -279,15 +277,10 @@ def sample_disc(direction: np.ndarray, radius_tangent: float, count: int) -> np.
 
 def stratify_light(weight: np.ndarray, directions: np.ndarray, count: int) -> np.ndarray:
     """Stratified sample points of a light of unit directions (n, 3), by recursive bisection into `count` parts, a power of two, of equal
-    weight along the principal axis (a k-d tree).
+    weight along the principal axis (a k-d tree). `weight`: weights of the light's texels (n), positive.
 
-    Args:
-        weight: Weights of the light's texels (n), positive.
-
-    Returns:
-        Unit directions to the parts' centers (count, 3). Bit k of a point's index says in which half of the k-th bisection it lies, so
-        that any aligned run of 2^k points has one in each of the 2^k parts of the first k bisections.
-    """
+    Returns unit directions to the parts' centers (count, 3). Bit k of a point's index says in which half of the k-th bisection it lies, so
+    that any aligned run of 2^k points has one in each of the 2^k parts of the first k bisections."""
     mean = (weight[:, None] * directions).sum(axis=0) / weight.sum()
     if count == 1:
         return (mean / norm(mean))[None]

@@ -310,12 +310,9 @@ def _check_rows(image: np.ndarray, path: Path) -> None:
 
 
 def _canonical_radiance(data: bytes, path: Path) -> tuple[bytes, Callable[[np.ndarray], np.ndarray]] | None:
-    """Rewrite the header of a Radiance file: magic, FORMAT, scanlines from the top, from left to right.
-
-    Returns:
-        The file with another header, and what turns its image as the header said, and divides by its exposure. None: it has no such header.
-
-    Raises LightError: the colours are not RGB."""
+    """Rewrite the header of a Radiance file: magic, FORMAT, scanlines from the top, from left to right. Returns the file with another
+    header, and what turns its image as the header said, and divides by its exposure. None: it has no such header. Raises LightError: the
+    colours are not RGB."""
     lines, at = [], 0
     while (end := data.find(b"\n", at, _MAX_HEADER)) >= 0:
         line = data[at:end].rstrip(b"\r")

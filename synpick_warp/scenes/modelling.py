@@ -214,11 +214,8 @@ def rounded_box(size: tuple[float, float, float], radius: float, rects: dict[str
 
 
 def make_mesh(patch: Patch, *, centered: bool) -> TriangleMesh:
-    """Merge vertices, drop degenerate triangles, and compute vertex normals that stay hard at edges above `CREASE`.
-
-    Args:
-        centered: Translate the centre of the bounding box to the origin.
-    """
+    """Merge vertices, drop degenerate triangles, and compute vertex normals that stay hard at edges above `CREASE`. `centered`: translate
+    the centre of the bounding box to the origin."""
     corners = patch.corners.reshape(-1, 3)
     if centered:
         corners = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2

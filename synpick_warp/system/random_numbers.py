@@ -52,9 +52,7 @@ def sample_triangles(areas: np.ndarray, count: int) -> tuple[np.ndarray, np.ndar
         areas: (F), in any unit.
         count: Number of points S.
 
-    Returns:
-        Triangle (S) of each point by a golden-ratio sequence over the cumulative area, and its barycentric weights (S, 3) by R2.
-    """
+    Returns the triangle (S) of each point by a golden-ratio sequence over the cumulative area, and its barycentric weights (S, 3) by R2."""
     cumulative = np.cumsum(areas)
     index = np.arange(1, count + 1)
     place = np.mod(index * _GOLDEN_STEP, 1.0) * cumulative[-1]

@@ -35,11 +35,8 @@ class Result:
 
 
 def run_module(client: str, python: str, module: str, *arguments: str) -> tuple[Result, str]:
-    """Run a module of this checkout in a client's interpreter.
-
-    Returns:
-        Its row, with the reason in `agreement` if it is not installed, has failed or gave no answer; and what it printed (empty if so).
-    """
+    """Run a module of this checkout in a client's interpreter. Returns its row, with the reason in `agreement` if it is not installed, has
+    failed or gave no answer; and what it printed (empty if so)."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"}
     command = (python, "-m", module, client, *arguments)
     try:

@@ -99,12 +99,9 @@ def rgb8(image: Image.Image) -> np.ndarray:
 
 
 def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray:
-    """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded.
-
-    Args:
-        linear: Whether the image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are.
-
-    Raises CatalogError: the image is too large, of another format, or damaged."""
+    """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded. `linear`: whether the
+    image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are. Raises CatalogError: the image
+    is too large, of another format, or damaged."""
     if data.startswith(EXR_MAGIC):
         light = decode_exr(data, source, MAX_TEXTURE_PIXELS)
         return np.rint(255.0 * (np.clip(light, 0.0, 1.0) if linear else linear_to_srgb(light))).astype(np.uint8)
@@ -155,9 +152,7 @@ def bake_vertex_colors(
         factor: Linear factor (3); None: 1.
         skin: Texture coordinates (V, 2), and the texture (H, W, 3) uint8, which repeats; its colours are multiplied in linear light.
 
-    Returns:
-        Texture coordinates of the 3 F corners (3 F, 2) float32, and the texture (S, S, 3) uint8.
-    """
+    Returns the texture coordinates of the 3 F corners (3 F, 2) float32, and the texture (S, S, 3) uint8."""
     texels = 2 if skin is None else _texels_per_triangle(faces, *skin)
     cells = int(np.ceil(np.sqrt(len(faces))))
     side = texels * cells
@@ -220,9 +215,7 @@ def clamp_texture(texture: Any, uv: np.ndarray, axes: tuple[bool, bool], ignored
         axes: Whether u and v are clamped.
         ignored: What is not done is added to it: an image that would exceed a quarter of the limit on pixels is not extended.
 
-    Returns:
-        The image, and coordinates in it.
-    """
+    Returns the image, and coordinates in it."""
     sides = np.array(texture.shape[1::-1], np.float64)
     low, high = np.minimum(uv.min(axis=0), 0.0), np.maximum(uv.max(axis=0), 1.0)
     # One texel more, which filtering at the border reads.
@@ -242,10 +235,8 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         parts: Texture coordinates (V, 2) in 0..1, or None, and the material, of each part.
         said: Warnings are added to it.
 
-    Returns:
-        New texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8.
-
-    Raises CatalogError: the atlas is too large."""
+    Returns new texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8. Raises
+    CatalogError: the atlas is too large."""
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:
@@ -295,12 +286,8 @@ def _fit_blocks(blocks: list[np.ndarray], owner: str, said: list[str]) -> list[n
 
 
 def decode_exr(data: bytes, source: str, most: int) -> np.ndarray:
-    """Decode the colour or grey channels of an OpenEXR image as (H, W, 3) float32, linear; the first layer that has them.
-
-    Args:
-        most: Maximum number of pixels, which is checked by the header.
-
-    Raises CatalogError: the image is too large, damaged or has no such channels."""
+    """Decode the colour or grey channels of an OpenEXR image as (H, W, 3) float32, linear; the first layer that has them. `most`: maximum
+    number of pixels, which is checked by the header. Raises CatalogError: the image is too large, damaged or has no such channels."""
     try:
         low, high = OpenEXR.File(io.BytesIO(data), header_only=True).header()["dataWindow"]
         width, height = (int(size) for size in np.subtract(high, low, dtype=np.int64) + 1)

@@ -105,10 +105,8 @@ def read_isolated(
         smaller: Advice for a file for which time or memory of this machine does not suffice.
         repair: Advice for a file on which the process crashes.
 
-    Yields:
-        What the function returned, or as `error` why there is nothing.
-
-    Raises SynpickError: as `error`: time or memory does not suffice, so that elsewhere the same file might be read."""
+    Yields what the function returned, or as `error` why there is nothing. Raises SynpickError: as `error`: time or memory does not suffice,
+    so that elsewhere the same file might be read."""
     for (file, *_), result in zip(calls, run_isolated(function, calls, limits), strict=True):
         if isinstance(result, Failure):
             advice = smaller if result.by_machine else repair
@@ -206,12 +204,8 @@ def is_missing(folder: Path, name: str, owner: object) -> bool:
 
 
 def locate(folder: Path, name: str, owner: object, error: type[SynpickError], root: Path | None = None) -> Path:
-    """Path of a referenced file; if it does not exist, of the file that the reference may mean (see `read_referred`), if any.
-
-    Args:
-        root: Folder that the name must not lead out of; None: `folder`.
-
-    Raises SynpickError: as `error`: the name leads out of the folder."""
+    """Path of a referenced file; if it does not exist, of the file that the reference may mean (see `read_referred`), if any. `root`:
+    folder that the name must not lead out of; None: `folder`. Raises SynpickError: as `error`: the name leads out of the folder."""
     path, fault = folder, None
     try:
         path = path_inside(folder, name, owner, error)

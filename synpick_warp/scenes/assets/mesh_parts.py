@@ -60,9 +60,7 @@ def find_concave(vertices: np.ndarray, flat: np.ndarray, lengths: np.ndarray, ig
         lengths: Number of corners of each polygon (P,).
         ignored: What is left out is added to it: polygons with too many corners together.
 
-    Returns:
-        Indices of polygons (N,), in order.
-    """
+    Returns indices of polygons (N,), in order."""
     starts, found = np.cumsum(lengths) - lengths, []
     for count in np.unique(lengths[lengths > 3]):
         index = np.flatnonzero(lengths == count)
@@ -80,11 +78,8 @@ def find_concave(vertices: np.ndarray, flat: np.ndarray, lengths: np.ndarray, ig
 
 
 def clip_ears(corners: np.ndarray) -> list[tuple[int, int, int]]:
-    """Triangulate a simple polygon of corners (C, 3) by ear clipping, in the plane of its normal.
-
-    Returns:
-        Triangles of corner indices, C - 2 of them. Of a polygon that crosses itself, the rest without ears is a fan.
-    """
+    """Triangulate a simple polygon of corners (C, 3) by ear clipping, in the plane of its normal. Returns C - 2
+    triangles of corner indices. Of a polygon that crosses itself, the rest without ears is a fan."""
     first = corners - corners[0]
     normal = np.cross(first, np.roll(first, -1, axis=0)).sum(axis=0)
     keep = [axis for axis in range(3) if axis != int(np.abs(normal).argmax())]

@@ -128,12 +128,8 @@ def _convert(entry: Any, obj_id: int, path: Path) -> FileModelInfo:
 
 def check_against_mesh(info: FileModelInfo, vertices: np.ndarray, diameter: float) -> tuple[FileModelInfo, list[str]]:
     """Compare an entry with its mesh, of vertices (V, 3) and a diameter [m]: is the diameter the bounding box's diagonal, or of another
-    mesh, and do the symmetries hold?
-
-    Returns:
-        The entry, converted if its lengths are in metres, and what is wrong with it.
-
-    Raises CatalogError: the mesh is in metres, where the entry is in millimetres."""
+    mesh, and do the symmetries hold? Returns the entry, converted if its lengths are in metres, and what is wrong with it. Raises
+    CatalogError: the mesh is in metres, where the entry is in millimetres."""
     low = vertices.min(axis=0).astype(np.float64)
     size = vertices.max(axis=0) - low
     info, said = compare_sizes(info, low, size, diameter)

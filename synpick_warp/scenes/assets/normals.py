@@ -17,11 +17,8 @@ _REACH = 32
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Compute smooth normals of vertices (V, 3) and faces (F, 3): area-weighted means over all triangles at a position, so that texture
-    seams do not show.
-
-    Returns:
-        Unit normals (V, 3) float32. Where the triangles at a position cancel out, those of the vertex alone are used, or +z.
-    """
+    seams do not show. Returns unit normals (V, 3) float32. Where the triangles at a position cancel out, those of the vertex alone are
+    used, or +z."""
     doubled = _doubled_areas(vertices, faces)
     own = np.zeros((len(vertices), 3))
     for corner in range(3):
@@ -43,10 +40,8 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, angle: float) -> tup
         faces: (F, 3); each vertex is used.
         angle: Crease angle [°].
 
-    Returns:
-        The vertex that each new vertex is a copy of (W,), the first V being 0 to V - 1; faces (F, 3) of new vertices; and their unit
-        normals (W, 3) float32.
-    """
+    Returns the vertex that each new vertex is a copy of (W,), the first V being 0 to V - 1; faces (F, 3) of new vertices; and their unit
+    normals (W, 3) float32."""
     doubled = _doubled_areas(vertices, faces)
     group = _smoothing_groups(_positions(vertices)[faces.reshape(-1)], doubled, angle)
     sums = np.stack([np.bincount(group, np.repeat(doubled[:, axis], 3)) for axis in range(3)], axis=1)

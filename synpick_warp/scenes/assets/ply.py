@@ -251,14 +251,8 @@ def _ply_part(elements: dict[str, _Element], path: Path, notes: Notes) -> MeshPa
 def _triangles(
     face: _Element, strips: _Element, vertices: np.ndarray | None, path: Path, notes: Notes
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Triangulate polygons, and strips.
-
-    Args:
-        vertices: Positions (V, 3); None: there are none.
-
-    Returns:
-        The vertices of all corners (C,) and triangles of corners (F, 3); and the face of each triangle (F,), None for strips.
-    """
+    """Triangulate polygons, and strips. `vertices`: positions (V, 3); None: there are none. Returns the vertices of all corners (C,) and
+    triangles of corners (F, 3); and the face of each triangle (F,), None for strips."""
     name = next((name for name in (*_INDICES, *face.kinds) if name in face.kinds), None)
     if name is not None and face.count:
         flat, lengths = _lists(face, name)

@@ -60,12 +60,8 @@ _KINDS = ("v", "vt", "vn")
 
 
 def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read an OBJ file, its material libraries, and the images of the materials that its faces use.
-
-    Returns:
-        One part per material.
-
-    Raises CatalogError: the file or one that it refers to cannot be used."""
+    """Read an OBJ file, its material libraries, and the images of the materials that its faces use. Returns one part per material. Raises
+    CatalogError: the file or one that it refers to cannot be used."""
     text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
     if text.count("\n") > 4 * MAX_ROWS:
         raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
@@ -177,12 +173,8 @@ def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, Mtl
 
 def normalize_text(text: str, path: Path, ignored: list[str]) -> str:
     """Rewrite the text of an OBJ file: lines end in a line feed and begin with a keyword and one blank, without comments behind numbers;
-    indices are absolute, and concave polygons are triangles.
-
-    Args:
-        ignored: What is left out is added to it.
-
-    Raises CatalogError: a face refers to vertex 0."""
+    indices are absolute, and concave polygons are triangles. `ignored`: what is left out is added to it. Raises CatalogError: a face refers
+    to vertex 0."""
     text = join_lines(text).replace("\t", " ")
     text = _OUTDATED.sub("f ", _INDENT.sub("", text))
     text = _MATERIAL.sub(lambda match: " ".join(match[0].split()), text)
@@ -272,11 +264,7 @@ class TexturePixels(ImageCache):
     """Image cache of one OBJ file."""
 
     def read(self, name: str, library: Path, linear: bool) -> np.ndarray:
-        """Decode an image that a material library names; `linear`: one of numbers, as roughness is.
-
-        Returns:
-            The image (H, W, 3) uint8.
-
+        """Decode an image that a material library names; `linear`: one of numbers, as roughness is. Returns the image (H, W, 3) uint8.
         Raises CatalogError: it is missing or damaged, or all images together have too many pixels."""
         plain = name.partition(" #")[0].strip()
         name = plain if plain and is_missing(library.parent, name, library) else name

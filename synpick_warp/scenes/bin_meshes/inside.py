@@ -111,12 +111,9 @@ def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.n
 
 
 def _bisect(corners: np.ndarray, longest: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Longest-edge bisection (Rivara, 1984), in batches that stay in the processor's cache.
-
-    Yields:
-        Triangles of a batch (3, 3, N) by corner and coordinate, and the given one of each (N); which of them have no edge that exceeds
-        `longest` (N) bool; middles of the longest edges of all others (3, M), and the given triangle of each (M).
-    """
+    """Longest-edge bisection (Rivara, 1984), in batches that stay in the processor's cache. Yields triangles of a batch (3, 3, N) by corner
+    and coordinate, and the given one of each (N); which of them have no edge that exceeds `longest` (N) bool; middles of the longest edges
+    of all others (3, M), and the given triangle of each (M)."""
     corners = np.ascontiguousarray(corners.transpose(1, 2, 0))
     edges = np.stack([_distance(corners[k], corners[(k + 1) % 3]) for k in range(3)])
     waiting = [(corners, edges, np.arange(corners.shape[2]))]

@@ -19,12 +19,8 @@ def load_settings(
     source: str = "in the settings passed",
     splits: bool = False,
 ) -> Config:
-    """Load a preset or a TOML file as `load_config` does, and measure the meshes of its bins and gripper.
-
-    Args:
-        preset_or_file, settings, source, splits: As of `load_config`.
-
-    Raises ConfigError: as of `load_config`, or a mesh cannot be used."""
+    """Load a preset or a TOML file as `load_config` does, and measure the meshes of its bins and gripper. Arguments: as of
+    `load_config`. Raises ConfigError: as of `load_config`, or a mesh cannot be used."""
     return load_config(preset_or_file, settings, source=source, splits=splits, measure=measure_meshes)
 
 

@@ -166,11 +166,8 @@ def relative_depth(vertices: np.ndarray, faces: np.ndarray) -> float:
     the hull's thickness (its least width).
 
     0 of convex and of hollow bodies; 0.8 of a tube whose wall is a tenth of its diameter; 1 and more of a bowl, of a bracket, and of a
-    plate with holes as wide as it is thick. Measured from samples of the hull to the triangles nearby.
-
-    Returns:
-        The ratio; 0 of coplanar points.
-    """
+    plate with holes as wide as it is thick. Measured from samples of the hull to the triangles nearby. Returns the ratio; 0 of coplanar
+    points."""
     positions, faces = merge_positions(vertices.astype(np.float64), faces)
     try:
         hull = ConvexHull(positions)

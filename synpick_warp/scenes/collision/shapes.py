@@ -75,10 +75,8 @@ def collision_shapes(
         cache_dir: Folder of the cache; created if missing. If it cannot be written, that is reported and shapes are computed each time.
         seconds: Limit of a decomposition's processor time [s].
 
-    Returns:
-        The shape of each mesh, or an error if it has none because it has no volume.
-
-    Raises CatalogError: time or memory does not suffice for objects, all of which are named."""
+    Returns the shape of each mesh, or an error if it has none because it has no volume. Raises CatalogError: time or memory does not
+    suffice for objects, all of which are named."""
     jobs = [
         _Job(name, mesh, recipe, cache_dir / f"{_key(mesh, recipe)}.npz") for name, mesh, recipe in zip(names, meshes, recipes, strict=True)
     ]
@@ -263,14 +261,10 @@ class ShapeRecipe:
 def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...]:
     """Approximate convex decomposition of a concave mesh with CoACD (Wei et al., SIGGRAPH 2022).
 
-    CoACD's manifold preprocessing, which remeshes the surface, takes two to five times as long for the real bowl and mug and thickens
-    their walls (0.261 l instead of 0.230 for the bowl's pieces), and CoACD asks for it wherever two triangles intersect. So the mesh is
-    preprocessed only if it is open, walls run inside the body, or a decomposition without it has lost a part. Repeated triangles, and
-    those without area in an open mesh, are removed first: they keep CoACD busy for minutes.
-
-    Returns:
-        The pieces; none if CoACD finds none.
-    """
+    CoACD's manifold preprocessing, which remeshes the surface, takes two to five times as long for the real bowl and mug and thickens their
+    walls (0.261 l instead of 0.230 for the bowl's pieces), and CoACD asks for it wherever two triangles intersect. So the mesh is
+    preprocessed only if it is open, walls run inside the body, or a decomposition without it has lost a part. Repeated triangles, and those
+    without area in an open mesh, are removed first: they keep CoACD busy for minutes. Returns the pieces; none if CoACD finds none."""
     import coacd  # loads a native library of 20 MB, which is needed only for shapes that are not cached
 
     coacd.set_log_level("error")
@@ -330,9 +324,7 @@ def _buried_fraction(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) 
     The solid angle Ω of a triangle with corners a, b, c relative to a point (van Oosterom and Strackee, 1983):
     tan(Ω/2) = a·(b x c) / (|a||b||c| + (a·b)|c| + (b·c)|a| + (c·a)|b|).
 
-    Args:
-        part: Connected component of each vertex (V).
-    """
+    `part`: connected component of each vertex (V)."""
     used = np.unique(faces)
     if (part[used] == part[used[0]]).all():
         return 0.0

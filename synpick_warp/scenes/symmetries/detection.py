@@ -98,14 +98,9 @@ def _upward(axis: np.ndarray) -> np.ndarray:
 
 
 def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, tolerance: float) -> Symmetries:
-    """Find the rotational symmetries of a mesh, vertices (V, 3) and faces (F, 3), of a diameter [m].
-
-    Args:
-        tolerance: Largest Hausdorff distance [m].
-
-    Returns:
-        A closed group of discrete symmetries. Rotations about a continuous axis are omitted, as the axis stands for them; beside it there
-        is at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
+    """Find the rotational symmetries of a mesh, vertices (V, 3) and faces (F, 3), of a diameter [m]. `tolerance`: largest Hausdorff
+    distance [m]. Returns a closed group of discrete symmetries. Rotations about a continuous axis are omitted, as the axis stands for them;
+    beside it there is at most one half turn, about a perpendicular axis. A ball has three continuous axes, which stand for all rotations.
     """
     surface = SampledSurface(vertices, faces)
     turns, missed = _find_turns(surface, diameter, tolerance)

@@ -30,15 +30,10 @@ _MAX_SHOWN = 4
 def add_symmetries(
     info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str
 ) -> tuple[FileModelInfo, list[str]]:
-    """Add the symmetries of the object's row to its entry, or detect them if neither has any and the settings ask for it.
-
-    Args:
-        info: Entry of models_info.json; without symmetries if there is none.
-
-    Returns:
-        The entry with symmetries, and lines on what was found, or on what is declared and does not hold.
-
-    Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or the declared ones generate too many."""
+    """Add the symmetries of the object's row to its entry, or detect them if neither has any and the settings ask for it. `info`: entry of
+    models_info.json; without symmetries if there is none. Returns the entry with symmetries, and lines on what was found, or on what is
+    declared and does not hold. Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or the declared ones generate
+    too many."""
     if row is not None and (row.symmetries_discrete or row.symmetries_continuous):
         return _declared(info, found, diameter, row, objects.strict, origin)
     if objects.symmetries != DETECT or info.symmetries_discrete or info.symmetries_continuous:

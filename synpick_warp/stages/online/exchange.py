@@ -58,11 +58,8 @@ class Gate:
             self.device.stream.record_event(self._ready)
 
     def admit(self, handle: int | None) -> None:
-        """Let a consumer's stream wait for the rendering of this batch.
-
-        Args:
-            handle: The stream by DLPack's convention; it must live until the batch expires.
-        """
+        """Let a consumer's stream wait for the rendering of this batch. `handle`: the stream by DLPack's convention; it must live until the
+        batch expires."""
         if self._ready is None or handle == _NO_ORDER:
             return
         handle = _LEGACY_STREAM if handle is None else handle

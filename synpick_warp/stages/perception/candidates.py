@@ -70,10 +70,8 @@ class CandidateSampler:
             state: States at moments of choice (`trials.find_choices`).
             rows: Its rows to sample.
 
-        Returns:
-            Structs `Grasps` and `Candidates`, with `count` consecutive elements per row, and the visible instances (row, instance) bool.
-            All fields of a row without visible instances are 0, or the planned grasp's.
-        """
+        Returns the structs `Grasps` and `Candidates`, with `count` consecutive elements per row, and the visible instances (row, instance)
+        bool. All fields of a row without visible instances are 0, or the planned grasp's."""
         sizes = {"grasp": len(rows) * self.count}
         grasps, candidates = (allocate_struct(kind, sizes, self.device) for kind in (GRASPS, CANDIDATES))
         uploaded = wp.array(rows, dtype=wp.int32, device=self.device)

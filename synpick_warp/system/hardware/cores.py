@@ -10,10 +10,7 @@ from pathlib import Path
 
 def count_cores(root: Path = Path("/")) -> int:
     """Number of usable CPU cores: those of the affinity mask (`taskset`), at most the CPU quota of the control groups (`docker --cpus`).
-
-    Args:
-        root: Folder in which /proc and /sys lie; tests pass another one.
-    """
+    `root`: folder in which /proc and /sys lie; tests pass another one."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min([cores, *(max(1, math.ceil(quota)) for quota in _list_quotas(root))])
 

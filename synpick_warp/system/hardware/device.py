@@ -28,12 +28,8 @@ _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 
 
 def pick_device(name: str) -> wp.Device:
-    """Select a device by name; starts Warp on the first call.
-
-    Args:
-        name: "cpu", "cuda:N", or "auto": the first GPU if there is one, else the CPU.
-
-    Raises DeviceError: the name has another form, or there is no such GPU."""
+    """Select a device by name; starts Warp on the first call. `name`: "cpu", "cuda:N", or "auto": the first GPU if there is one, else the
+    CPU. Raises DeviceError: the name has another form, or there is no such GPU."""
     start_warp()
     count = wp.get_cuda_device_count()
     if name == "auto":
@@ -50,13 +46,9 @@ def pick_device(name: str) -> wp.Device:
 
 
 def pick_devices(names: Sequence[str]) -> tuple[str, ...]:
-    """Select the devices of a bake with one process each; returns their names. Starts Warp, but touches no device.
-
-    Args:
-        names: Different GPUs, or "cpu" once per process, since a process simulates on one core. `ALL` alone: every GPU, or the CPU if there
-            is none.
-
-    Raises DeviceError: there is no such device, a GPU is named twice, or the CPU beside a GPU."""
+    """Select the devices of a bake with one process each; returns their names. Starts Warp, but touches no device. `names`: different GPUs,
+    or "cpu" once per process, since a process simulates on one core. `ALL` alone: every GPU, or the CPU if there is none. Raises
+    DeviceError: there is no such device, a GPU is named twice, or the CPU beside a GPU."""
     if not names:
         raise DeviceError(f"--devices names none; {_DEVICES}")
     if list(names) == [ALL]:

@@ -35,10 +35,7 @@ def free_device_memory(device: wp.Device) -> int:
 
 def free_host_memory(root: Path = Path("/")) -> int:
     """Free memory of the host [bytes]: MemAvailable (without it: all memory), at most what each control group leaves; plus all free swap.
-
-    Args:
-        root: Folder in which /proc and /sys lie; tests pass another one.
-    """
+    `root`: folder in which /proc and /sys lie; tests pass another one."""
     table = _read_table(root / "proc/meminfo")
     # meminfo is in kibibytes. Without it, swap is unknown and counts as none.
     available, swap = table.get("MemAvailable:", 0) << 10, table.get("SwapFree:", 0) << 10

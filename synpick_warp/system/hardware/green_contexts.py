@@ -31,12 +31,8 @@ class SmPartition:
     """
 
     def __init__(self, device: wp.Device, reserved: int) -> None:
-        """Split the SMs of a GPU.
-
-        Args:
-            reserved: Number of reserved SMs; CUDA rounds up, with compute capability 9 to a multiple of 8.
-
-        Raises DeviceError: the driver is missing or too old, or the device has too few SMs."""
+        """Split the SMs of a GPU. `reserved`: number of reserved SMs; CUDA rounds up, with compute capability 9 to a multiple of 8. Raises
+        DeviceError: the driver is missing or too old, or the device has too few SMs."""
         self.device = device
         self._driver = _load_driver()
         ordinal, groups = ctypes.c_int(), ctypes.c_uint(1)

@@ -52,10 +52,7 @@ def decode_image(
         flags: OpenCV's `IMREAD_` flags; -1: unchanged.
         size: Width and height that it must have [px]; None: any up to MAX_SIDE.
 
-    Returns:
-        Image (H, W[, 3]), blue first.
-
-    Raises SynpickError: as `error`, in one line: it is not an image of that size."""
+    Returns the image (H, W[, 3]), blue first. Raises SynpickError: as `error`, in one line: it is not an image of that size."""
     stated = None if data.startswith(_TIFF) else image_size(data)
     if stated is None:
         raise error(f"{source} is not an image: neither PNG nor JPEG")

@@ -32,9 +32,7 @@ def decode_grey_crop(data: bytes, size: tuple[int, int], rows: slice, columns: s
         rows, columns: Of the crop, within the image.
         bits: Bit depth that it must have: 8 or 16.
 
-    Returns:
-        Crop (rows, columns), uint8 or big-endian uint16; None: the file is of another kind or size, or damaged.
-    """
+    Returns the crop (rows, columns), uint8 or big-endian uint16; None: the file is of another kind or size, or damaged."""
     width, height = size
     stream = _join_data(data, width, height, bits)
     if stream is None:

@@ -84,15 +84,9 @@ class _Server:
         self._worker: WorkerProcess | None = None
 
     def open_link(self, result: int, failed: WorkerProcess | None) -> tuple[socket.socket, WorkerProcess]:
-        """Ask the server for a process that writes its result into the file with handle `result`.
-
-        Args:
-            failed: Server of this call's first attempt, which exited without an answer; None at the first attempt. It is replaced once,
-                by whichever of its calls asks first.
-
-        Returns:
-            Socket connected to the supervisor of the new process, and the server that was asked.
-        """
+        """Ask the server for a process that writes its result into the file with handle `result`. `failed`: server of this call's first
+        attempt, which exited without an answer; None at the first attempt. It is replaced once, by whichever of its calls asks first.
+        Returns the socket connected to the supervisor of the new process, and the server that was asked."""
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
             if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
@@ -121,11 +115,8 @@ def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]],
         function: Function at the top of a module: it is pickled by name, and the process imports it.
         calls: Arguments of each call; they are pickled.
 
-    Yields:
-        For each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
-        `Failure`.
-
-    Raises ProcessError: no process can be started."""
+    Yields, for each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
+    `Failure`. Raises ProcessError: no process can be started."""
     if not calls:
         return
     links = _Links()

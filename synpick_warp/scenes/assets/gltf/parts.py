@@ -61,12 +61,8 @@ _RIGID = 1e-6
 
 
 def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshPart]:
-    """Read a .glb or .gltf file: one part for each primitive of each node of the default scene.
-
-    Args:
-        data: Content to decode in place of the file's.
-
-    Raises CatalogError: the file or one that it refers to cannot be used."""
+    """Read a .glb or .gltf file: one part for each primitive of each node of the default scene. `data`: content to decode in place of the
+    file's. Raises CatalogError: the file or one that it refers to cannot be used."""
     document, buffers = read_document(path, notes, data)
     with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
         return _Reader(path, document, buffers, notes).parts()
