@@ -5,6 +5,7 @@ import ast
 import functools
 import importlib
 import importlib.util
+import io
 import logging
 import os
 import re
@@ -14,6 +15,7 @@ import sys
 import threading
 import tomllib
 import types
+from contextlib import redirect_stdout
 from itertools import pairwise
 from pathlib import Path
 from types import CodeType, FrameType
@@ -30,7 +32,7 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing import box_views
 from synpick_warp.testing.exporters import export
-from tests.builders import PICKING, assignments, bake_boxes
+from tests.builders import PICKING, STIRRING, assignments, bake_boxes, run
 from tests.harness.environment import checkout_environment
 from tests.test_bake import TINY
 
@@ -57,43 +59,45 @@ def blocks(document: str) -> list[tuple[str, str]]:
     return [(match["language"], match["text"]) for match in BLOCK.finditer(document) if not match["skipped"]]
 
 
-@pytest.fixture
-def environment(tmp_path) -> dict[str, str]:
-    """The package importable from anywhere, a stand-in for PyTorch where it is missing, and a command `synpick-warp`."""
-    command = tmp_path / "bin" / "synpick-warp"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m synpick_warp "$@"\n')
-    command.chmod(0o755)
+def run_blocks(document: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **quick: object) -> str:
+    """Run the blocks of a document in a folder; returns what they print. Commands and Python run in this process, which has loaded the
+    kernels, except for PyTorch's loader, which forks; settings of a quick bake are all that is added."""
     stubs = [] if importlib.util.find_spec("torch") else [str(ROOT / "tests" / "stubs")]
     paths = os.pathsep.join([*stubs, *filter(None, [os.environ.get("PYTHONPATH")])])
-    return checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]), PATH=f"{command.parent}:{os.environ['PATH']}")
-
-
-def run_blocks(document: str, folder: Path, environment: dict[str, str]) -> str:
-    """Run the blocks of a document; returns what they print."""
+    environment = checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]))
+    monkeypatch.chdir(folder)
     said = ""
     for language, text in blocks(document):
-        program = [sys.executable, "-c", text] if language == "python" else ["bash", "-e", "-c", text]
-        done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, timeout=SECONDS)
-        assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
-        said += done.stdout
+        parts = [text] if language == "python" else re.split(r"^(synpick-warp .*)\n", text, flags=re.MULTILINE)
+        for part in filter(str.strip, parts):
+            name, *arguments = shlex.split(part, comments=True) if language == "bash" else [part]
+            if name == "synpick-warp":
+                code, printed, err = run(*arguments, *(("--device", "cpu", *assignments(quick)) if arguments[0] == "bake" else ()))
+                assert code == 0, f"{part}\n{printed}\n{err}"
+            elif language == "python" and "import torch" not in part:
+                with redirect_stdout(io.StringIO()) as out:
+                    exec(compile(part, "block", "exec"), {"__name__": "__main__"})
+                printed = out.getvalue()
+            else:
+                program = [sys.executable, "-c", part] if language == "python" else ["bash", "-e", "-c", part]
+                done = subprocess.run(program, env=environment, capture_output=True, text=True, timeout=SECONDS)
+                assert done.returncode == 0, f"{part}\n{done.stdout}\n{done.stderr}"
+                printed = done.stdout
+            said += printed
     return said
 
 
-@pytest.mark.slow(minutes=2)
-def test_the_lines_of_the_readme_run_as_written(tmp_path, environment):
+@pytest.mark.slow(minutes=1)
+def test_the_lines_of_the_readme_run_as_written(tmp_path, monkeypatch):
     assert [language for language, _ in blocks(README)].count("python") == 3
-    run_blocks(README, tmp_path, environment)
+    run_blocks(README, tmp_path, monkeypatch, **STIRRING)
     assert (tmp_path / "DATA.png").stat().st_size > 10_000
     assert (tmp_path / "view.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow(minutes=1)
-def test_the_page_on_ones_own_cell_leads_to_a_valid_data_set(tmp_path, environment):
-    """Settings of a quick bake are all that is added."""
-    bake = "synpick-warp bake "
-    assert CELL.count(f"\n{bake}") == 1
-    said = run_blocks(CELL.replace(f"\n{bake}", f"\n{bake}{shlex.join(assignments(PICKING))} --device cpu "), tmp_path, environment)
+def test_the_page_on_ones_own_cell_leads_to_a_valid_data_set(tmp_path, monkeypatch):
+    said = run_blocks(CELL, tmp_path, monkeypatch, **PICKING)
     assert "0 errors" in said
     assert "bracket.stl: 80 x 40 x 30 mm, unit mm" in said
     for name in ("CELL/cell.png", "symmetries.png", "DATA.png", "DATA-report.html", "DATA/camera_left.json", "DATA/usd/000000.usdc"):

@@ -5,6 +5,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -368,6 +369,13 @@ def test_few_small_files_are_read_by_the_calling_process(out, monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(pool, "start_process", None)
     assert verify.verify(out, 8).files == TOTAL
+
+
+def test_another_data_set_in_the_same_folder_has_settings_of_its_own(tmp_path):
+    for formats in (("bop",), ("usd",)):
+        scripted_bake.bake(tmp_path / "set", scripted_bake.settings(1, formats))
+        assert verify.verify(tmp_path / "set").problem == ""
+        shutil.rmtree(tmp_path / "set")
 
 
 @pytest.mark.parametrize("moment", ["before the data set", "with a task"])

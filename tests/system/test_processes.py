@@ -237,6 +237,12 @@ def test_errors_are_results_and_large_results_arrive(capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_paths_are_relative_to_the_folder_in_which_a_call_is_made(tmp_path, monkeypatch):
+    for folder in (tmp_path, tmp_path.parent):
+        monkeypatch.chdir(folder)
+        assert list(run_isolated(os.getcwd, [()], LIMITS)) == [str(folder)]
+
+
 def test_a_server_that_has_ended_is_started_again():
     list(run_isolated(math.sqrt, [(4.0,)], LIMITS))
     assert isolation._server._worker is not None

@@ -65,6 +65,7 @@ def verify(folder: Path, threads: int | None = None, report: Report = ignore_pro
     `threads` processes, None: one per core. Raises DatasetError if the folder is not a data set, or its manifest is damaged, and
     ProcessError if processes cannot be started, or one died.
     """
+    _read_config.cache_clear()  # Another data set may be there now.
     manifest = read_manifest(folder)
     episodes = committed_episodes(folder)
     files = 0

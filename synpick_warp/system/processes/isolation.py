@@ -84,9 +84,9 @@ class _Server:
         self._worker: WorkerProcess | None = None
 
     def open_link(self, result: int, failed: WorkerProcess | None) -> tuple[socket.socket, WorkerProcess]:
-        """Ask the server for a process that writes its result into the file with handle `result`. `failed`: server of this call's first
-        attempt, which exited without an answer; None at the first attempt. It is replaced once, by whichever of its calls asks first.
-        Returns the socket connected to the supervisor of the new process, and the server that was asked."""
+        """Ask the server for a process in the current folder that writes its result into the file with handle `result`. `failed`: server of
+        this call's first attempt, which exited without an answer; None at the first attempt. It is replaced once, by whichever of its calls
+        asks first. Returns the socket connected to the supervisor of the new process, and the server that was asked."""
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
             if self._worker is None or self._worker is failed or self._worker.process.poll() is not None:
@@ -94,7 +94,11 @@ class _Server:
                 program = f"from synpick_warp.system.processes.isolation import main; main({MODULES!r}, {IDLE_TIME!r})"
                 self._worker = start_process(program, environment=_ENVIRONMENT, has_threads=True)
             with socket.socket(fileno=os.dup(self._worker.link.fileno())) as control, contextlib.suppress(OSError):
-                socket.send_fds(control, [b"r"], [theirs.fileno(), result])
+                place = os.open(".", os.O_PATH)
+                try:
+                    socket.send_fds(control, [b"r"], [theirs.fileno(), result, place])
+                finally:
+                    os.close(place)
             return ours, self._worker
 
     def stop(self) -> None:
@@ -226,12 +230,12 @@ def main(modules: Sequence[str], idle: float) -> None:
         importlib.import_module(module)
     control = socket.socket(fileno=int(sys.argv[1]))
     while select.select([control], [], [], idle)[0]:
-        message, handles, _, _ = socket.recv_fds(control, 1, 2)
+        message, handles, _, _ = socket.recv_fds(control, 1, 3)
         if not message:
             return
         if os.fork() == 0:
             control.close()
-            _exit_after(_supervise, Connection(handles[0]), handles[1])
+            _exit_after(_supervise, Connection(handles[0]), *handles[1:])
         for handle in handles:
             os.close(handle)
 
@@ -245,8 +249,10 @@ def _exit_after(function: Callable[..., int], *arguments: Any) -> None:
         os._exit(code)
 
 
-def _supervise(link: Connection, result: int) -> int:
-    """Run a request in a child, and send how it ended (`_outcome`); kill it if its time is over or the caller closed the link."""
+def _supervise(link: Connection, result: int, place: int) -> int:
+    """Run a request in a child, in the caller's folder (handle `place`), to which its paths are relative; send how it ended (`_outcome`),
+    and kill it if its time is over or the caller closed the link."""
+    os.fchdir(place)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     send(link, "started")
     if (message := _receive(link)) is None:
