@@ -119,8 +119,7 @@ def make_parser(
     doc: str | None, *shared: str, own: Mapping[str, Mapping[str, Any]] | None = None, **defaults: object
 ) -> argparse.ArgumentParser:
     """Argument parser, described by the first line of the docstring `doc`, with options out of `OPTIONS` and further ones of the same form;
-    `defaults` are those that differ from `OPTIONS`.
-    """
+    `defaults` are those that differ from `OPTIONS`."""
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     for name, arguments in {**{name: OPTIONS[name] for name in shared}, **(own or {})}.items():
         parser.add_argument(f"--{name}", **arguments)

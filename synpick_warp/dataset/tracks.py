@@ -13,8 +13,7 @@ from synpick_warp.dataset.view import View
 @dataclass(frozen=True, eq=False)
 class Track:
     """Poses, visibility and boxes of one instance over C cameras and the F frames of its episode; where it is not in the scene, poses are
-    NaN, boxes -1, the rest 0. Poses: object to tote, object to camera [m].
-    """
+    NaN, boxes -1, the rest 0. Poses: object to tote, object to camera [m]."""
 
     instance_id: int
     object_id: int

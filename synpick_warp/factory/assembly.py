@@ -336,8 +336,7 @@ def _build_group(config: Config, scene: RenderScene, cameras: tuple[Camera, ...]
 def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device: wp.Device, progress: Progress) -> Config:
     """Resolve settings that depend on objects and bins: whether objects repeat in an episode (if they are too few to fill the bin), and
     contact capacities. Raises ConfigError if the capacities do not fit into the device's memory, the objects of `arrangement.counts` do not
-    fit into the bins, or no cup of the gripper can lie on any object.
-    """
+    fit into the bins, or no cup of the gripper can lie on any object."""
     labelled = without_distractors(config.arrangement, config.randomize.most_distractors)
     check_fill(labelled, config.physics.guide_height, catalog, config.cell.bins)
     picks = may_pick(config.bake, config.splits)

@@ -36,8 +36,7 @@ def encode_line(attempt: Attempt, bin: Mapping[str, Any] | None = None) -> str:
 @dataclass(frozen=True)
 class EpisodeRecord:
     """Attempts and object counts (first and last frame) of an episode; empty if it is not part of the data set. Distractors count as no
-    objects.
-    """
+    objects."""
 
     mode: str
     objects: int = 0

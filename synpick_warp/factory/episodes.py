@@ -73,8 +73,7 @@ _OPTIONAL = EpisodeOutcome._field_defaults
 @dataclass
 class BakeSummary:
     """Totals of a bake, committed episodes of earlier runs included: episodes, views and time of this run, resampled arrangements,
-    outcomes, and the signal that stopped it (0: none).
-    """
+    outcomes, and the signal that stopped it (0: none)."""
 
     total: int = 0
     """Episodes of the complete data set."""

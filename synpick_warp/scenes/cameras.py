@@ -138,8 +138,7 @@ class EpisodeCameras:
 
     def record(self, episode: int) -> dict[str, Any] | None:
         """Record of an episode's cameras by name, those that are drawn or move: matrix [px], rotation and translation [m] from the world,
-        or with `fixed_to` from what carries the camera; None: there is none.
-        """
+        or with `fixed_to` from what carries the camera; None: there is none."""
         records = {}
         for index, one in enumerate(self.of_episode(episode)):
             if self.rig.is_placed(index):

@@ -192,8 +192,7 @@ class EnvironmentMap:
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Pinhole camera: image size, intrinsic matrix K, world-to-camera rotation and translation [m]. OpenCV's axes (x right, y down, z
-    forward); the centre of pixel (row, column) is (column + 0.5, row + 0.5).
-    """
+    forward); the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
 
     width: int
     height: int

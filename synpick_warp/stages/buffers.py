@@ -46,8 +46,7 @@ class LastFrame(array_group(FramePoses, "world", "instance", units=_METRES, **_W
 @dataclass(frozen=True, eq=False)
 class ViewBuffers:
     """Output of the renderer for one batch of views: colour, depth in counts (0: none), segmentation ids, amodal masks, pixel counts,
-    boxes, effects.
-    """
+    boxes, effects."""
 
     color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""

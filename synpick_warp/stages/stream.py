@@ -36,8 +36,7 @@ _SNAPSHOT = ("bin", "fixture_pose", "fixture_visible", "light", "light_yaw", "li
 @dataclass(frozen=True, eq=False)
 class TickReport:
     """Results of one tick on the host, one row a world: status, measures, objects (-1: none), object-to-world poses [m], perception, and
-    recorded physics (empty: not recorded).
-    """
+    recorded physics (empty: not recorded)."""
 
     status: np.ndarray
     """Status rows (world, status) int32; columns: `Status`."""
@@ -74,8 +73,7 @@ class TickReport:
 @dataclass(frozen=True, eq=False)
 class LightTable:
     """Environment maps: name, and unit direction towards the first lamp (the sun, or else the strongest light) before the map is rotated;
-    zero: the map has none.
-    """
+    zero: the map has none."""
 
     name: np.ndarray
     """Name (light) str."""
@@ -234,8 +232,7 @@ def describe_batches(
 @dataclass(eq=False)
 class _Launched:
     """Batch in flight, which the device renders, encodes and copies: ring slot, number of views, description, and what to call when it is
-    consumed.
-    """
+    consumed."""
 
     ring: ViewRing
     slot: int
@@ -250,8 +247,7 @@ class _Launched:
 
 class FrameStream:
     """Renders the live worlds of snapshots as FrameBatches, in a ring for each group of cameras: on a GPU up to two batches of a group are
-    in flight while one is consumed.
-    """
+    in flight while one is consumed."""
 
     def __init__(
         self,
@@ -274,8 +270,7 @@ class FrameStream:
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
         """Yield the tick's views, group by group of cameras, world by world and camera by camera. A batch is valid until the next one is
-        requested.
-        """
+        requested."""
         while self.in_flight:
             # Left by a consumer that stopped early.
             launched = self.in_flight.popleft()

@@ -37,8 +37,7 @@ RING = 3
 
 def views_per_batch(render: Render, rig: Rig, worlds: int, objects: int, device: wp.Device, group: int = 0) -> int:
     """Number of views of a group of cameras rendered at once: as set; else on a CPU one world's, on a GPU what the group's share of
-    BATCH_BYTES holds, up to all worlds'.
-    """
+    BATCH_BYTES holds, up to all worlds'."""
     cameras = rig.groups[group]
     views = len(cameras)
     if render.views_per_batch:

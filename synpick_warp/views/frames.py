@@ -192,8 +192,7 @@ class TickBatch:
 @dataclass(frozen=True)
 class EpisodeEnd:
     """End of an episode: indices, frames, `Ending`, and its lines of episodes.jsonl (empty: the arrangement will be resampled) and
-    attempts.jsonl. Exporters commit its files, or discard them if the ending delivers nothing.
-    """
+    attempts.jsonl. Exporters commit its files, or discard them if the ending delivers nothing."""
 
     episode: int
     """Episode index."""

@@ -127,8 +127,7 @@ def test_textures_have_several_colours_and_are_used(raw):
 @pytest.mark.parametrize("obj_id", PRINTED)
 def test_labels_are_upright_and_not_mirrored(obj_id):
     """Seen from outside, triangles run counter-clockwise in space and so they must in the picture. On upright faces its v grows with
-    height: for v as a linear function on the triangle, dv/dz > 0.
-    """
+    height: for v as a linear function on the triangle, dv/dz > 0."""
     points, uv = printed(obj_id)
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     assert (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > -1e-9).all()

@@ -323,8 +323,7 @@ def test_a_hole_leaks_by_its_area_and_one_of_a_tenth_of_the_cup_is_always_seen(d
 )
 def test_a_cup_seals_on_what_its_bellows_follow_and_nowhere_else(device, cup, mesh, share):
     """A ball or pipe of radius r with r - sqrt(r² - R²) of up to a tenth of the cup; nothing thinner than it, no hole, no gap of 3 mm: one
-    of 4 mm depth, with 24 mm² below the lip, leaves 3 % of the vacuum.
-    """
+    of 4 mm depth, with 24 mm² below the lip, leaves 3 % of the vacuum."""
     (force,) = forces(device, [mesh], cup)
     assert share - 0.01 <= force / full(cup) <= share + 0.04
 

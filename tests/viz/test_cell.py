@@ -1,6 +1,5 @@
 """Sheet of a cell: projections and frusta of known cameras, objects laid out, and the command. Sheet of symmetries: which axes are drawn,
-and the command on folders of models and data sets.
-"""
+and the command on folders of models and data sets."""
 
 from dataclasses import replace
 from pathlib import Path

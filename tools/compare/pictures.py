@@ -117,8 +117,7 @@ class PictureDifference:
 
 def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> PictureDifference:
     """Compare one output of two devices: images (view, row, column[, channel]), where a pixel differs if any of its channels does, or
-    counts or boxes of any shape. NaN equals NaN.
-    """
+    counts or boxes of any shape. NaN equals NaN."""
     tolerance = COLORS[mode] if output == "color" else TOLERANCES[output]
     if tolerance.difference is None:
         difference = (a != b).astype(np.float64)

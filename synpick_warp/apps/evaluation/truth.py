@@ -148,8 +148,7 @@ def read_truth(data_set: DataSet) -> Truth:
 
 def _assemble(parts: list[tuple[SceneArrays, int, int, int, str]], period: float | None) -> Truth:
     """Build the table from `parts`: (arrays, scene_id, episode, camera, mode) of each scene, sorted by scene, image and object. Without a
-    frame `period` [s], speeds are NaN.
-    """
+    frame `period` [s], speeds are NaN."""
     lengths = [len(arrays) for arrays, *_ in parts]
 
     def repeat(values: Iterable[int | str]) -> np.ndarray:

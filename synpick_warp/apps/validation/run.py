@@ -117,8 +117,7 @@ def validate(folder: Path, options: ValidationOptions, summary: Summary, report:
 
 def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation:
     """Count a violation in the summary; returns it with a shorter text: paths relative to the data set, and the file's own name
-    not twice.
-    """
+    not twice."""
     if violation.level is Level.ERROR:
         summary.errors += 1
     else:

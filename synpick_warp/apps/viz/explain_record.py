@@ -281,8 +281,7 @@ class GraphLayout:
 
 def clutter_edges(attempt: SeenAttempt, min_votes: float) -> list[Edge]:
     """Edges of the clutter graph, sorted by lower, then upper instance: all that are kept in the acyclic graph, and of at least `min_votes`
-    those removed, since the opposite has as many votes or to break a cycle.
-    """
+    those removed, since the opposite has as many votes or to break a cycle."""
     edges = []
     for lower, one in sorted(attempt.objects.items()):
         voted = {upper for (at, upper), votes in attempt.votes.items() if at == lower and votes >= min_votes}
@@ -409,8 +408,7 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
 
 def _draw_bent(canvas: Image, edge: Edge, layout: GraphLayout) -> None:
     """Draw a removed edge as a dashed arc, so that it does not cover the straight line between its nodes, where the opposite
-    edge may run.
-    """
+    edge may run."""
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
     route = _arc(start, end, _BEND * np.array([end[1] - start[1], start[0] - end[0]]))
     _draw_arrow(canvas, route, GREY if edge.state == OUTVOTED else RED, 1, dashed=True)

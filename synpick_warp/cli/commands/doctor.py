@@ -75,8 +75,7 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of the arrays in the memory plan of a bake with these settings, and their sum. Small arrays, of less
-    than `_SMALL` of it, share a row.
-    """
+    than `_SMALL` of it, share a row."""
     device, episodes = pick_device(config.bake.device), DataLayout.of(config).planned
     writers = count_writers(config.bake.writers, Needs.of(config).slot_bytes)
     config = fit_to_device(without_pictures(config), device, episodes, writers)

@@ -69,8 +69,7 @@ _COPLANAR_COSINE = 1.0 - 1e-6 / 2.0
 @dataclass(frozen=True)
 class _Facets:
     """Half-spaces n·x ≤ d relative to a hull's centroid, with the mean gap to its surface: those of clusters of its triangles, largest area
-    first, then sides of a box along the principal axes.
-    """
+    first, then sides of a box along the principal axes."""
 
     normal: np.ndarray
     """Outward unit normal n (facet, 3)."""

@@ -55,8 +55,7 @@ Bits = tuple[int, int]
 
 def code_lengths() -> list[int]:
     """Code lengths [bits] of the literal/length alphabet: the 256 bytes, the end of the block, the length symbols; 0: not used. Distance
-    symbols are apart (`_DISTANCE_LENGTHS`).
-    """
+    symbols are apart (`_DISTANCE_LENGTHS`)."""
     return [int(digit, 16) for digit in _CODE_LENGTHS]
 
 

@@ -85,8 +85,7 @@ class ModuleBuild(NamedTuple):
 @contextlib.contextmanager
 def compilation_lock(wait: Callable[[], None]) -> Iterator[None]:
     """Lock of Warp's kernel cache (flock): of several processes that start with a cold cache one compiles, and the others get its kernels.
-    File systems without locks are used unlocked. `wait`: called before waiting for another process.
-    """
+    File systems without locks are used unlocked. `wait`: called before waiting for another process."""
     try:
         handle = os.open(Path(wp.config.kernel_cache_dir or "", _LOCK_FILE), os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
     except OSError:

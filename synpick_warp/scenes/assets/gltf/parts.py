@@ -331,8 +331,7 @@ class _Reader:
 
     def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
         """Material and coordinates with a sampler's wrap modes applied where coordinates leave 0..1: mirrored repetition as an image twice
-        the size that repeats, clamping as a margin around the image.
-        """
+        the size that repeats, clamping as a margin around the image."""
         texture = self.gltf.textures[info.index]
         if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
             return material, uv
