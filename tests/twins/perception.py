@@ -16,7 +16,7 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.perception.images import allocate_batch
-from synpick_warp.stages.perception.segment import Segmenter
+from synpick_warp.stages.perception.perceive import Segmenter
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.sim.worlds import world_sizes

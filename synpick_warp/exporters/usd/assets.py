@@ -1,7 +1,5 @@
-"""Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table."""
-
-# pxr's modules are filled when they are loaded, invisible to type checkers.
-# pyright: reportAttributeAccessIssue=false
+"""Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table; and
+environment maps: EXR files, and the parameters of dome and distant lights."""
 
 from __future__ import annotations
 
@@ -9,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
+import OpenEXR
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
 from synpick_warp.codes import LookPart
 from synpick_warp.configs.schema import Physics, Render
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
     add_body,
     add_collider,
@@ -28,11 +28,23 @@ from synpick_warp.exporters.usd.parts import (
     save_layer,
     write_texture,
 )
-from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, bin_asset, drawn_texture, object_asset
+from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset
 from synpick_warp.scenes.bins import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE, make_bins
+from synpick_warp.scenes.environment import (
+    BACKGROUND_ROWS,
+    LUMINANCE,
+    MAX_SUN_TANGENT,
+    WHITE_VALUE,
+    draw_sun_disc,
+    map_directions,
+    replace_sun,
+    resize_map,
+    sun_fraction,
+)
 from synpick_warp.scenes.grippers import finger_collider, finger_fixture, make_head, rod_inertia
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, Fixture, Material, TriangleMesh
+from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
+from synpick_warp.system.linear_algebra import dot
 
 
 def write_library(library: Path, context: ExportContext) -> None:
@@ -146,3 +158,66 @@ def _add_contact_material(stage: Usd.Stage, physics: Physics) -> tuple[str, UsdS
     root = str(stage.GetDefaultPrim().GetPath())
     UsdGeom.Scope.Define(stage, f"{root}/Materials")
     return root, add_friction(stage, f"{root}/Materials/Contact", physics.friction)
+
+
+def light_file(index: int) -> str:
+    """Path of an environment map in the asset library."""
+    return f"lights/light_{index:03d}.exr"
+
+
+def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> StageLight:
+    """Describe an environment map, by its index in the bake, as lights of a stage; the intensity reproduces the renderer's automatic
+    exposure times `exposure`."""
+    radiance, irradiance, radius_tangent = separate_sun(light)
+    directions, solid = map_directions(len(radiance))
+    upward = np.maximum(directions[..., 2], 0.0) * solid
+    white = np.einsum("ij,ijc->c", upward, radiance)
+    azimuth = polar = 0.0
+    sun: tuple[float, float, float] | None = None
+    if light.sun is not None and irradiance.any():
+        x, y, z = light.sun.direction
+        azimuth, polar = np.degrees(np.arctan2(y, x)), np.degrees(np.arccos(np.clip(z, -1.0, 1.0)))
+        white = white + max(z, 0.0) * irradiance
+        sun = (float(irradiance[0]), float(irradiance[1]), float(irradiance[2]))
+    factor = exposure * WHITE_VALUE * np.pi / max(float(dot(white, LUMINANCE)), 1e-9)
+    angle = float(2.0 * np.degrees(np.arctan(radius_tangent)))
+    return StageLight(light.name, light_file(index), float(factor), float(azimuth), float(polar), sun, angle)
+
+
+def write_light_maps(library: Path, lights: tuple[EnvironmentMap, ...]) -> None:
+    """Write all maps as EXR files into the asset library; `lights/` must exist.
+
+    By OpenEXR's convention, longitude grows to the left in the image and is 0 at its centre; it equals our azimuth. USD's core supports
+    EXR, PNG and JPEG textures; Radiance maps (.hdr) are supported by some renderers only. Raises OutputError.
+    """
+    for index, light in enumerate(lights):
+        image, path = np.ascontiguousarray(separate_sun(light)[0][:, ::-1], dtype=np.float32), library / light_file(index)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "envmap": OpenEXR.ENVMAP_LATLONG}
+        try:
+            OpenEXR.File(header, {"RGB": image}).write(str(path))
+        except RuntimeError as error:
+            raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}; free space or rights there") from error
+
+
+def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
+    """Separate an environment map and its sun so that no light counts twice, by the same rule as the renderer.
+
+    The sun has the colour given with the map. Its luminance is the given one or that of the bright region it replaces, whichever is larger.
+    Returns the map (H, 2H, 3) without that region, or with a disc in its place if the sun is wide; the sun's irradiance (3), zero if it has
+    none or is that disc; tangent of its angular radius.
+    """
+    sun = light.sun
+    if sun is None:
+        return light.radiance, np.zeros(3), 0.0
+    radiance = light.radiance.astype(np.float64)
+    coarse = resize_map(radiance, BACKGROUND_ROWS)
+    _, direction, irradiance, radius_tangent = replace_sun(coarse, sun)
+    # The fraction of a coarse texel applies to all fine texels within it, so that the same light is removed.
+    fraction = sun_fraction(coarse, direction).astype(np.float32)
+    rows = len(radiance)
+    method = cv2.INTER_AREA if rows <= BACKGROUND_ROWS else cv2.INTER_NEAREST
+    fine = cv2.resize(fraction, (2 * rows, rows), interpolation=method).astype(np.float64)
+    rest = radiance * (1.0 - fine)[..., None]
+    if radius_tangent > MAX_SUN_TANGENT:
+        return rest + draw_sun_disc(fine > 0.0, direction, irradiance, radius_tangent), np.zeros(3), radius_tangent
+    return rest, irradiance, radius_tangent

@@ -19,8 +19,8 @@ from synpick_warp.configs.cell.bins import BinRow, Bins
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.formats import FORMAT_TABLE
+from synpick_warp.exporters.usd.assets import write_light_maps
 from synpick_warp.exporters.usd.exporter import UsdExporter
-from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import new_asset, save_layer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
