@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from synpick_warp.apps.viz.explain_record import read_attempts
 from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Task
-from synpick_warp.configs.dataset.splits import may_pick
+from synpick_warp.configs.dataset import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.records import Row

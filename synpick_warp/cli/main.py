@@ -37,7 +37,7 @@ from synpick_warp.cli.options import (
 )
 from synpick_warp.cli.streams import StreamError, describe_fault, flush_output, safe_streams
 from synpick_warp.configs.check import describe_allowed
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.fields import PATH_RULE, settings_of
 from synpick_warp.configs.files.load import COMMAND_LINE, DEFAULT_PRESET, describe_presets, parse_assignment, preset_names, sections
 from synpick_warp.configs.files.write import config_to_toml

@@ -15,14 +15,14 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.dataset.commit.manifest import episode_entry, read_checksums, read_entry
 from synpick_warp.dataset.commit.writing import list_lines
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter
 from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.writing.files import LINES
-from synpick_warp.system.inputs.paths import make_folder, path_inside
+from synpick_warp.system.inputs.files import make_folder, path_inside
 
 MAX_BUNDLE = 1 << 30
 """Limit of an episode's index file, unpacked [B]: guards against decompression bombs."""

@@ -16,14 +16,14 @@ from typing import Any, Self
 from synpick_warp.cloud.bundles import make_bundle
 from synpick_warp.cloud.claims import LeaseLostError
 from synpick_warp.cloud.ledger import INDEX, Ledger
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.dataset.commit.manifest import CONSTANTS, MANIFEST_FILE, committed_episodes, episode_entry, read_checksums, read_entry
 from synpick_warp.errors import OutputError, StoreError
 from synpick_warp.exporters.base import list_folders
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.system import clock
-from synpick_warp.system.inputs.json import MAX_JSON
+from synpick_warp.system.inputs.files import MAX_JSON
 from synpick_warp.system.progress import ForwardingProgress, Progress
 from synpick_warp.system.stores.store import Store, TransientError, persist
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from synpick_warp.cloud.bundles import MAX_BUNDLE, unpack_bundle
 from synpick_warp.cloud.delivery import FILES_AT_ONCE, send_file
 from synpick_warp.cloud.ledger import FINISHED, FINISHING, INDEX, Ledger
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, INDICES, MANIFEST_FILE, read_checksums
 from synpick_warp.dataset.commit.writing import finalize_data_set
@@ -20,8 +20,7 @@ from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.sizes import count_writers
 from synpick_warp.system import clock
-from synpick_warp.system.inputs.json import MAX_JSON
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import MAX_JSON, make_folder
 from synpick_warp.system.stores.store import SMALL
 
 AHEAD = 256

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
@@ -25,8 +25,7 @@ from synpick_warp.dataset.commit.manifest import (
 )
 from synpick_warp.dataset.records import Manifest
 from synpick_warp.errors import ConfigError, OutputError, StoreError
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
-from synpick_warp.system.inputs.toml import MAX_TOML
+from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, decode_json
 from synpick_warp.system.stores.opening import CONTROL, Probe, open_store
 from synpick_warp.system.stores.store import SMALL, Store
 

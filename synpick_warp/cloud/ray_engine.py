@@ -20,7 +20,7 @@ from typing import Any
 from synpick_warp._version import __version__
 from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store, open_ledger
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.errors import DeviceError, SynpickError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import with_measures

@@ -23,7 +23,7 @@ import msgspec
 
 from synpick_warp.cloud.delivery import FILES_AT_ONCE
 from synpick_warp.cloud.ledger import ENTRY
-from synpick_warp.configs.dataset.splits import episode_range
+from synpick_warp.configs.dataset import episode_range
 from synpick_warp.dataset.annotations import ADVICE, Index
 from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
@@ -41,10 +41,7 @@ from synpick_warp.dataset.commit.manifest import (
 from synpick_warp.dataset.commit.verify import Verdict, check_part
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, StoreError
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
-from synpick_warp.system.inputs.paths import make_folder, path_inside
-from synpick_warp.system.inputs.toml import MAX_TOML
+from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, decode_json, make_folder, path_inside, read_file
 from synpick_warp.system.inputs.urls import SCHEMES
 from synpick_warp.system.progress import Report, ignore_progress
 from synpick_warp.system.stores.opening import CONTROL, open_store

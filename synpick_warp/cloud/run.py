@@ -18,7 +18,7 @@ from synpick_warp.cloud.claims import CLAIMS, LEASE, Chunk, Chunks, Claims, Leas
 from synpick_warp.cloud.delivery import Delivery, WatchedProgress
 from synpick_warp.cloud.finish import finalize_store
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import MANIFEST_FILE
 from synpick_warp.errors import StoreError, SynpickError

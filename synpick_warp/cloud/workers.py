@@ -17,7 +17,7 @@ from typing import Any
 from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.ray_engine import bake_with_ray
 from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store, open_ledger
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.devices import DeviceProcesses

@@ -14,9 +14,8 @@ import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.files import read_file
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
 from synpick_warp.system.inputs.image_files import MAX_SIDE
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 _Content = TypeVar("_Content")
 ADVICE = "restore the file, or bake the data set again"

@@ -17,7 +17,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.configs.dataset.splits import DataLayout, episode_range
+from synpick_warp.configs.dataset import DataLayout, episode_range
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.commit.plausibility import check_frames
@@ -37,7 +37,7 @@ from synpick_warp.dataset.trajectory import (
 from synpick_warp.errors import DatasetError, format_value
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json
 from synpick_warp.system.inputs.urls import parse_place
 
 if TYPE_CHECKING:

@@ -15,8 +15,7 @@ from synpick_warp.codes import MAX_INSTANCES as MAX_OBSERVED
 from synpick_warp.configs.cell.cameras import WORLD
 from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
 
 Number = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
 """32-bit integer."""

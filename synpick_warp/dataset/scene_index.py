@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from synpick_warp.configs.cell.rig import Size
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.view_files import SceneFiles

@@ -12,8 +12,7 @@ from msgspec import Meta, Struct
 from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, OBJECTS, GroupSpec
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json, read_file
 
 if TYPE_CHECKING:
     import numpy as np

@@ -27,9 +27,8 @@ from synpick_warp.dataset.annotations import (
 from synpick_warp.dataset.bop.images import COLOR, KeyedImages
 from synpick_warp.dataset.bop.layout import Listing, SceneRef
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.files import read_file_if_present
+from synpick_warp.system.inputs.files import MAX_JSON, read_file_if_present
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
-from synpick_warp.system.inputs.json import MAX_JSON
 from synpick_warp.system.inputs.png_crop import decode_grey_crop
 
 SUFFIXES = (".png", ".jpg")

@@ -24,7 +24,7 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from typing import Literal, NamedTuple
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import FORMATS, Bop
 from synpick_warp.errors import ConfigError
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS

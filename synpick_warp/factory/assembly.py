@@ -19,7 +19,7 @@ from synpick_warp.codes import Ending, Status
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.gripper import describe_forces
 from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.dataset.splits import DataLayout, may_pick
+from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.exporters.registry import Needs

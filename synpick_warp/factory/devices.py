@@ -24,7 +24,7 @@ from typing import Any, Self
 
 import warp as wp
 
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.writing import OutputFolder, digest_inputs

@@ -16,7 +16,7 @@ import warp as wp
 
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.cell.extents import BinSizes
-from synpick_warp.configs.dataset.splits import DataLayout, may_pick
+from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import most_objects
 from synpick_warp.configs.episodes.randomize import Randomize

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.sim.choices import Choice, ChoiceReader, ChoiceRecorder

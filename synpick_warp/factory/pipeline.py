@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_entry

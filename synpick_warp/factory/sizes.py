@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 import warp as wp
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH

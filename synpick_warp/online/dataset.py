@@ -19,7 +19,7 @@ from torch.utils.data import IterableDataset, get_worker_info  # pyright: ignore
 
 from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.check import to_index
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from synpick_warp.configs.check import to_index
-from synpick_warp.configs.dataset.splits import DataLayout, check_shard
+from synpick_warp.configs.dataset import DataLayout, check_shard
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config

@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import Stages, build_online, group_layers

@@ -16,7 +16,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.dataset.splits import mode_weights
+from synpick_warp.configs.dataset import mode_weights
 from synpick_warp.configs.schema import EXCEED, Arrangement, Bake, Config, Move, Physics, Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.inside import HeightField

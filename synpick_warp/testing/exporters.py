@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter

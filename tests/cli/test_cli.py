@@ -20,7 +20,7 @@ from synpick_warp.cli.commands import doctor
 from synpick_warp.cli.main import app, main
 from synpick_warp.cli.options import EXAMPLES, MAX_LINE, one_line, parse_resolution, parse_shard
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import load_config, preset_names
 from synpick_warp.errors import ConfigError, DatasetError, DeviceError, OutputError, SynpickError
 from synpick_warp.exporters.writing.pool import WriterPool

@@ -22,7 +22,7 @@ from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.scenes.collision.shapes import _Saver
 from synpick_warp.scenes.types import ConvexPiece
 from synpick_warp.system.hardware.caches import link_files
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 from tests.builders import mistake
 from tests.harness.scripted_bake import bake, settings
 

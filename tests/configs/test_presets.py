@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Stream
-from synpick_warp.configs.dataset.splits import DataLayout, episode_range, may_pick, mode_weights
+from synpick_warp.configs.dataset import DataLayout, episode_range, may_pick, mode_weights
 from synpick_warp.configs.fields import settings_of
 from synpick_warp.configs.files.load import load_config, preset_names, sections
 from synpick_warp.configs.files.write import config_to_toml

@@ -21,8 +21,7 @@ import pytest
 
 import synpick_warp.exporters
 from synpick_warp.codes import Effect, Outcome, Task, names
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import FORMATS, Config, Split
 from synpick_warp.dataset.records import Attempt, InstanceObservation

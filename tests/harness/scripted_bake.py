@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set

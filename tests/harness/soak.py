@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.commit.manifest import episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode

@@ -24,12 +24,9 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
-from synpick_warp.system.inputs.files import check_regular_file, read_file
+from synpick_warp.system.inputs.files import MAX_TOML, check_regular_file, decode_json, decode_toml, path_inside, read_file, read_toml
 from synpick_warp.system.inputs.image_files import decode_image
-from synpick_warp.system.inputs.json import decode_json
-from synpick_warp.system.inputs.paths import path_inside
 from synpick_warp.system.inputs.png_crop import _WIDE, decode_grey_crop
-from synpick_warp.system.inputs.toml import MAX_TOML, decode_toml, read_toml
 from tests.builders import mistake, refusal
 from tests.harness.hostile import fuzz_examples
 from tests.worlds.model_files import pack_png

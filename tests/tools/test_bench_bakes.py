@@ -12,7 +12,7 @@ from unittest import mock
 import pytest
 import warp as wp
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import write_manifest_entry

@@ -15,7 +15,7 @@ import pytest
 import synpick_warp
 from synpick_warp.apps.validation import run as running
 from synpick_warp.apps.validation.registry import load_rules
-from synpick_warp.system.inputs.json import MAX_JSON
+from synpick_warp.system.inputs.files import MAX_JSON
 from tests.builders import run as command
 from tests.harness.hostile import hostile_contents
 from tests.harness.scripted_bake import make_victim, snapshot

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext

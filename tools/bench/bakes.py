@@ -26,7 +26,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.cli.commands.doctor import GIB
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_checksums

@@ -27,8 +27,8 @@ from synpick_warp.dataset.bop.foreign import measure_info
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors
+from synpick_warp.system.inputs.files import decode_json
 from synpick_warp.system.inputs.image_files import decode_image
-from synpick_warp.system.inputs.json import decode_json
 from tools.options import fail
 
 SPLIT = "test"

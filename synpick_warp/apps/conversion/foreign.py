@@ -22,7 +22,7 @@ from synpick_warp.apps.validation.comparison import MEASURED_DEPTH
 from synpick_warp.apps.validation.rendering import DepthPatch, ObjectRenderer
 from synpick_warp.codes import Ending
 from synpick_warp.configs.calibration.lens import read_lens
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.bop.foreign import ForeignScenes, measure_info
 from synpick_warp.dataset.bop.layout import TARGETS, Layout
@@ -43,8 +43,8 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg
 from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.inputs.files import make_folder
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, TEXTURE_KINDS
-from synpick_warp.system.inputs.paths import make_folder
 from synpick_warp.system.progress import Report
 from synpick_warp.views.frames import EpisodeEnd
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from synpick_warp.apps.conversion.foreign import convert_foreign
 from synpick_warp.apps.conversion.source import ConversionSource, StoredContext
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.schema import CLASSIC
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.dataset.reading import open_data_set

@@ -20,8 +20,7 @@ import numpy as np
 
 from synpick_warp._version import __version__
 from synpick_warp.codes import Ending
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import ADVICE, Index, check_content
 from synpick_warp.dataset.bop.models import names_of

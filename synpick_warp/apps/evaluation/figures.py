@@ -21,7 +21,7 @@ from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.system.codecs.charts import INK, PALETTE, SOFT, Legend, Spec, axis, chart, line, panel, points, render_charts
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 
 _CENTIMETERS = 100.0
 _RAW = "#aab2bc"

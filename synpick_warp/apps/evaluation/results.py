@@ -25,8 +25,7 @@ from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.errors import OutputError, ResultError, format_value
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.inputs.files import read_file, read_json
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
 FORMAT = f"{HEADER}, with 9 numbers in R and 3 in t [mm], separated by spaces"

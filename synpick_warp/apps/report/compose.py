@@ -48,7 +48,7 @@ from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 from synpick_warp.system.progress import Report, ignore_progress
 
 SUFFIXES = (".html", ".htm")

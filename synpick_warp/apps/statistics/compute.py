@@ -23,7 +23,7 @@ from msgspec import UNSET
 from synpick_warp.apps.statistics import columns, figures
 from synpick_warp.apps.statistics.columns import Block, Counts, Group
 from synpick_warp.apps.statistics.figures import Comparison, GroupStatistics, Numbers
-from synpick_warp.configs.dataset.splits import split_kind
+from synpick_warp.configs.dataset import split_kind
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.bop.arrays import read_arrays
@@ -32,7 +32,7 @@ from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.inputs.toml import read_toml
+from synpick_warp.system.inputs.files import read_toml
 from synpick_warp.system.processes.pool import WorkerPool, WorkerProgram
 from synpick_warp.system.progress import Report
 

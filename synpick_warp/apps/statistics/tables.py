@@ -29,7 +29,7 @@ from synpick_warp.apps.statistics.figures import GroupStatistics, Statistics
 from synpick_warp.errors import OutputError, escape
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.system.codecs.tables import Column, Table, Value, parse_columns, to_csv, to_text
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 
 ALL = "all"
 """Label of the row over all splits or modes."""

@@ -21,8 +21,8 @@ from synpick_warp.dataset.bop.images import FolderImages, KeyedImages
 from synpick_warp.dataset.bop.layout import Layout, SceneRef
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json
 from synpick_warp.system.inputs.image_files import MAX_SIDE, decode_picture
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 """An index as a key: decimal digits without leading zeros."""

@@ -13,8 +13,8 @@ from synpick_warp.apps.validation.scene_files import Annotation, CheckedScene, C
 from synpick_warp.dataset.annotations import TargetEntry
 from synpick_warp.dataset.bop.layout import TARGETS, Layout, is_index
 from synpick_warp.errors import DatasetError
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json
 from synpick_warp.system.inputs.image_files import MAX_IMAGE_FILE, decode_picture
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
 
 _Result = TypeVar("_Result")
 COLOURS = ("rgb", "gray")

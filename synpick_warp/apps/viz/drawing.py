@@ -12,7 +12,7 @@ import numpy as np
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import write_atomically
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 GOLDEN = 0.6180339887498949

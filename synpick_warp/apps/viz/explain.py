@@ -45,7 +45,7 @@ from synpick_warp.apps.viz.explain_record import (
 )
 from synpick_warp.configs.cell.gripper import Suction
 from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.bop.models import object_names

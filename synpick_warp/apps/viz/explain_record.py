@@ -25,8 +25,7 @@ from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.commit.manifest import ATTEMPTS_FILE
 from synpick_warp.dataset.records import InstanceObservation
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import MAX_JSON, decode_json
+from synpick_warp.system.inputs.files import MAX_JSON, decode_json, read_file
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint", "drawn")

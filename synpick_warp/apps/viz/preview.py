@@ -28,7 +28,7 @@ from synpick_warp.apps.viz.drawing import (
     write_picture,
 )
 from synpick_warp.apps.viz.false_colors import DepthScale, bin_scale, color_depth, describe_depth, layer_pictures, pooled_scale
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.foreign import ForeignScenes

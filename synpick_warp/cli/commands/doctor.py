@@ -15,7 +15,7 @@ from rich.table import Table
 
 from synpick_warp._version import __version__
 from synpick_warp.cli.display import format_duration, make_console, make_progress
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import check_new_folder, check_output_file, find_data_set, name_fetched
 from synpick_warp.cli.options import EpisodesOfOption, WholeNumber, check_range
-from synpick_warp.configs.dataset.splits import split_kind
+from synpick_warp.configs.dataset import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, format_value
 
 if TYPE_CHECKING:

@@ -30,8 +30,7 @@ from synpick_warp.configs.rules.camera_rules import NAME, RESERVED
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, OutputError, SynpickError, escape, format_value, suggest
 from synpick_warp.scenes.bin_meshes.loading import load_settings
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder, read_file
 
 if TYPE_CHECKING:
     from synpick_warp.scenes.types import RawObject

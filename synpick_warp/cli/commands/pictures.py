@@ -149,7 +149,7 @@ def draw_cell(
     written."""
     config = load_settings(preset_or_file)
     from synpick_warp.apps.viz.cell import CellScene, write_cell_sheet
-    from synpick_warp.configs.dataset.splits import may_pick
+    from synpick_warp.configs.dataset import may_pick
     from synpick_warp.scenes.cameras import describe_cameras
 
     scene = CellScene(config, progress, say, objects)

@@ -13,8 +13,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from synpick_warp.errors import ConfigError
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json, read_file
 
 MAX_FILE = 2**20
 """Largest calibration file [bytes]; one with the corners of a hundred pictures of a board has some 300 kB."""

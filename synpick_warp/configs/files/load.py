@@ -22,7 +22,7 @@ from synpick_warp.configs.files.table_lists import SPLITS, change_rows, given_va
 from synpick_warp.configs.rules.consistency import find_conflicts
 from synpick_warp.configs.schema import Bake, Bop, Config, Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
-from synpick_warp.system.inputs.toml import decode_toml, read_toml
+from synpick_warp.system.inputs.files import decode_toml, read_toml
 
 DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"

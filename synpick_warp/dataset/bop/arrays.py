@@ -13,7 +13,7 @@ from msgspec import UNSET
 from synpick_warp.dataset.annotations import ADVICE, InfoEntry, Key, TruthEntry, check_content
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.inputs.files import read_json
 
 _INFO = InfoEntry.__struct_fields__
 

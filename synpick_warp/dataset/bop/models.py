@@ -12,8 +12,7 @@ from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
 from synpick_warp.dataset.bop.layout import RENDERING_MODELS
 from synpick_warp.errors import DatasetError
 from synpick_warp.scenes.assets.models_info import FileModelInfo, read_models_info
-from synpick_warp.system.inputs.files import check_regular_file
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import check_regular_file, path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet

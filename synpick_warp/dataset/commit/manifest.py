@@ -39,10 +39,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.formats import find_format, format_names
 from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
-from synpick_warp.system.inputs.files import check_regular_file, read_file
-from synpick_warp.system.inputs.json import MAX_JSON, read_json
-from synpick_warp.system.inputs.paths import path_inside
-from synpick_warp.system.inputs.toml import MAX_TOML
+from synpick_warp.system.inputs.files import MAX_JSON, MAX_TOML, check_regular_file, path_inside, read_file, read_json
 
 ENTRIES = Path("manifest")
 """Folder of the entries, in the data set."""

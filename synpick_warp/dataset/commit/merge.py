@@ -14,8 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
@@ -41,7 +40,7 @@ from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, check_output_folder, output_error, remove_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 from synpick_warp.system.inputs.urls import store_url
 
 MAX_EPISODES = 10_000_000

@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,

@@ -23,8 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout, may_pick
+from synpick_warp.configs.dataset import DataLayout, ExportSettings, may_pick
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Config
@@ -68,9 +67,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.system import clock
-from synpick_warp.system.inputs.files import check_regular_file
-from synpick_warp.system.inputs.paths import make_folder
-from synpick_warp.system.inputs.toml import MAX_TOML
+from synpick_warp.system.inputs.files import MAX_TOML, check_regular_file, make_folder
 from synpick_warp.views.frames import EpisodeEnd
 
 LOCK_TIMEOUT = 20.0

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
 from synpick_warp.exporters.bop.graph import FrameSupport, find_supports

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode, Outcome
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.exporters.lerobot.layout import ROW, part_path, video_path, video_rate
 from synpick_warp.exporters.lerobot.video import GROUP, LEVELS, join_groups
 from synpick_warp.exporters.writing.files import sync_file, sync_folder, write_synced

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.codes import Task
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
 from synpick_warp.exporters.lerobot.episode import TICK, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices

@@ -21,8 +21,7 @@ import pyarrow.parquet as pq
 
 from synpick_warp.codes import Outcome, names
 from synpick_warp.configs.cell.rig import Size
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot.episode import LerobotPart, make_folders
 from synpick_warp.exporters.lerobot.layout import (
@@ -46,8 +45,7 @@ from synpick_warp.exporters.lerobot.layout import (
 )
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
 from synpick_warp.exporters.writing.notes import describe_lenses
-from synpick_warp.system.inputs.json import read_json
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import path_inside, read_json
 from synpick_warp.system.linear_algebra import dot
 
 ROW_GROUP = 20_000

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.dataset.splits import DataLayout, split_kind
+from synpick_warp.configs.dataset import DataLayout, split_kind
 from synpick_warp.configs.schema import Physics
 
 FOLDER = Path("lerobot")

@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 
 from synpick_warp.codes import Outcome
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE_GROUPS
 from synpick_warp.exporters.trajectory.spool import ROWS, field_name
 from synpick_warp.exporters.trajectory.store import add_array, add_group, add_table, chunk_layout

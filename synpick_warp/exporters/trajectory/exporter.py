@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.trajectory.arrays import CONSTANT_FILES, EPISODES, STORE

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, checksum_line, is_litter, write_atomically
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 """Line of a checksum list: digest and name."""

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from synpick_warp.errors import OutputError
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 from synpick_warp.system.inputs.urls import store_url
 
 PARTIAL = ".partial"

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from synpick_warp.configs.cell.rig import lens_map
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.scenes.types import Camera
 
 _INTRINSICS = ("`camera.json` has the intrinsics of all cameras", "`camera_NAME.json` has the intrinsics of each camera")

@@ -20,8 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from synpick_warp.errors import CatalogError, SynpickError
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.paths import MAX_NAME, path_inside
+from synpick_warp.system.inputs.files import MAX_NAME, path_inside, read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 MAX_MESH_FILE = 2**28

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.system.inputs.json import read_json
+from synpick_warp.system.inputs.files import read_json
 from synpick_warp.system.linear_algebra import det, dot, matmul, norm
 
 MAX_OBJ_ID = 2**31 - 1

@@ -11,7 +11,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.kernels.sim import arrangement, gripper, rest

@@ -10,7 +10,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.dataset.splits import DataLayout, may_pick
+from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import StateError
 from synpick_warp.kernels.sim import snapshot as pack

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 
 KERNEL_VARIABLE = "WARP_CACHE_PATH"
 """Moves the cache of compiled kernels."""

@@ -21,7 +21,7 @@ import warp as wp
 from warp._src import context
 
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.inputs.paths import make_folder
+from synpick_warp.system.inputs.files import make_folder
 
 MAX_COMPILERS = 16
 """Maximum number of compiling threads: the longest module of a bake takes as long as 16 threads need for all others."""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.dataset.commit.manifest import CONSTANTS, episode_entry
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify

@@ -22,8 +22,7 @@ from pycocotools.coco import COCO
 
 import synpick_warp
 from synpick_warp.codes import MAX_INSTANCES
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Arrangement, Split
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view

@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.exporters.base import EncodedView, SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.view import ViewSettings

@@ -21,7 +21,7 @@ from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import MAX_INFO, ROTATION_TOLERANCE, is_rigid
 from synpick_warp.scenes.assets.ply import MAX_HEADER, read_ply_vertices
 from synpick_warp.scenes.types import TriangleMesh
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json
 from synpick_warp.system.random_numbers import sample_triangles
 
 _CHUNK = 512

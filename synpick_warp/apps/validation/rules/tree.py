@@ -13,7 +13,7 @@ from synpick_warp.apps.validation.subjects import MASKS, SceneSubject, TreeSubje
 from synpick_warp.dataset.bop.images import SUFFIXES
 from synpick_warp.dataset.bop.layout import is_index
 from synpick_warp.errors import DatasetError
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json
 
 _NAME = re.compile(r"[0-9]{6,9}")
 _MASK = re.compile(r"[0-9]{6,9}_[0-9]{6,9}")

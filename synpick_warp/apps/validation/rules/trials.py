@@ -16,7 +16,7 @@ from synpick_warp.dataset.reading import DataSet, Episode, open_data_set
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError
 from synpick_warp.scenes.assets.meshes import read_mesh
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import path_inside
 from synpick_warp.views.picks import MOVED
 
 MILLIMETRE = 1e-3

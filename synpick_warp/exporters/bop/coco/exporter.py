@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.coco.annotation_files import (

@@ -10,8 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from synpick_warp.configs.cell.rig import lens_map
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout, split_kind
+from synpick_warp.configs.dataset import DataLayout, ExportSettings, split_kind
 from synpick_warp.exporters.writing.notes import describe_lenses
 
 CARD_FILE = "README.md"

@@ -11,7 +11,7 @@ import tarfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from synpick_warp.configs.dataset.splits import MAX_SHARD_SCENES
+from synpick_warp.configs.dataset import MAX_SHARD_SCENES
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import ViewSettings, make_rle, to_json

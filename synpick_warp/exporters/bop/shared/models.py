@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.dataset.export import ExportSettings
+from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
@@ -20,8 +20,8 @@ from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
+from synpick_warp.system.inputs.files import make_folder, path_inside
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
-from synpick_warp.system.inputs.paths import make_folder, path_inside
 from synpick_warp.views.layer_codec import layer_notes
 
 MODEL_FOLDERS = ("models", "models_eval")

@@ -11,11 +11,10 @@ from typing import Annotated
 
 import msgspec
 
-from synpick_warp.configs.dataset.splits import DataLayout, split_kind
+from synpick_warp.configs.dataset import DataLayout, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import join_lines, write_atomically
-from synpick_warp.system.inputs.json import read_json
-from synpick_warp.system.inputs.paths import path_inside
+from synpick_warp.system.inputs.files import path_inside, read_json
 
 BOP19, BOP24, MULTIVIEW = "test_targets_bop19.json", "test_targets_bop24.json", "test_targets_multiview_bop25.json"
 _SCENE = re.compile(r"[0-9]{6,12}")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from synpick_warp.configs.cell.cameras import COLOR, DEPTH
-from synpick_warp.configs.dataset.export import ExportSettings
-from synpick_warp.configs.dataset.splits import DataLayout
+from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.scenes.types import Camera, Catalog
 
 PARAMS_FILE = "bop_dataset_params.py"

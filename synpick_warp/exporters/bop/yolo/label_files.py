@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.configs.dataset.splits import split_kind
+from synpick_warp.configs.dataset import split_kind
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.outlines import join_parts, trace_outlines

@@ -18,8 +18,7 @@ import msgspec
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, Notes, read_referred
-from synpick_warp.system.inputs.files import read_file
-from synpick_warp.system.inputs.json import decode_json
+from synpick_warp.system.inputs.files import decode_json, read_file
 
 _JSON, _BIN = b"JSON", b"BIN\0"
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

@@ -1,4 +1,5 @@
-"""Splits of a data set: which episodes each one has, in which modes (gripper tasks), and where its BOP scenes are.
+"""Settings that all writers of a data set share; and its splits: which episodes each one has, in which modes (gripper tasks), and where its
+BOP scenes are.
 
 Episode indices are unique in a data set: each split is a range of them. Random streams are keyed by seed and episode index, so splits
 share none; scene ids follow from episode indices, so a scene id names one scene of the whole data set. Without splits there is one range,
@@ -9,10 +10,48 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.sensors import effect_ranges
 from synpick_warp.configs.check import to_index
-from synpick_warp.configs.schema import CYCLE, MIXED, MODES, MULTISENSOR, Bake, Config, Split
+from synpick_warp.configs.schema import CYCLE, MIXED, MODES, MULTISENSOR, Bake, Bop, Config, Gripper, Physics, Render, Split, Trajectory
 from synpick_warp.errors import ConfigError, format_value, suggest
+
+
+@dataclass(frozen=True)
+class ExportSettings:
+    """Settings by which files are written: what all views and episodes of a data set have in common."""
+
+    layout: DataLayout
+    bake: Bake
+    bop: Bop
+    rig: Rig
+    physics: Physics
+    render: Render
+    trajectory: Trajectory
+    gripper: Gripper
+    bins: tuple[BinSizes, ...]
+    """Bins from which an episode draws its own."""
+    effects: tuple[str, ...]
+    """Names of the camera effects that are on."""
+    objects: int
+    """Maximum number of objects of an episode."""
+
+    @classmethod
+    def of(cls, config: Config) -> ExportSettings:
+        """Those of all settings."""
+        effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
+        names = ("bake", "bop", "rig", "physics", "render", "trajectory", "gripper")
+        sections: dict[str, Any] = {name: getattr(config, name) for name in names}
+        return cls(layout=DataLayout.of(config), bins=config.cell.bins, effects=effects, objects=config.arrangement.max_objects, **sections)
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Modes of the data set or of its splits."""
+        return bake_modes(self.bake, self.layout.splits)
+
 
 MAX_SHARD_SCENES = 1_000_000
 """Scene ids that the names of shards (format shards) tell apart: part p of a scene is shard scene_id + p · this."""

@@ -1,1 +1,0 @@
-"""Data set: modes, splits, and the settings that all writers share."""
