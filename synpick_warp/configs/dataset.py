@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.cell.sensors import effect_ranges
 from synpick_warp.configs.check import to_index

@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from synpick_warp.codes import MAX_INSTANCES, Tone, names
-from synpick_warp.configs.cell.bins import BinRow, Bins, Tote
+from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, Tote
 from synpick_warp.configs.cell.cameras import CameraRow, Cameras
-from synpick_warp.configs.cell.extents import Cell
 from synpick_warp.configs.cell.gripper import Gripper, Suction
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.cell.sensors import DepthSensor, Effects

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Bins

@@ -47,14 +47,13 @@ from synpick_warp.scenes.grippers import check_reach, make_head
 from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.host_copies import choose_transfers
-from synpick_warp.stages.mask_pool import MaskBounds
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.looks import draw_looks
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene, with_cameras
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, read_tick
-from synpick_warp.stages.view_ring import CameraGroup, ViewRing, history_count, view_sizes
+from synpick_warp.stages.view_ring import CameraGroup, MaskBounds, ViewRing, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.kernels import Compiler, build_of, compilation_lock, dry_launches
 from synpick_warp.system.interpreter import collection_paused

@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.cameras import COLOR
-from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import most_objects
@@ -48,7 +48,7 @@ from synpick_warp.stages.sim.step_log import allocate_record, record_sizes
 from synpick_warp.stages.sim.trials import count_trial_worlds
 from synpick_warp.stages.sim.worlds import world_sizes
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.stages.tick_queue import allocate_rings, queue_lead, record_bytes
+from synpick_warp.stages.ticks import allocate_rings, queue_lead, record_bytes
 from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, view_sizes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory

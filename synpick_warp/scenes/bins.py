@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.cell.bins import TOTE, BinRow, Tote
-from synpick_warp.configs.cell.extents import DIVIDER, BinSizes, Point
+from synpick_warp.configs.cell.bins import DIVIDER, TOTE, BinRow, BinSizes, Point, Tote
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.colliders import FLOOR_DEPTH, MIN_WALL

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Stream
 from synpick_warp.configs.calibration.lens import with_matrix
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter
-from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig, lens_map
 from synpick_warp.configs.episodes.manipulation import Pick

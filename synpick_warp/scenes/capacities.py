@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.episodes.objects import Counts
 from synpick_warp.configs.schema import LAYERED, Arrangement, Physics
 from synpick_warp.errors import ConfigError, format_value, suggest

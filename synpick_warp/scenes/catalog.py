@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from trimesh.bounds import oriented_bounds
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, HULL, MASS_RANGE, MESH, UNITS
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError

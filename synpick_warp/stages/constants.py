@@ -12,7 +12,7 @@ import warp as wp
 
 from synpick_warp.codes import Mode
 from synpick_warp.configs import schema
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.dataset import mode_weights
 from synpick_warp.configs.episodes.manipulation import ANOTHER
 from synpick_warp.configs.episodes.objects import Counts, most_objects

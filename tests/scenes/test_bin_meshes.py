@@ -7,8 +7,7 @@ import pytest
 import trimesh
 
 from synpick_warp.apps.viz.cell import lay_out
-from synpick_warp.configs.cell.bins import AXES, BinRow, MeasuredBin
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import AXES, BinRow, BinSizes, MeasuredBin
 from synpick_warp.configs.files.load import load_config, override_config
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit.manifest import make_manifest

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.gripper import GRIPPERS
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.files.write import config_to_toml

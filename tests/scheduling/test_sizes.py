@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
-from synpick_warp.configs.cell.bins import BinRow
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinRow, BinSizes
 from synpick_warp.configs.files.load import load_config, parse_assignment
 from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.configs.schema import Arrangement, Config, Physics

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
 from synpick_warp.kernels.sim import snapshot as snapshots
-from synpick_warp.stages import host_copies, tick_queue, ticks
+from synpick_warp.stages import host_copies, ticks
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.launch import launch
@@ -30,7 +30,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
+from synpick_warp.stages.ticks import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
 from synpick_warp.system.hardware.device import pick_device
 from tests.harness.cuda_model import ModelArray, ModelDevice
 from tests.harness.environment import default_device
@@ -176,11 +176,11 @@ def test_the_memory_plan_counts_the_queue(device, monkeypatch, formats):
     """A queue of 200 ticks, to the byte: with another size of a record it would have fewer or more."""
     config = settings(bake__worlds=8, bake__formats=formats)
     record = Simulation(config, catalog(), 1, device, records_physics=formats == ["zarr"]).record
-    monkeypatch.setattr(tick_queue, "QUEUE_PART", 1)
-    monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record))
+    monkeypatch.setattr(ticks, "QUEUE_PART", 1)
+    monkeypatch.setattr(ticks, "QUEUE_BYTES", 200 * record_bytes(record))
     gpu = SimpleNamespace(is_cuda=True, total_memory=QUEUE_BYTES)
     assert queued_ticks(config, gpu) == 200
-    monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record) - 1)
+    monkeypatch.setattr(ticks, "QUEUE_BYTES", 200 * record_bytes(record) - 1)
     assert queued_ticks(config, gpu) == 199
     slots = queued_ticks(config, device)
     planned = {term.name: term.size for term in memory_plan.plan_memory(config, device)}
@@ -255,11 +255,11 @@ def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
         device = ModelDevice(random.Random(seed))
         clock = itertools.count(step=host_copies.PAUSE_SECONDS)
         time = SimpleNamespace(sleep=lambda _: device.run(device.chance.choice((0, 1, 3, 30))), monotonic=lambda: next(clock))
-        for module in (ticks, tick_queue, host_copies):
+        for module in (ticks, host_copies):
             monkeypatch.setattr(module, "wp", device.wp)
         monkeypatch.setattr(host_copies, "time", time)
-        monkeypatch.setattr(tick_queue, "TickReader", ModelReader)
-        monkeypatch.setattr(tick_queue, "allocate_slots", partial(allocate_slots, device))
+        monkeypatch.setattr(ticks, "TickReader", ModelReader)
+        monkeypatch.setattr(ticks, "allocate_slots", partial(allocate_slots, device))
         return device
 
     return make

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, ONE_OBJECT, PICKING, assignments, refusal

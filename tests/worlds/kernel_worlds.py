@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell.bins import Bins, Tote
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import Bins, BinSizes, Tote
 from synpick_warp.configs.episodes.manipulation import Move
 from synpick_warp.configs.episodes.randomize import Randomize
 from synpick_warp.kernels import structs

@@ -21,7 +21,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import Ending, Phase
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.schema import Physics
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import fit_to_catalog

@@ -16,9 +16,8 @@ import warp as wp
 from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, blank, check_picture_name, put_text, stacked, with_text, write_picture
 from synpick_warp.apps.viz.frusta import Canvas, draw_axes, draw_camera, project, rays
 from synpick_warp.configs.calibration.lens import with_matrix
-from synpick_warp.configs.cell.bins import Bins
+from synpick_warp.configs.cell.bins import Bins, BinSizes
 from synpick_warp.configs.cell.cameras import WORLD
-from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import compiling_if_cold, make_renderer

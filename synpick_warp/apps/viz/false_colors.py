@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import GOLDEN, Image
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.dataset.view import read_layer
 from synpick_warp.dataset.view_files import SceneFiles
 

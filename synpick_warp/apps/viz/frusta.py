@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from synpick_warp.apps.viz.drawing import Color, Image, put_text, text_size
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
-from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.episodes.manipulation import Pick

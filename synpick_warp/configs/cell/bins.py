@@ -1,8 +1,11 @@
-"""Settings of the bins that stand under the cameras."""
+"""Settings of the bins that stand under the cameras, and their extents; a table and a pallet are bins without walls."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 from synpick_warp.configs.episodes.objects import UNITS
@@ -121,3 +124,175 @@ def check_meshes(tables: object, source: str) -> None:
         if others := [name for name in names if name in table]:
             rule = "none beside bin.file, whose mesh has it" if names is _SIZES else "none without bin.file"
             raise ConfigError(f"bin[{index}].{others[0]} is {format_value(table[others[0]])} {source}; allowed: {rule}")
+
+
+Sides = tuple[float, float]
+"""Length (along x) and width (along y) [m]."""
+Point = tuple[float, float, float]
+Rectangle = tuple[float, float, float, float]
+Floor = tuple[float, float, float, float, float, float, float]
+DIVIDER = 0.01
+"""Thickness of dividers [m]: more than an object at physics.max_speed moves in one step."""
+
+
+@dataclass(frozen=True)
+class BinSizes:
+    """Extents of a bin [m] in its own frame: origin at the centre of the inner floor, z up."""
+
+    name: str
+    noun: str
+    """What it is, in sentences: tote, bin, pallet or table."""
+    shell: Tote | None
+    """Sizes and material of its walls, or file of its mesh; None: it has none."""
+    outer: Sides
+    floor: Sides
+    """Inner floor."""
+    opening: Sides
+    """At the rim; without walls, the area over which objects are dropped."""
+    height: float
+    """Height of the rim."""
+    base: float
+    """z of its underside."""
+    margin: float = 0.0
+    """Distance from the opening beyond which an object has left it."""
+    weight: float = 1.0
+    """Weight with which an episode draws it."""
+    compartments: tuple[int, int] = (1, 1)
+    """Columns (along x) and rows (along y)."""
+    divider_height: float = 0.0
+    measured: MeasuredBin | None = None
+    """Of a bin whose mesh has been read."""
+
+    @classmethod
+    def of_tote(cls, tote: Tote, name: str = TOTE, noun: str = TOTE) -> BinSizes:
+        """Sizes of the tote, or of a box like it."""
+        height = tote.outer_size[2] - tote.wall
+        return cls(name, noun, tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, height, -tote.wall)
+
+    @classmethod
+    def of_row(cls, row: BinRow) -> BinSizes:
+        """Sizes of a row of [[bin]]; one with a file must be measured."""
+        if (found := row.measured) is not None:
+            x, y = (2 * max(abs(found.box[axis]), abs(found.box[axis + 3])) for axis in (0, 1))
+            floor = found.floor or found.opening
+            return cls(row.name, "bin", row, (x, y), floor, found.opening, found.height, found.box[2], weight=row.weight, measured=found)
+        sizes = cls.of_tote(row, row.name, "bin")
+        return replace(sizes, weight=row.weight, compartments=row.compartments, divider_height=row.divider_height)
+
+    @property
+    def is_visible(self) -> bool:
+        """Whether there is anything but the table."""
+        return self.noun != "table"
+
+    @property
+    def origin(self) -> Point:
+        """Origin of its frame in the world, without shift, if it is the first bin."""
+        return self.measured.origin if self.measured else (0.0, 0.0, 0.0)
+
+    @property
+    def turn(self) -> float:
+        """Angle about z of its frame in the world, without that which an episode draws [rad]."""
+        return math.radians(self.measured.yaw or 0.0) if self.measured else 0.0
+
+    @property
+    def ground(self) -> float:
+        """z of its underside in the world, if it is the first bin: that of the table."""
+        return self.origin[2] + self.base
+
+    def to_world(self, point: Point) -> Point:
+        """Point of its frame in the world, without shift, if it is the first bin."""
+        cosine, sine = math.cos(self.turn), math.sin(self.turn)
+        (x, y, z), at = point, self.origin
+        return at[0] + cosine * x - sine * y, at[1] + sine * x + cosine * y, at[2] + z
+
+    def to_frame(self, point: Sequence[float]) -> Point:
+        """Point of the world in its frame; the inverse of `to_world`."""
+        cosine, sine = math.cos(self.turn), math.sin(self.turn)
+        x, y, z = (value - begin for value, begin in zip(point, self.origin, strict=True))
+        return cosine * x + sine * y, cosine * y - sine * x, z
+
+    @property
+    def corners(self) -> list[Point]:
+        """Corners of the outer box in the world (8)."""
+        length, width = (side / 2 for side in self.outer)
+        return [self.to_world(one) for one in itertools.product((-length, length), (-width, width), (self.base, self.height))]
+
+    @property
+    def _centers(self) -> list[Sides]:
+        """Centre of each compartment of a box, column by column."""
+        columns, rows = (
+            [-side / 2 + cell / 2 + index * (cell + DIVIDER) for index in range(count)] if count > 1 else [0.0]
+            for side, cell, count in zip(self.floor, self.cell, self.compartments, strict=True)
+        )
+        return list(itertools.product(columns, rows))
+
+    @property
+    def cell(self) -> Sides:
+        """Inner floor of a compartment."""
+        length, width = (
+            (side - (count - 1) * DIVIDER) / count if count > 1 else side for side, count in zip(self.floor, self.compartments, strict=True)
+        )
+        return length, width
+
+    @property
+    def openings(self) -> Sequence[Rectangle]:
+        """Opening of each compartment: centre x, y, length and width; over its floor, where a box has several."""
+        if self.measured:
+            return self.measured.openings or [one[:4] for one in self.measured.compartments]
+        return [(*center, *(self.opening if self.compartments == (1, 1) else self.cell)) for center in self._centers]
+
+    @property
+    def mouth(self) -> Sides:
+        """Length and width of the smallest opening."""
+        return min((one[2:] for one in self.openings), key=min)
+
+    @property
+    def floors(self) -> Sequence[Floor]:
+        """Inner floor of each compartment: centre x, y, length and width; and its height z = a x + b y + c."""
+        return self.measured.compartments if self.measured else [(*center, *self.cell, 0.0, 0.0, 0.0) for center in self._centers]
+
+    def waypoints(self, corner: float, height: float) -> list[list[Point]]:
+        """Points near the four corners of each compartment: `corner` is where they are, as a fraction of the way from the centre to the
+        corners of the floor, `height` their height above the floor [m]."""
+        return [
+            [(x, y, a * x + b * y + c + height) for y in (cy + corner * width / 2, cy - corner * width / 2) for x in (cx + s, cx - s)]
+            for cx, cy, length, width, a, b, c in self.floors
+            for s in (corner * length / 2,)
+        ]
+
+    @property
+    def inner_corners(self) -> list[Point]:
+        """Corners of the inner floor and of the rim in the world (8)."""
+        levels = ((self.floor, 0.0), (self.opening, self.height))
+        signs = list(itertools.product((-1, 1), repeat=2))
+        return [self.to_world((x * length / 2, y * width / 2, z)) for (length, width), z in levels for x, y in signs]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What stands under the cameras: the bins from which an episode draws its own."""
+
+    bins: tuple[BinSizes, ...]
+    """Extents of the bins; the first stands on the table, whose height follows from its base."""
+    tables: Mapping[str, Tote]
+    """Settings of the bins with walls of sizes, not of a mesh, by their keys: tote, or bin[0] and so on."""
+    recorded: tuple[str, ...]
+    """Names of the bins, where data sets record that of each episode; empty for a tote that is always in its place."""
+
+    @classmethod
+    def of(cls, tote: Tote, bins: Bins, rows: tuple[BinRow, ...]) -> Cell:
+        """The cell of these settings."""
+        tables: dict[str, Tote] = {}
+        if bins.kind == NONE:
+            sizes: tuple[BinSizes, ...] = (BinSizes("table", "table", None, bins.area, bins.area, bins.area, 0.0, 0.0, bins.margin),)
+        elif bins.kind == PALLET:
+            length, width, height = bins.pallet_size
+            sizes = (BinSizes("pallet", "pallet", None, (length, width), bins.area, bins.area, 0.0, -height, bins.margin),)
+        elif bins.kind == OWN and rows:
+            sizes = tuple(BinSizes.of_row(row) for row in rows)
+            tables = {f"bin[{index}]": row for index, row in enumerate(rows) if not row.file}
+        else:
+            sizes = (BinSizes.of_tote(tote),)
+            tables = {TOTE: tote} if bins.kind == TOTE else {}
+        stays = bins.kind == TOTE and not any(bins.shift) and bins.yaw == 0.0
+        return cls(sizes, tables, () if stays else tuple(one.name for one in sizes))

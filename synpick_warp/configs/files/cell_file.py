@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from synpick_warp.configs.cell.bins import BinRow
+from synpick_warp.configs.cell.bins import BinRow, BinSizes
 from synpick_warp.configs.cell.cameras import Jitter, Pose
-from synpick_warp.configs.cell.extents import BinSizes
 from synpick_warp.configs.cell.gripper import COMPLIANCE, FLOW, Gripper
 from synpick_warp.configs.check import is_table
 from synpick_warp.configs.episodes.objects import MESH

@@ -11,8 +11,8 @@ from dataclasses import replace
 from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
+from synpick_warp.configs.cell.bins import BinSizes, Sides
 from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS, MODALITIES, OPENCV, OPENGL, CameraRow, Cameras, Jitter, Pose
-from synpick_warp.configs.cell.extents import BinSizes, Sides
 from synpick_warp.configs.cell.rig import Rig, intrinsics, inverted, lens_map, moved, position, turned, viewing_direction
 from synpick_warp.configs.dataset import may_pick
 from synpick_warp.configs.episodes.randomize import FIXED

@@ -9,8 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, Tote
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, BinSizes, Tote
 from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
 from synpick_warp.configs.dataset import MAX_SHARD_SCENES, DataLayout, bake_modes, may_pick, possible_modes
 from synpick_warp.configs.episodes.manipulation import PICKS

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from synpick_warp.codes import LookPart
-from synpick_warp.configs.cell.extents import BinSizes
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Camera, Material
 
 

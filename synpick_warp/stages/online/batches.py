@@ -13,11 +13,10 @@ from synpick_warp.kernels.render.images.ground_truth import ViewTruth, expand_ma
 from synpick_warp.stages.arrays import allocate, array_group, device_array
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch
-from synpick_warp.stages.mask_pool import widen
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from synpick_warp.stages.render.view_setup import with_cameras
 from synpick_warp.stages.timing import scope
-from synpick_warp.stages.view_ring import CameraGroup
+from synpick_warp.stages.view_ring import CameraGroup, widen
 
 GPU_RING = 3
 """Slots on a GPU: one with the consumer, one rendered ahead, and one that the consumer's queue may still read."""

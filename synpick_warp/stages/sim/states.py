@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Lost
-from synpick_warp.configs.cell.extents import Cell
+from synpick_warp.configs.cell.bins import Cell
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import StateError
 from synpick_warp.kernels import world_rows

@@ -22,13 +22,12 @@ from synpick_warp.scenes.cameras import CAMERA_KEYS
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import ViewBuffers, allocate_view_buffers, masks_of, view_buffer_sizes
-from synpick_warp.stages.mask_pool import SHARE, MaskBounds, share_words, split_batches, widen
 from synpick_warp.stages.online.batches import TruthBuffers
 from synpick_warp.stages.render import mask_runs
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport
-from synpick_warp.stages.view_ring import CameraGroup, ViewRing
+from synpick_warp.stages.view_ring import SHARE, CameraGroup, MaskBounds, ViewRing, share_words, split_batches, widen
 from synpick_warp.testing.box_views import batches, cameras, config, ends
 from synpick_warp.testing.exporters import digests, exporting, finish
 from synpick_warp.views.frames import most_words, paint_masks

@@ -1,7 +1,7 @@
 """Amodal masks: one bit per pixel of each instance's bounding box, in words of MASK_ROWS rows of a column, from a pool of words per view.
 
 A box takes as many words as it needs, wherever the boxes before it end (prefix sum), so work, copies and memory grow with covered area,
-not with the number of instances; `stages.mask_pool` forms batches whose masks fit. Words lie along the rows of the image, as its pixels
+not with the number of instances; `stages.view_ring` forms batches whose masks fit. Words lie along the rows of the image, as its pixels
 do: neighbouring columns are neighbouring words.
 """
 
