@@ -15,8 +15,8 @@ from synpick_warp.configs.dataset import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.records import Row
-from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord, encode_line
-from synpick_warp.factory.episodes import EpisodeOutcome, remedy
+from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.factory.episodes import EpisodeOutcome, encode_line, remedy
 from synpick_warp.views.frames import bin_record
 from tests.worlds.scripted_worlds import CONFIG, OBJECT_IDS, RAYS, ROOM, Ticks, World, bits, new_world, play, report, run
 from tests.worlds.small_worlds import settings

@@ -30,8 +30,8 @@ from synpick_warp.scenes.types import Material
 from synpick_warp.stages.render.scene import build_render_scene, pack_texels
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.system.progress import SilentProgress
-from tests.builders import PICKING, mistake
-from tests.harness.bake_server import TINY
+from tests.builders import PICKING, mistake, once
+from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.pieces import depth_within
 from tests.worlds.bin_meshes import bracket, sloped_bin
 from tests.worlds.model_files import OBJ, box, exported, glb, put
@@ -56,9 +56,12 @@ MAX_DEPTH = 2e-3
 @pytest.fixture(scope="module")
 def baked(tmp_path_factory):
     """Settings and data set of an episode."""
-    folder = tmp_path_factory.mktemp("cell")
+    return once(tmp_path_factory, "own-cell", bake_own)[0]
+
+
+def bake_own(folder: Path) -> None:
     for name in ("bins", "parts"):
-        (folder / name).mkdir()
+        (folder / name).mkdir(parents=True)
     sloped_bin().apply_scale(1000.0).export(folder / "bins" / "kanban.stl")
     bracket(60.0).export(folder / "parts" / "bracket.stl")
     (folder / "cell.toml").write_text(CELL)
@@ -74,14 +77,14 @@ def baked(tmp_path_factory):
     }
     # With the physics of the preset.
     quick = {key: value for key, value in (PICKING | TINY).items() if not key.startswith("physics.")}
+    quick |= {key: value for key, value in TINY_PICKS.items() if key.startswith("picks.")}
     config = load_config(str(folder / "cell.toml"), quick | more)
     summary = run_bake(config, folder / "set", SilentProgress())
     (row,) = summary.episodes
     assert (row.objects, row.picked > 0, summary.resampled) == (3, True, 0)
-    return folder
 
 
-@pytest.mark.slow(minutes=1)
+@pytest.mark.slow
 def test_parts_stay_within_the_mesh_in_every_step(baked):
     """Nothing passes through a wall, the divider or the sloped floor while the gripper picks."""
     data_set = DataSet(baked / "set")

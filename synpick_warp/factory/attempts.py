@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
@@ -15,7 +13,6 @@ from synpick_warp.configs.schema import Suction
 from synpick_warp.dataset.records import Attempt, InstanceObservation, RecordedObservation
 from synpick_warp.stages.arrays import WORD_BITS, unpack_words
 from synpick_warp.stages.stream import TickReport
-from synpick_warp.views.frames import name_bin
 
 DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
@@ -24,13 +21,6 @@ FORCE_PLACES = 4
 
 _OBSERVED = [name for name in InstanceObservation.__struct_fields__ if name not in ("instance", "object_id")]
 """Arrays of `stages.perception.arrays.Observation` that an `InstanceObservation` has a row of."""
-
-
-def encode_line(attempt: Attempt, bin: Mapping[str, Any] | None = None) -> str:
-    """Serialize an attempt as one line of JSON with line break; `bin`: record of the episode's bin, if it is not a tote in its place.
-    Raises ValueError if a number is not finite."""
-    record = msgspec.to_builtins(attempt)
-    return json.dumps(record | {"sentence": name_bin(attempt.sentence, bin)}, allow_nan=False) + "\n"
 
 
 @dataclass(frozen=True)

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import msgspec
 
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
-from synpick_warp.factory.attempts import EpisodeRecord, encode_line
+from synpick_warp.dataset.records import Attempt
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, name_bin
+
+if TYPE_CHECKING:
+    from synpick_warp.factory.attempts import EpisodeRecord
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
@@ -149,6 +155,13 @@ def remedy(ending: Ending, config: Config) -> str:
     values = {key: config.value(key) for key in keys}
     named = (f"{key} ({value:g})" if isinstance(value, float) else f"{key} ({value})" for key, value in values.items())
     return f"{verb} {' or '.join(named)}" if keys else ""
+
+
+def encode_line(attempt: Attempt, bin: Mapping[str, Any] | None = None) -> str:
+    """Serialize an attempt as one line of JSON with line break; `bin`: record of the episode's bin, if it is not a tote in its place.
+    Raises ValueError if a number is not finite."""
+    record = msgspec.to_builtins(attempt)
+    return json.dumps(record | {"sentence": name_bin(attempt.sentence, bin)}, allow_nan=False) + "\n"
 
 
 def episode_end(row: EpisodeOutcome, record: EpisodeRecord, tries: int) -> EpisodeEnd:

@@ -73,3 +73,18 @@ def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> Ba
     if share.episodes == [0]:
         raise OutputError("cannot write here")
     return wait_for_stop(share, handles, link)
+
+
+def lose_one(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
+    """Generate a share of a bake; of two episodes at least one is lost: the process is killed as it commits the first."""
+    from synpick_warp.factory import pipeline  # The others need no simulator.
+
+    commit = pipeline.commit_episode
+
+    def commit_and_die(*arguments: object) -> None:
+        commit(*arguments)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if len(share.episodes) == 2:
+        pipeline.commit_episode = commit_and_die
+    return pipeline.generate_share(share, handles, link)

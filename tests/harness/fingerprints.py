@@ -26,7 +26,7 @@ from synpick_warp.system.hardware.device import start_warp
 from synpick_warp.system.linear_algebra import rotation
 from synpick_warp.testing.exporters import digests
 from tests.builders import PICKED, bake_boxes
-from tests.harness.made_once import written_here
+from tests.harness.made_once import made_once, written_here
 from tools.embedded_shapes import modelled_shape
 
 NAMES = ("soup_tin", "squeeze_bottle", "marker", "gear", "nut", "pipe_tee")
@@ -68,6 +68,9 @@ def computed() -> dict[str, str]:
 
 if __name__ == "__main__":
     start_warp()
-    with written_here():
-        bake_boxes(Path(sys.argv[1]), PICKED | {"bop.keypoints": 4, "bake.formats": ["bop", "shards", "coco", "usd", "zarr"]})
+    with made_once(), written_here():
+        bake_boxes(
+            Path(sys.argv[1]),
+            PICKED | {"cameras.resolution": [48, 27], "bop.keypoints": 4, "bake.formats": ["bop", "shards", "coco", "usd", "zarr"]},
+        )
     print(json.dumps(computed() | digests(Path(sys.argv[1]))))
