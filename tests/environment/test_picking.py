@@ -34,14 +34,6 @@ def floor_pixels(obs) -> np.ndarray:
 # ---- seeds ----
 
 
-def test_a_seed_names_the_piles_whatever_world_they_are_in(environment):
-    first = environment.reset(seed=[3, 4])[0]
-    assert same(first, environment.reset(seed=3)[0])
-    swapped = environment.reset(seed=[4, 3])[0]
-    assert same({name: values[::-1].copy() for name, values in swapped.items()}, first)
-    assert not same(environment.reset()[0], first)
-
-
 def test_an_episode_index_names_a_pile(environment):
     info = environment.reset(seed=3)[1]
     first = environment.observe()
@@ -159,14 +151,6 @@ def test_integers_of_numpy_are_seeds_too(seed):
     assert make_seeds(seed, 2) == {0: 3, 1: 4}
 
 
-def test_an_environment_without_a_seed_of_its_own_continues(environment):
-    first = environment.reset(seed=[5, 6])[1]["episode_index"]
-    second = environment.reset(seed=[5, None])[1]["episode_index"]
-    assert second[0] == first[0]
-    assert second[1] != first[1]
-    assert environment.reset(seed=[None, 6])[1]["episode_index"][1] == first[1]
-
-
 def test_the_course_of_a_trial_has_the_outcome_of_its_table(device):
     """Sooner than an attempt, and with hits and force of the trial of the planned grasp; on the floor it ends after the press."""
     environment = build(device, course="trial")
@@ -183,30 +167,6 @@ def test_the_course_of_a_trial_has_the_outcome_of_its_table(device):
 
 
 # ---- states and branches ----
-
-
-def test_a_branch_sees_what_its_origin_sees(environment):
-    environment.step(centers(environment.observe()["instances"]))
-    obs = environment.branch(0, [1])
-    for _ in range(2):
-        for name, values in obs.items():
-            assert values[0].tobytes() == values[1].tobytes(), name
-        obs = environment.step(np.repeat(centers(obs["instances"])[:1], 2, axis=0)).obs
-    assert environment.episodes.steps.tolist() == [3, 3]
-
-
-def test_a_state_continues_as_before(environment):
-    state, actions = environment.get_state(), centers(environment.observe()["instances"])
-    before, step = environment.observe(), environment.step(actions)
-    host = environment.state_to_host(state)
-    assert same(environment.set_state(environment.state_from_host(host)), before)
-    again = environment.step(actions)
-    assert same(again.obs, step.obs)
-    assert again.reward.tolist() == step.reward.tolist()
-    obs = environment.set_state(state, np.array([True, False]))
-    assert obs["depth"][0].tobytes() == before["depth"][0].tobytes()
-    assert obs["depth"][1].tobytes() == step.obs["depth"][1].tobytes()
-    assert environment.episodes.steps.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(

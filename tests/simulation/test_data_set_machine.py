@@ -1,0 +1,327 @@
+"""Random sequences of bakes, kills, shards, growth, losses of files, merges and conversions of small data sets, against a plain model.
+
+Hypothesis draws and shrinks the sequences (`RuleBasedStateMachine`). What a folder must hold follows from its model: the files of an
+undisturbed bake of these episodes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
+
+from synpick_warp.apps.conversion.run import convert
+from synpick_warp.configs.dataset import DataLayout
+from synpick_warp.configs.files.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.commit import manifest, merge, verify, writing
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, INDICES, committed_episodes, episode_entry, is_complete
+from synpick_warp.dataset.commit.writing import OutputFolder
+from synpick_warp.errors import SynpickError
+from synpick_warp.exporters.writing.checksums import parse_checksums
+from synpick_warp.exporters.writing.files import MANIFEST_FILE
+from tests.harness import scripted_bake
+from tests.harness.hostile import fuzz_examples
+from tests.simulation.crashing_disk import CrashingDisk
+from tests.simulation.scheduler import Dead
+
+EPISODES = 3
+"""Most episodes of a set."""
+FOLDERS = ("a", "b", "c")
+FORMATS = ("shards", "bop")
+CRASH = st.one_of(st.just(0), st.integers(1, 90))
+"""Number of the modification at which a bake, merge or conversion is killed; 0: it is not."""
+MEMORY = Path("/dev/shm")
+"""Folder in memory, where there is one: files on a disk take most of the time."""
+
+
+@functools.cache
+def config_of(kind: str, planned: int) -> Config:
+    """Settings of a set of one format."""
+    return scripted_bake.small_settings().with_values({"bake.formats": (kind,), "bake.episodes": planned, "bake.writers": 1})
+
+
+@functools.cache
+def undisturbed(kind: str, planned: int, episodes: frozenset[int]) -> dict[str, tuple[str, bytes]]:
+    """Files of an undisturbed bake of these episodes."""
+    with tempfile.TemporaryDirectory() as folder:
+        scripted_bake.bake_episodes(config_of(kind, planned), Path(folder, "set"), None, sorted(episodes))
+        return scripted_bake.snapshot(Path(folder, "set"))
+
+
+def listed(files: dict[str, tuple[str, bytes]], entry: Path) -> list[str]:
+    """Names of an entry's files."""
+    return list(parse_checksums(files[f"{entry}.sha256"][1], Path(), entry, ""))
+
+
+@dataclasses.dataclass
+class Known:
+    """Model of a data set."""
+
+    kind: str
+    planned: int
+    """Number of episodes that the last bake that wrote was to make."""
+    whole: set[int] = dataclasses.field(default_factory=set)
+    """Committed episodes that have all of their files."""
+    damaged: set[int] = dataclasses.field(default_factory=set)
+    """Committed episodes that lost a file."""
+    indexed: frozenset[int] | None = None
+    """Episodes that the indices cover; None: there are none."""
+
+    @property
+    def committed(self) -> set[int]:
+        return self.whole | self.damaged
+
+    @property
+    def finished(self) -> bool:
+        return self.indexed == self.committed
+
+
+class DataSets(RuleBasedStateMachine):
+    """Folders, and their models by name; a folder without a model holds no data set."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.base = Path(tempfile.mkdtemp(dir=MEMORY if MEMORY.is_dir() else None))
+        self.known: dict[str, Known] = {}
+        self.changed: set[str] = set()
+        """Folders that the last rule may have changed."""
+        self.before: dict[str, dict[str, tuple[str, bytes]]] = {name: {} for name in FOLDERS}
+
+    def teardown(self) -> None:
+        shutil.rmtree(self.base)
+
+    def folder(self, name: str) -> Path:
+        return self.base / name
+
+    @contextlib.contextmanager
+    def refused(self):
+        """Within, a call must end with a SynpickError, and change nothing."""
+        with pytest.raises(SynpickError) as caught:
+            yield
+        assert "\n" not in str(caught.value)
+
+    # ---- bakes ----
+
+    def _plan(self, name: str, kind: str, planned: int, part: tuple[int, int]) -> tuple[Known, set[int]] | None:
+        """Model of the folder, and the episodes that a bake is to add; None: it is refused."""
+        known = self.known.get(name, Known(kind, planned))
+        wanted = set(range(part[0], planned, part[1]))
+        if known.kind != kind or max(known.committed, default=-1) >= planned:
+            return None
+        return known, wanted - known.whole
+
+    @rule(
+        name=st.sampled_from(FOLDERS),
+        kind=st.sampled_from(FORMATS),
+        planned=st.integers(1, EPISODES),
+        part=st.sampled_from([(0, 1), (0, 2), (1, 2)]),
+        stop_after=st.sampled_from([None, None, 1]),
+        crash=CRASH,
+        power=st.booleans(),
+    )
+    def bake(self, name, kind, planned, part, stop_after, crash, power):
+        """Bake a shard or all: new, resumed, or grown; perhaps stopped after an episode, or killed at a change, perhaps by a power cut."""
+        if part[0] >= planned:
+            return
+        make = functools.partial(scripted_bake.bake, self.folder(name), config_of(kind, planned), part, stop_after)
+        plan = self._plan(name, kind, planned, part)
+        if plan is None:
+            with self.refused():
+                make()
+            return
+        known, missing = plan
+        if known.finished and not missing:
+            make()
+            return
+        self.changed = {name}
+        whole = known.whole | set(sorted(missing)[:stop_after])
+        after = Known(kind, planned, whole, set(), frozenset(whole) if stop_after is None else None)
+        if self._ends(name, make, crash, power):
+            self.known[name] = after
+        else:
+            self._look(name, known, after)
+
+    def _ends(self, name: str, change: Callable[[], Any], number: int, power: bool = False) -> bool:
+        """Make a change that is killed at a modification of the folder (0: at none); returns whether it came to its end."""
+        folder = self.folder(name)
+        folder.mkdir(exist_ok=True)
+        with CrashingDisk(folder, number) as disk:
+            try:
+                change()
+            except Dead:
+                pass
+            else:
+                return True
+        if power:
+            disk.cut_power()
+        return False
+
+    def _look(self, name: str, before: Known, after: Known) -> None:
+        """Take over what a killed bake left: nothing that was whole is lost, and nothing is there that it was not to make."""
+        folder = self.folder(name)
+        if not (folder / MANIFEST_FILE).exists():
+            assert not before.whole, "lost"
+            self.known.pop(name, None)
+            return
+        there = set(committed_episodes(folder))
+        whole = {episode for episode in there if is_complete(folder, episode_entry(episode))}
+        assert before.whole <= whole <= after.whole, "lost, or not asked for"
+        indices = manifest.read_entry(folder, INDICES) if is_complete(folder, INDICES) else None
+        indexed = None if indices is None else frozenset(indices["episodes"])
+        assert indexed in (None, before.indexed, after.indexed)
+        planned = before.planned
+        if (folder / CONFIG_FILE).exists():
+            planned = load_config(str(folder / CONFIG_FILE), {}).bake.episodes
+            assert planned in (before.planned, after.planned)
+        self.known[name] = Known(after.kind, planned, whole, there - whole, indexed)
+
+    # ---- losses ----
+
+    @precondition(lambda self: any(known.whole for known in self.known.values()))
+    @rule(data=st.data())
+    def lose(self, data):
+        """A file of an episode, or its mark, is lost."""
+        name = data.draw(st.sampled_from(sorted(name for name, known in self.known.items() if known.whole)))
+        known = self.known[name]
+        episode = data.draw(st.sampled_from(sorted(known.whole)))
+        lost = data.draw(st.sampled_from([*listed(self.before[name], episode_entry(episode)), f"{episode_entry(episode)}.json"]))
+        (self.folder(name) / lost).unlink()
+        known.whole.remove(episode)
+        if lost != f"{episode_entry(episode)}.json":
+            known.damaged.add(episode)
+        self.changed = {name}
+
+    # ---- merges and conversions ----
+
+    @precondition(lambda self: self.known)
+    @rule(data=st.data(), out=st.sampled_from(FOLDERS), crash=CRASH)
+    def merge(self, data, out, crash):
+        """Merge sets into a new folder; perhaps killed."""
+        names = data.draw(st.lists(st.sampled_from(sorted(self.known)), min_size=1, max_size=2, unique=True))
+        parts, known = [self.folder(name) for name in names], [self.known[name] for name in names]
+        allowed = out not in self.known and len({each.kind for each in known}) == 1 and not any(each.damaged for each in known)
+        if not (allowed and any(each.whole for each in known)):
+            with self.refused():
+                merge.merge(parts, self.folder(out))
+            return
+        shutil.rmtree(self.folder(out), ignore_errors=True)
+        self.changed = {out}
+        if not self._ends(out, lambda: merge.merge(parts, self.folder(out)), crash) and not (self.folder(out) / MANIFEST_FILE).exists():
+            shutil.rmtree(self.folder(out))
+            return
+        whole = set().union(*(each.whole for each in known))
+        self.known[out] = Known(known[0].kind, max(each.planned for each in known), whole, set(), frozenset(whole))
+
+    @precondition(lambda self: self.known)
+    @rule(data=st.data(), out=st.sampled_from(FOLDERS), crash=CRASH)
+    def convert(self, data, out, crash):
+        """Convert a set to the other format, also into an earlier conversion that grows or was killed."""
+        source = data.draw(st.sampled_from(sorted(self.known)))
+        known = self.known[source]
+        (kind,) = set(FORMATS) - {known.kind}
+        target = self.known.get(out, Known(kind, known.planned))
+        make = functools.partial(convert, self.folder(source), self.folder(out), (kind,), 1, lambda *_: None)
+        refused = out == source or not known.committed or target.kind != kind
+        if refused or max(target.committed, default=-1) >= known.planned:
+            with self.refused():
+                make()
+            return
+        missing = known.committed - target.whole
+        if target.finished and not missing:
+            make()
+            return
+        self.changed = {out}
+        whole = known.committed | target.whole
+        after = Known(kind, known.planned, whole, set(), frozenset(whole))
+        if missing & known.damaged:
+            with self.refused():
+                make()
+            self._look(out, target, after)
+        elif self._ends(out, make, crash):
+            self.known[out] = after
+        else:
+            self._look(out, target, after)
+
+    # ---- what holds ----
+
+    @invariant()
+    def every_folder_is_as_its_model(self):
+        for name in FOLDERS:
+            found = scripted_bake.snapshot(self.folder(name))
+            if name not in self.changed:
+                assert found == self.before[name], f"{name} has changed"
+            self.before[name] = found
+            if name in self.changed & self.known.keys():
+                self._check_files(self.known[name], found)
+                self._check_verdict(self.folder(name), self.known[name])
+        self.changed = set()
+
+    def _check_files(self, known: Known, found: dict[str, tuple[str, bytes]]) -> None:
+        """What is committed, or all if it is finished, is what an undisturbed bake makes."""
+        expected = undisturbed(known.kind, known.planned, frozenset(known.committed)) if known.committed else {}
+        if known.finished and not known.damaged:
+            assert found.keys() == expected.keys()
+            assert [path for path in expected if found[path] != expected[path]] == []
+        for episode in known.whole:
+            entry = episode_entry(episode)
+            for path in (f"{entry}.json", f"{entry}.sha256", *listed(expected, entry)):
+                assert found.get(path) == expected[path], path
+
+    def _check_verdict(self, folder: Path, known: Known) -> None:
+        """`verify` finds what is lost, and nothing else."""
+        verdict = verify.verify(folder)
+        assert (verdict.episodes, verdict.finished) == (len(known.committed), known.finished)
+        lost = known.damaged | ((known.indexed or frozenset()) - known.committed)
+        begun = (folder / CONFIG_FILE).exists() and (is_complete(folder, CONSTANTS) or not known.committed)
+        assert bool(verdict.problem) == bool(lost or not begun), verdict.problem
+
+
+def run(examples: int, steps: int, **given: Any) -> None:
+    given |= {"max_examples": examples, "stateful_step_count": steps, "report_multiple_bugs": False}
+    run_state_machine_as_test(DataSets, settings=settings(**given))
+
+
+@pytest.mark.parametrize(("examples", "steps"), [(15, 12), pytest.param(80, 25, marks=pytest.mark.slow)])
+def test_no_sequence_loses_or_repeats_anything(examples, steps):
+    run(fuzz_examples(examples), steps)
+
+
+BUGS = {
+    "a mark counts without its files": lambda patch: patch.setattr(
+        writing, "is_complete", lambda folder, entry: manifest.read_entry(folder, entry) is not None
+    ),
+    "uncommitted files stay": lambda patch: patch.setattr(OutputFolder, "_remove_incomplete", lambda self, end: None),
+    "a data set may shrink": lambda patch: patch.setattr(DataLayout, "is_planned", lambda self, episode: True),
+    "a merge takes the first settings": lambda patch: patch.setattr(
+        merge, "_config", lambda parts, content: manifest.read_settings(parts[0], content)
+    ),
+    "a merge moves files": lambda patch: patch.setattr(merge, "_link", _move),
+}
+"""Planted bugs, by name."""
+
+
+def _move(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    source.rename(target)
+
+
+LONG = ("uncommitted files stay", "a merge takes the first settings")
+"""Bugs that take longest to find."""
+
+
+@pytest.mark.parametrize("bug", [pytest.param(bug, marks=[pytest.mark.slow] * (bug in LONG)) for bug in BUGS])
+def test_a_planted_bug_of_data_sets_is_found(bug, monkeypatch):
+    BUGS[bug](monkeypatch)
+    with pytest.raises((AssertionError, pytest.fail.Exception)):
+        run(100, 12, phases=[Phase.generate])
