@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from synpick_warp.errors import OutputError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.worker import BakeLink
-from synpick_warp.system.processes.worker import start_process
+from synpick_warp.system.processes.worker import WorkerProcess, start_process
 from tests.harness.processes import wait_for
 
 FOREVER = 60.0
@@ -33,11 +33,17 @@ def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> BakeSumm
     return BakeSummary(episodes=share.episodes)
 
 
-def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
-    """Start a writer that never ends by itself, report its process id, and wait for a stop; the first device is ended by SIGTERM."""
+def _start_writer(handles: Sequence[int], link: BakeLink) -> WorkerProcess:
+    """Start a writer that never ends by itself, and report its process id."""
     writer = start_process(_SLEEPER, (), handles)
     link.writers = (writer.process.pid,)
     link.note(f"{os.getpid()} {writer.process.pid}")
+    return writer
+
+
+def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
+    """Start a writer, and wait for a stop; the first device is ended by SIGTERM."""
+    writer = _start_writer(handles, link)
     if share.episodes == [0]:
         os.kill(os.getpid(), signal.SIGTERM)
     wait_for(lambda: bool(link.number), FOREVER)
@@ -47,9 +53,7 @@ def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink
 
 def ignore_stop(_: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> None:
     """Start a writer, and hear of no stop."""
-    writer = start_process(_SLEEPER, (), handles)
-    link.writers = (writer.process.pid,)
-    link.note(f"{os.getpid()} {writer.process.pid}")
+    _start_writer(handles, link)
     time.sleep(FOREVER)
 
 
@@ -68,11 +72,14 @@ def fail(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> Bake
     return finish(share, handles, link)
 
 
-def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
-    """The first device has an error that the user can correct, the others wait."""
+def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> None:
+    """The first device has an error that the user can correct as soon as both others have a writer; they wait."""
     if share.episodes == [0]:
+        wait_for(lambda: len(os.listdir(handles[0])) == 2, FOREVER)
         raise OutputError("cannot write here")
-    return wait_for_stop(share, handles, link)
+    _start_writer(handles, link)
+    os.mkdir(str(os.getpid()), dir_fd=handles[0])
+    time.sleep(FOREVER)
 
 
 def lose_one(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
