@@ -340,7 +340,7 @@ READ_RANGE = """
 import numpy as np, synpick_warp
 view = synpick_warp.open("DATA")[0].view(0)
 rows, columns = np.indices(view.depth.shape)
-rays = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(np.asarray(view.intrinsics)).T
+rays = np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)], axis=2) @ np.linalg.inv(np.asarray(view.intrinsics)).T
 np.testing.assert_allclose(view.layer("range"), 1e3 * view.depth * np.linalg.norm(rays, axis=2), atol=1.1)  # rounded [mm]
 """
 
