@@ -361,7 +361,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     (tmp_path / "home").mkdir()
     with tempfile.TemporaryDirectory(dir="/tmp") as short:  # Paths of sockets have 107 characters.
         places = {"HOME": str(tmp_path / "home"), "TMPDIR": short, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, "-m", "tests.cloud.ray_driver", prefix, "12", "2", str(tmp_path / "died")]
+        command = [sys.executable, "-m", "tests.cloud.ray_driver", prefix, "6", "2", str(tmp_path / "died")]
         ran = subprocess.run(command, env=os.environ | places, capture_output=True, text=True, timeout=300)
         assert ran.returncode == 0, ran.stdout + ran.stderr
         assert not list(Path(short).glob("ray-*"))
@@ -369,7 +369,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     assert (tmp_path / "died").exists()
     assert "worker · cost" in ran.stdout or "workers · cost" in ran.stdout
     assert "A worker died" in ran.stdout  # Ray's own notice.
-    scripted_bake.bake(tmp_path / "local", tiny(12).with_values({"bake.device": "cpu"}))
+    scripted_bake.bake(tmp_path / "local", tiny(6).with_values({"bake.device": "cpu"}))
     assert stored(prefix) == files(tmp_path / "local")
 
 
