@@ -14,6 +14,7 @@ from trimesh.creation import annulus, box, cylinder, icosphere
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.files.load import load_config
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.suction import SuctionHold
@@ -263,9 +264,11 @@ def held(cup: float, area: float) -> float:
 
 
 def press(device, meshes, cup: float, places=((0.0, 0.0),), turn=UPRIGHT, cups=((0.0, 0.0),), valve: int = 0, **settings) -> Cups:
-    """One world per offset [m] of the first object from the cup's axis; the highest point of each object is at the lip."""
+    """One world per offset [m] of the first object from the cup's axis; the highest point of each object is at the lip. Rays hit meshes;
+    nothing collides, so that boxes are the shapes."""
     config = load_config("smoke", {"suction.vacuum": PRESSURE / 1e3, "gripper.cup_width": cup} | settings)
-    result = Cups(device, len(places), cups=cups, objects=Catalog(tuple(map(solid, meshes))), config=config, reach=0.03)
+    objects = Catalog(tuple(solid(mesh, (simplify_hull(mesh.bounding_box.vertices, 8),)) for mesh in meshes))
+    result = Cups(device, len(places), cups=cups, objects=objects, config=config, reach=0.03)
     result.scene.cups.common_valve = valve
     for world, place in enumerate(places):
         for index, mesh in enumerate(meshes):
