@@ -157,6 +157,7 @@ class OutputFolder:
             (self.out / ENTRIES).mkdir(exist_ok=True)
             self._remove_indices()
             if self._known:
+                self._remove_temporary()
                 self._remove_incomplete(max(self._layout.episodes_end, _planned_end(self.out)))
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
@@ -193,6 +194,11 @@ class OutputFolder:
             self._remove_entry(episode_entry(episode))
             for path in self._exporters.files(episode):
                 remove_path(self.out / path)
+
+    def _remove_temporary(self) -> None:
+        """Delete files of entries whose commits were killed."""
+        for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / ENTRIES)):
+            (self.out / ENTRIES / name).unlink()
 
     def _named_episodes(self) -> set[int]:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
@@ -235,8 +241,7 @@ class OutputFolder:
         if any(os.path.lexists(self.out / folder) for folder in list_folders(self.out, self._shared.folders)):
             return
         if (self.out / ENTRIES).is_dir():
-            for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / ENTRIES)):
-                (self.out / ENTRIES / name).unlink()
+            self._remove_temporary()
             (self.out / ENTRIES).rmdir()
         for name in (CONFIG_FILE, MANIFEST_FILE):
             (self.out / name).unlink(missing_ok=True)
