@@ -123,20 +123,6 @@ def test_sets_without_views_have_episodes_and_attempts(sets, name):
     mistake("preview", sets[name], "--out", sets[name].parent / "sheet.png")
 
 
-def test_interrupted_conversion_resumes_to_the_same_bytes(sets, tmp_path):
-    """What a kill between two commits leaves: one episode committed, files of the other, a staging folder."""
-    out, seen = tmp_path / "out", []
-    shutil.copytree(sets["shards"], out)
-    for name in ("000001.json", "000001.sha256", "joined.json", "joined.sha256"):
-        (out / "manifest" / name).unlink()
-    (out / "test_web" / "shard-000004.tar").write_bytes(b"half")
-    (out / ".partial" / "shards" / "000001").mkdir(parents=True)
-    assert run(sets["source"], out, "shards", report=lambda *step: seen.append(step))[:2] == (2, 1)
-    assert seen == [("episodes", 2, 2)]
-    assert snapshot(out) == snapshot(sets["shards"])
-    assert run(sets["source"], out, "shards")[:2] == (2, 2)
-
-
 def test_an_interrupt_leaves_no_files_beside_committed_episodes(sets, tmp_path):
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

@@ -17,7 +17,7 @@ import pytest
 import synpick_warp
 from synpick_warp.cli.main import EXIT_MISTAKE
 from synpick_warp.dataset.commit import writing
-from synpick_warp.dataset.commit.manifest import INDICES, committed_episodes
+from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import OutputError
@@ -78,18 +78,6 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
             assert digests(out) == expected
             finished += 1
             longest = min(longest, 2.0 * (time.monotonic() - started))
-
-
-@pytest.mark.slow
-def test_a_shard_removes_the_uncommitted_files_of_others(server, whole, tmp_path):
-    """A whole bake was killed when the shard's episodes were committed, and files of another one were in place without an entry."""
-    out = tmp_path / "set"
-    assert server.bake(out, arguments=["--shard", "0/2"]) == 0
-    shard = digests(out)
-    shutil.copytree(whole / "train/000003", out / "train/000003")
-    (out / f"{INDICES}.json").unlink()
-    assert server.bake(out, arguments=["--shard", "0/2"]) == 0
-    assert digests(out) == shard
 
 
 @pytest.fixture
@@ -164,23 +152,6 @@ def test_a_data_set_can_grow_with_other_worlds_and_writers(server, expected, tmp
     assert verify(out).finished
     assert server.bake(out) == 0
     assert digests(out) == expected
-
-
-@pytest.mark.slow
-def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
-    parts = [tmp_path / str(part) for part in range(3)]
-    for part, folder in enumerate(parts):
-        assert server.bake(folder, arguments=["--shard", f"{part}/3"]) == 0
-        assert committed_episodes(folder) == list(range(part, EPISODES, 3))
-        assert verify(folder).finished
-    merged = merge(parts, tmp_path / "set")
-    assert (merged.episodes, merged.missing) == (EPISODES, [])
-    assert digests(tmp_path / "set") == expected
-    assert verify(tmp_path / "set") == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
-    some = merge(parts[1:2], tmp_path / "some")
-    assert (some.episodes, some.missing) == (1, [0, 2, 3])
-    assert server.bake(tmp_path / "some") == 0
-    assert digests(tmp_path / "some") == expected
 
 
 SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
@@ -301,12 +272,6 @@ def test_what_is_wrong_or_missing_is_named(copied):
 
 def exchange(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text().replace(old, new))
-
-
-def test_an_episode_that_lost_a_file_is_made_again(server, copied, expected):
-    (copied / "train/000004/depth/000002.png").unlink()
-    assert server.bake(copied) == 0
-    assert digests(copied) == expected
 
 
 def test_a_folder_is_one_bakes_at_a_time(copied, monkeypatch):

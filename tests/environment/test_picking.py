@@ -107,16 +107,6 @@ def test_an_empty_bin_terminates_the_episode(environment):
 # ---- the ends of episodes ----
 
 
-def test_next_step_begins_an_episode_with_the_step_after(environment):
-    environment.choice = replace(environment.choice, max_steps=1)
-    last = environment.step(floor_pixels(environment.observe()))
-    assert last.truncated.all()
-    first = environment.step(np.zeros((2, 2), int))
-    assert not first.truncated.any()
-    assert (first.info["episode_index"] != last.info["episode_index"]).all()
-    assert (first.info["steps"] == 0).all()
-
-
 def test_same_step_has_the_last_observation_in_its_info(environment):
     pixels = floor_pixels(environment.observe())
     environment.choice = replace(environment.choice, max_steps=1)

@@ -293,11 +293,6 @@ def test_a_full_disk_names_the_file_that_could_not_be_written(parts, tmp_path, m
     assert verify(tmp_path / "out").finished
 
 
-def test_merged_parts_are_what_one_bake_writes(parts, ready, tmp_path):
-    merge(parts, tmp_path / "merged")
-    assert snapshot(tmp_path / "merged") == snapshot(ready)
-
-
 # ---- fuzz ----
 
 
