@@ -209,12 +209,6 @@ def bake(out: Path, *arguments: str) -> int:
     return main([*command(out), *arguments])
 
 
-def device_processes() -> list[int]:
-    """Process ids of the children of this process that simulate."""
-    numbers = [number for task in Path("/proc/self/task").iterdir() for number in (task / "children").read_text().split()]
-    return sorted(int(number) for number in numbers if b"lose_one" in Path(f"/proc/{number}/cmdline").read_bytes())
-
-
 @pytest.mark.slow
 def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path, capsys, monkeypatch):
     """Begun on one device, continued on two, of which one is killed with an episode left, and finished on one."""
@@ -233,7 +227,6 @@ def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_
     assert bake(several, "--device", "cpu") == 0
     assert f"{EPISODES} of {EPISODES} episodes ({len(there)} of them before)" in capsys.readouterr().out
     assert digests(several) == digests(one)
-    assert device_processes() == []
 
 
 @pytest.mark.parametrize(
