@@ -174,9 +174,9 @@ class OutputFolder:
 
     def _remove_indices(self) -> None:
         """Remove the files that list all episodes, and their entry in the manifest."""
+        self._remove_entry(INDICES)  # First: killed in between, no mark names files that are gone.
         for name in (EPISODES_FILE, ATTEMPTS_FILE, *self._shared.indices):
             (self.out / name).unlink(missing_ok=True)
-        self._remove_entry(INDICES)
 
     def _remove_constants(self) -> None:
         """Delete the constants, and folders of formats if they are empty then."""
