@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
 from synpick_warp.kernels.sim import snapshot as snapshots
+from synpick_warp.kernels.structs import CatalogData
 from synpick_warp.stages import host_copies, ticks
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
@@ -438,6 +439,8 @@ class Linked:
     def __init__(self) -> None:
         self.device = pick_device(default_device())
         self.last, self.count = allocate(LastFrame, SIZES, self.device), 0
+        self.catalog = CatalogData()
+        self.catalog.radius = wp.full(32, 0.1, dtype=float, device=self.device)
 
     def tick(self, worlds: list[tuple[int, int, int]]) -> Snapshot:
         self.count += 1
@@ -448,7 +451,7 @@ class Linked:
             values = getattr(made, name).numpy()
             values[:] = (self.count + 10 * np.arange(LINKED_WORLDS)).reshape(LINKED_WORLDS, *(1,) * (values.ndim - 1))
             getattr(made, name).assign(values)
-        launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, self.last)
+        launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, self.last, catalog=self.catalog)
         return made
 
 
@@ -480,3 +483,25 @@ def test_every_snapshot_has_the_one_before_beside_it(script):
             told = number + 10 * np.arange(LINKED_WORLDS) if number else np.zeros(LINKED_WORLDS)
             np.testing.assert_array_equal(values, np.broadcast_to(told[:, None], values.shape))
         before = worlds
+
+
+@pytest.mark.parametrize(
+    ("moved", "turned", "held"), [(0.0, 0.0, True), (9e-6, 0.0, True), (1.1e-5, 0.0, False), (0.0, 9e-5, True), (0.0, 1.1e-4, False)]
+)
+def test_poses_are_held_until_a_point_moves_by_10_um(moved, turned, held):
+    """Of an object whose points lie within 0.1 m of its origin."""
+    linked = Linked()
+    first = linked.tick([(1, 0, 0)] * LINKED_WORLDS)
+    first.catalog_index.zero_()
+    poses = np.tile(np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], np.float32), (LINKED_WORLDS, 2, 1))
+    linked.last.pose.assign(poses)
+    linked.last.catalog_index.zero_()
+    made = allocate(Snapshot, SIZES, linked.device)
+    made.live.fill_(1)
+    made.frame.fill_(1)
+    now = poses + np.array([moved, 0.0, 0.0, np.sin(turned / 2), 0.0, 0.0, np.cos(turned / 2) - 1.0], np.float32)
+    made.pose.assign(now)
+    launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, linked.last, catalog=linked.catalog)
+    np.testing.assert_array_equal(made.pose.numpy(), poses if held else now)
+    np.testing.assert_array_equal(made.last_pose.numpy(), poses)
+    np.testing.assert_array_equal(linked.last.pose.numpy(), made.pose.numpy())

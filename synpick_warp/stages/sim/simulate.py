@@ -265,7 +265,7 @@ class Simulation:
         tables = {"status_out": status.table, "measure_out": status.measures}
         launch(pack.pack_status_kernel, worlds, snapshot, state, self.attempts, self.seals, self.plan, **tables)
         launch(pack.copy_sets_kernel, status.engaged.shape, self.attempts, out=status)
-        launch(pack.link_frames_kernel, worlds, snapshot, self.last)
+        launch(pack.link_frames_kernel, worlds, self.scene, snapshot, self.last)
         wp.copy(snapshot.bin, state.bin)
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_yaw, state.light_yaw)
