@@ -299,7 +299,7 @@ def test_extreme_settings_give_a_plan_or_one_line(data, cuda, mode, cameras):
                 assert size >= 0
                 assert all(type(extent) is int and extent >= 0 for extent in shape)
             # Without history, or without images, there is nothing to hold.
-            assert term.size > 0 or term.name.startswith(("images in", "light averaged over frames"))
+            assert term.size > 0 or term.name.startswith(("images in", "light averaged over frames", "pictures kept over frames"))
         check_memory(terms, device)
     except SynpickError as error:
         assert "\n" not in str(error)  # noqa: PT017 - most examples are errors, some are none

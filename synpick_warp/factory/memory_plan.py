@@ -39,6 +39,7 @@ from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.plan import allocate_votes
 from synpick_warp.stages.render.cameras import allocate_lenses
 from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
+from synpick_warp.stages.render.postprocess import KeptColors
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import blank_scene
@@ -256,8 +257,11 @@ def _images(
             copied = [array for batch in ring for array in batch.copied(host.on_demand).values()]
     history, background = ([array for array in arrays if name in array.spec.shape] for name in ("world_camera", "camera"))
     others = [array for array in arrays if not {"world_camera", "camera"}.intersection(array.spec.shape)]
+    kept = [array for array in history if array.name.startswith(KeptColors.__name__)]
     if history:
-        yield _term("light averaged over frames", history, _HISTORY)
+        yield _term("light averaged over frames", (array for array in history if array not in kept), _HISTORY)
+    # Kernels index these by image, row and column.
+    yield _term("pictures kept over frames", kept, _HISTORY, indexed=False)
     yield _term(f"images of {views:,} views of {size}", others + images, _VIEWS)
     yield _term(f"backgrounds of {cameras:,} cameras of {size}", background, _CAMERAS)
     if copied and device.is_cuda:

@@ -130,6 +130,8 @@ class DryArray:
     def fill_(self, value: Any) -> None:
         """Nothing is filled."""
 
+    assign = fill_
+
 
 _dry: ContextVar[list[DryArray] | None] = ContextVar("dry", default=None)
 """Stand-ins of the dry run of this thread; None: arrays are allocated."""

@@ -75,7 +75,7 @@ def split_passes(measured) -> tuple[list, dict[Renderer, list[list]]]:
     """Batches before the passes, and of each renderer those of each pass; a pass has two batches a tick."""
     per_tick = -(-WORLDS * CAMERAS // BATCH)
     first = HISTORY_TICKS * per_tick
-    warmup, timed = measured.batches[first : first + 2 * per_tick], measured.batches[first + 2 * per_tick :]
+    warmup, timed = measured.batches[first : first + 3 * per_tick], measured.batches[first + 3 * per_tick :]
     renderers = list(dict.fromkeys(batch.renderer for batch in warmup))
     size = KEPT_TICKS * per_tick
     passes = [timed[start : start + size] for start in range(0, len(timed), size)]
@@ -89,7 +89,7 @@ def all_views(batches: Sequence) -> list[tuple]:
 
 def test_each_pass_renders_each_view_of_each_kept_tick_once(measured):
     first, passes = split_passes(measured)
-    assert [len(of_renderer) for of_renderer in passes.values()] == [ROUNDS] * 2
+    assert [len(of_renderer) for of_renderer in passes.values()] == [ROUNDS] * 3
     assert len(all_views(first)) == HISTORY_TICKS * WORLDS * CAMERAS
     assert min(frame for _, frame, _ in all_views(first)) >= AFTER
     episodes = {episode for episode, *_ in all_views(first)}
@@ -123,11 +123,11 @@ def test_kept_snapshots_are_copies(measured):
 
 def test_histories_continue_in_every_pass_and_are_the_same_in_each(measured):
     first, passes = split_passes(measured)
-    with_history, without = passes.values()
+    with_history, whole, without = passes.values()
     assert all(not batch.holds.any() for batch in first[:2])
-    assert all(batch.holds.all() for batches in with_history for batch in batches)
+    assert all(batch.holds.all() for batches in (*with_history, *whole) for batch in batches)
     assert all(batch.holds is None for batches in without for batch in batches)
-    for batch, again in zip(*with_history, strict=True):
+    for batch, again in (*zip(*with_history, strict=True), *zip(with_history[0], whole[0], strict=True)):
         np.testing.assert_array_equal(batch.paths, again.paths)
         np.testing.assert_array_equal(batch.color, again.color)
     longest = [max(batch.paths.max() for batch in batches) for batches in (first[:2], first[-2:], with_history[0][-2:])]
@@ -141,7 +141,7 @@ def test_rows_state_counts_and_rates(measured):
     assert rows["views in a pass"] == KEPT_TICKS * WORLDS * CAMERAS
     assert rows["views in a batch"] == BATCH
     assert rows["paths in a history before a pass, mean"] > 1.0
-    for name in ("all stages", "all stages, render.history=0"):
+    for name in ("all stages", "all stages, render.reuse=false", "all stages, render.history=0"):
         rate = rows[f"{name}: views, median of {ROUNDS} passes"]
         assert 0.0 < rows[f"{name}: views, slowest pass"] <= rate <= rows[f"{name}: views, fastest pass"]
         assert rows[f"{name}: pixels"] == pytest.approx(32 * 18e-6 * rate)

@@ -33,8 +33,8 @@ from tools.options import MeasuredRow
 
 HISTORY_TICKS = 24
 """Ticks rendered before the measurement. Where nothing moves, a coarse pixel traces its 2nd path in the next frame, 2 more in every second
-frame and 4 more in every fourth: it has accumulated 8 after 1 + 2 * 2 + 4 * 4 = 21 frames, and then traces one in every 8th, its longest
-update period."""
+frame and 4 more in every fourth: it has accumulated 8 after 1 + 2 * 2 + 4 * 4 = 21 frames, and then traces one in every 8th. Its longest
+update period it reaches after 16 more."""
 KEPT_TICKS = 1 << int(MAX_PERIOD_BITS)
 """Ticks of a pass: the longest update period, in which each coarse pixel traces at least one path."""
 ROUNDS = 5
@@ -55,10 +55,13 @@ def light_history(renderer: Renderer) -> Any:
     return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
 
 
-def _history_arrays(renderer: Renderer) -> list[wp.array]:
-    """Arrays of a renderer's light histories; none if it keeps none."""
-    history = light_history(renderer)
-    return [] if history is None else [getattr(history, name) for name in LIGHT_HISTORY.specs]
+def _history_arrays(renderer: Renderer) -> dict[str, wp.array]:
+    """Arrays of a renderer's light histories and kept images by name; none if it keeps none."""
+    history, shading = light_history(renderer), renderer.shading
+    if history is None or not isinstance(shading, DenoisedRenderer):
+        return {}
+    kept = {"ratios": shading.ratios.record, "bodies": shading.tiles.bodies, "color": renderer.postprocessor.kept}
+    return {name: getattr(history, name) for name in LIGHT_HISTORY.specs} | {name: array for name, array in kept.items() if array.size}
 
 
 def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
@@ -90,8 +93,10 @@ def measure_pictures(bench: Bench) -> Iterator[MeasuredRow]:
     if history is not None:
         paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
         yield MeasuredRow("paths in a history before a pass, mean", float(paths.mean()), "")
-        without = config.with_values({"render.history": 0})
-        renderers["all stages, render.history=0"] = make_renderer(without, ring.renderer.scene, ring.instances, ring.batch)
+        scene, count = ring.renderer.scene, history.frame.shape[0]
+        for setting, value, histories in (("render.reuse", False, count), ("render.history", 0, 0)):
+            other = make_renderer(config.with_values({setting: value}), scene, ring.instances, ring.batch, histories)
+            renderers[f"all stages, {setting}={str(value).lower()}"] = other
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
@@ -134,14 +139,14 @@ def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick])
 
 def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:
     """Times of ROUNDS passes of each renderer [s], by its name, after a warm-up pass over the first tick."""
-    saved = {name: list(map(wp.clone, _history_arrays(renderer))) for name, renderer in renderers.items()}
+    saved = {name: wp.clone(array) for name, array in _history_arrays(next(iter(renderers.values()))).items()}
     times: dict[str, list[float]] = {name: [] for name in renderers}
     for renderer in renderers.values():
         render_ticks(stream, renderer, ticks[:1])
     for _ in range(ROUNDS):
         for name, renderer in renderers.items():
-            for array, copy in zip(_history_arrays(renderer), saved[name], strict=True):
-                wp.copy(array, copy)
+            for member, array in _history_arrays(renderer).items():
+                wp.copy(array, saved[member])
             wp.synchronize_device(stream.device)
             started = time.perf_counter()
             render_ticks(stream, renderer, ticks)

@@ -138,7 +138,7 @@ def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[in
     References have half of the paths each, and seeds of their own.
     """
     device = pick_device(config.bake.device)
-    fitted = fit_to_device(config.with_values({"render.mode": FAST}), device, config.bake.episodes)
+    fitted = fit_to_device(config.with_values({"render.mode": FAST, "render.reuse": False}), device, config.bake.episodes)
     check_memory(plan_memory(fitted, device), device)
     with explain_shortage(fitted):
         stages = build_stages(fitted, device, SilentProgress(), range(config.bake.episodes))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Render
@@ -19,7 +20,14 @@ from synpick_warp.kernels.render.images.antialias import (
     resolve_footprints_kernel,
 )
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
+from synpick_warp.kernels.render.lighting.denoise import (
+    ALL_STAGES,
+    choose_widths_kernel,
+    filter_blocks_kernel,
+    plan_stages_kernel,
+    smooth_ratios_kernel,
+)
+from synpick_warp.kernels.render.lighting.dirty_tiles import DirtyTiles, mark_dirty_tiles_kernel, plan_passes_kernel
 from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, advance_history_kernel
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.paths.bounces import extend_queued_paths_kernel
@@ -27,7 +35,7 @@ from synpick_warp.kernels.render.lighting.paths.coarse import start_paths_kernel
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight
 from synpick_warp.kernels.render.lighting.paths.lists import REGION_PIXELS, PathLists
 from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEUE_CAPACITY, PathQueues
-from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel
+from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel, schedule_paths_kernel
 from synpick_warp.kernels.render.lighting.shading import DenoisedLight, shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
 from synpick_warp.kernels.render.lighting.shadow_edges import (
@@ -62,6 +70,7 @@ from synpick_warp.stages.render.sampling_rates import (
     traces_paths,
 )
 from synpick_warp.stages.render.scene import RenderScene, build_grid
+from synpick_warp.stages.render.view_setup import body_sizes
 from synpick_warp.stages.timing import scope
 
 SINGLE_PATH_VARIANCE_SCALE = 2.0
@@ -84,6 +93,13 @@ MAX_QUEUE_FRACTION = 1 / 96
 """Maximum size of path queues as a fraction of the device's memory. At full HD, 42 views fit into that of an H100, and 6 into that of a GPU
 of 12 GiB, which is better used for worlds."""
 
+MAX_KEPT_FRACTION, KEPT_BYTES = 1 / 8, 3
+"""Maximum size of the images that are kept from frame to frame, as a fraction of the device's memory, and size of a pixel [bytes]. Those
+of 512 worlds with three full-HD cameras fit into a GPU of 80 GB; on one of 24 GB their pictures are shaded whole."""
+
+MAX_KEPT_HOST = 1 << 30
+"""The same on a CPU [bytes]: images of 170 cameras in full HD."""
+
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
 LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column", edge=("view", "row", "column"))
@@ -104,6 +120,16 @@ LIGHT_HISTORY = struct_arrays(
     episode=("world_camera",),
     frame=("world_camera",),
 )
+DIRTY_TILES = struct_arrays(
+    DirtyTiles,
+    "view",
+    history_row=("view",),
+    stages=("view", "cell_tile"),
+    due=("view", "cell_tile"),
+    shadowed=("view", "shadow_tile"),
+    dirty=("view", "tile"),
+    bodies=("world_camera", "tile", "body_word"),
+)
 MOVING_BODIES = struct_arrays(
     MovingBodies,
     "view",
@@ -111,7 +137,9 @@ MOVING_BODIES = struct_arrays(
     **dict.fromkeys(("holds", "count", "all_lower", "all_upper"), ("view",)),
     units=dict.fromkeys(("to_body", "lower", "upper", "all_lower", "all_upper"), "m"),
 )
-PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
+PATH_LISTS = struct_arrays(
+    PathLists, "view", "region", "rank", count=("view", "region", "path_kind"), listed=("view", "cell_row", "cell_column")
+)
 PATH_QUEUES = struct_arrays(
     PathQueues,
     "queue_view",
@@ -121,6 +149,7 @@ PATH_QUEUES = struct_arrays(
     record=("queue_view", "queue_region", "path_record"),
 )
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
+KEPT_RATIOS = struct_arrays(RatioImages, "world_camera", "cell_row", "cell_column")
 SHADOW_RAYS = struct_arrays(ShadowRays, "view", "shadow_row", "shadow_column")
 FOOTPRINT_LISTS = struct_arrays(FootprintLists, "view", "chunk", footprint=("view", "chunk", "chunk_footprint"))
 
@@ -183,6 +212,13 @@ def history_sizes(render: Render, width: int, height: int, histories: int) -> di
     return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
 
 
+def keeps_images(render: Render, width: int, height: int, histories: int, device: wp.Device) -> bool:
+    """Whether images are kept from frame to frame: with light histories, if they fit into MAX_KEPT_FRACTION of a GPU's memory, or
+    MAX_KEPT_HOST bytes of a CPU's."""
+    room = MAX_KEPT_FRACTION * device.total_memory if device.is_cuda else MAX_KEPT_HOST
+    return render.reuse and accumulates(render, histories) and histories * width * height * KEPT_BYTES <= room
+
+
 def build_coarse_grid(image: Any, size: int, rays: int = 1) -> Any:
     """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px; see there for `rays`."""
     coarse = CoarseGrid()
@@ -202,7 +238,15 @@ class DenoisedRenderer:
     """Renders linear radiance from a few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and lamp shadows.
     Allocates its scratch once; `shade` only launches kernels."""
 
-    def __init__(self, render: Render, seed: int, scene: RenderScene, instances: int, views: int, histories: int = 0) -> None:
+    def __init__(
+        self,
+        render: Render,
+        seed: int,
+        scene: RenderScene,
+        instances: int,
+        views: int,
+        histories: int = 0,
+    ) -> None:
         """Allocate scratch.
 
         Args:
@@ -229,19 +273,27 @@ class DenoisedRenderer:
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
         self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
         self.history.frame.fill_(int(NEVER))
+        self.reuses = keeps_images(render, scene.width, scene.height, histories, scene.device)
+        averages = accumulates(render, histories)
+        sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if averages else 0}
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
         queues = queue_sizes(render, scene.width, scene.height, views, histories, scene.device)
         self.queues = allocate_struct(PATH_QUEUES, queues, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
-        self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
+        self.chosen = allocate_struct(RATIO_IMAGES, sizes, scene.device)
+        self.ratios = allocate_struct(KEPT_RATIOS if averages else RATIO_IMAGES, sizes, scene.device)
         self.shadow_rays = allocate_struct(SHADOW_RAYS, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
         self.edge_lists = allocate_struct(EDGE_LISTS, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
+        sizes["cell_tile"], sizes["shadow_tile"] = self.coarse.grid.tiles, self.shadow_grid.grid.tiles
+        self.tiles = allocate_struct(DIRTY_TILES, sizes if self.reuses else sizes | {"world_camera": 0}, scene.device)
+        self.tiles.stages.fill_(ALL_STAGES)
+        self.tiles.history_row.assign(np.arange(views))
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
 
@@ -278,7 +330,9 @@ class DenoisedRenderer:
             return
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.frames, views]
-        wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving], **options)
+        wp.launch(
+            kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving, self.tiles.history_row], **options
+        )
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
@@ -290,9 +344,16 @@ class DenoisedRenderer:
         scene, views, threads = self.scene, shot.views, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            inputs = [scene.paths, self.coarse, shot, self.moving]
-            outputs = [self.history, self.path_lists, self.guide, self.coarse_light]
-            launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
+            self.tiles.due.zero_()
+            inputs, outputs = [scene.paths, self.coarse, shot, self.moving], [self.history, self.path_lists, self.tiles.due]
+            launch_views(schedule_paths_kernel, views.count, threads, inputs, outputs, scene.device)
+            dim, inputs = (views.count, self.coarse.grid.tiles), [self.coarse.grid, self.tiles.due]
+            wp.launch(plan_stages_kernel, dim=dim, inputs=inputs, outputs=[self.tiles.stages], device=scene.device)
+            inputs, outputs = (
+                [scene.paths, self.coarse, shot, self.path_lists, self.tiles.stages],
+                [self.history, self.guide, self.coarse_light],
+            )
+            self._launch(reuse_histories_kernel, self.coarse.grid, views, inputs, outputs)
         inputs = [scene.paths, self.coarse, shot, self.path_lists, self.rules]
         outputs = [self.queues, self.history, self.guide, self.coarse_light]
         if self.queues.count.shape[1] == 0:
@@ -317,17 +378,36 @@ class DenoisedRenderer:
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""
         shared = [self.coarse, self.guide]
-        self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views], [self.blocks])
-        self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [self.chosen])
-        self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
+        self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views, self.tiles.stages], [self.blocks])
+        inputs = [*shared, self.blocks, views, self.tiles.stages, self.variance_scale]
+        self._launch(choose_widths_kernel, self.coarse.grid, views, inputs, [self.chosen])
+        inputs = [*shared, self.chosen, views, self.tiles.stages, self.tiles.history_row]
+        self._launch(smooth_ratios_kernel, self.coarse.grid, views, inputs, [self.ratios])
 
     def trace_shadows(self, shot: Any, image: Any) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
         coarse, views, inputs = self.shadow_grid, shot.views, [self.scene.plain, self.shadow_grid, shot]
-        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, self.moving], [self.history, self.shadow_rays])
+        self.tiles.shadowed.zero_()
+        outputs = [self.history, self.shadow_rays, self.tiles.shadowed]
+        self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, self.moving], outputs)
         for kernel in (filter_shadows_kernel, measure_steepness_kernel):
             self._launch(kernel, coarse.grid, views, [*inputs, self.shadow_rays], [self.shadows])
+        self.mark_dirty_tiles(shot)
         self.trace_shadow_edges(shot, image)
+
+    def mark_dirty_tiles(self, shot: Any) -> None:
+        """Mark the tiles that may differ from the frame before, by bodies, light and shadows; nothing without reuse."""
+        if self.reuses:
+            inputs = [self.coarse, self.shadow_grid, shot, self.moving]
+            dim = (shot.views.count, shot.grid.tiles)
+            kernel = kernel_for(mark_dirty_tiles_kernel, *inputs)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.tiles], device=self.scene.device, block_dim=PIXEL_BLOCK)
+
+    def plan_passes(self, shot: Any, image: Any) -> None:
+        """Plan what is computed anew in each tile, once all dirty ones are marked; nothing without reuse."""
+        if self.reuses:
+            inputs, dim = [shot.grid, self.tiles.dirty], (shot.views.count, shot.grid.tiles)
+            wp.launch(plan_passes_kernel, dim=dim, inputs=inputs, outputs=[image.passes], device=self.scene.device, block_dim=PIXEL_BLOCK)
 
     def trace_shadow_edges(self, shot: Any, image: Any) -> None:
         """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions, which
@@ -339,14 +419,16 @@ class DenoisedRenderer:
         launch_views(list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device)
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
         sharing = lists.count.shape[1] * threads
-        launch_views(list_edge_pixels_kernel, views.count, sharing, [scene.meshes, coarse, shot, threads], outputs, device)
+        inputs = [scene.meshes, coarse, scene.lights, shot, self.moving, threads]
+        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, [*outputs, self.tiles.dirty], device)
+        self.plan_passes(shot, image)
         inputs = [scene.plain, coarse, shot, lists]
-        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, threads], [self.shadows], device)
+        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, image.passes, threads], [self.shadows], device)
         launch_pixels(filter_shadow_edges_kernel, views.count * sharing, [*inputs, self.shadows, threads], [image], device)
 
     def shade_pixels(self, shot: Any, image: Any) -> None:
         """Deferred shading: radiance of each pixel."""
-        self._launch(self.shade_kernel, shot.grid, shot.views, [self.scene.paths, shot, bundle(DenoisedLight, self)], [image])
+        self._launch(self.shade_kernel, shot.grid, shot.views, [self.scene.paths, shot, bundle(DenoisedLight, self, self.tiles)], [image])
         shade_floor(self.scene, shot, image)
 
     def resolve_footprints(self, shot: Any, image: Any) -> None:

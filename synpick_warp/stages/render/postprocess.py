@@ -33,6 +33,16 @@ class LensArrays:
     """Resolved radiance after vignette, and after blur and chromatic aberration along rows."""
 
 
+@dataclass(frozen=True, eq=False)
+class KeptColors:
+    """Colour images of the last frame of each world and camera."""
+
+    color: wp.array = device_array("world_camera", "row", "column", dtype=wp.vec3ub)
+    """sRGB, red first."""
+    history_row: wp.array = device_array("view", dtype=wp.int32)
+    """Image of each view of a batch, where no renderer says which."""
+
+
 def has_effects(effects: Effects) -> bool:
     """True if any camera effect is on."""
     return any(any(bounds) for bounds in effect_ranges(effects).values())
@@ -55,7 +65,9 @@ def make_effect_ranges(effects: Effects, seed: int) -> Any:
 class PostProcessor:
     """Turns radiance into sRGB images. Owns its scratch; `process` only launches, so a CUDA graph can capture it."""
 
-    def __init__(self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int) -> None:
+    def __init__(
+        self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int, history_row: wp.array | None = None, kept: int = 0
+    ) -> None:
         """Allocate scratch, if an effect needs it.
 
         Args:
@@ -64,8 +76,13 @@ class PostProcessor:
             seed: Seed of the bake.
             scene: Constant data.
             views: Largest number of views in a batch.
+            history_row: (view) int32: the kept images of a batch's views; None: there are none.
+            kept: Number of images that are kept from frame to frame, for tiles that are not computed anew.
         """
         self.scene = scene
+        sizes = {"world_camera": kept, "row": scene.height, "column": scene.width, "view": views}
+        images = allocate(KeptColors, sizes, scene.device)
+        self.kept, self.history_row = images.color, images.history_row if history_row is None else history_row
         self.effects = make_effect_ranges(effects, seed) if has_effects(effects) else None
         self.settings = PostProcessSettings()
         self.settings.seed = seed
@@ -86,7 +103,8 @@ class PostProcessor:
         """
         scene, count = self.scene, shot.views.count
         if self.effects is None:
-            self._launch(postprocess_kernel, count, [scene.lights, shot, image, self.settings.tone], out.color)
+            inputs = [scene.lights, shot, image, self.settings.tone, self.history_row]
+            launch_pixels(postprocess_kernel, count * scene.grid.tiles * int(TILE_PIXELS), inputs, [self.kept, out.color], scene.device)
             return
         inputs = [self.effects, shot]
         wp.launch(kernel_for(sample_effects_kernel, shot), dim=count, inputs=inputs, outputs=[out.effects], device=scene.device)

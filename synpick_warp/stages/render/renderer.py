@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.sensors import DepthSensor, Effects
-from synpick_warp.kernels.render.visibility.gbuffer import ShadedImage
+from synpick_warp.kernels.render.visibility.gbuffer import ALL_PASSES, ShadedImage
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
@@ -14,14 +15,14 @@ from synpick_warp.stages.render.cameras import allocate_view_cameras
 from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.looks import Dresser
-from synpick_warp.stages.render.postprocess import PostProcessor
+from synpick_warp.stages.render.postprocess import PostProcessor, has_effects
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_shot, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
 
-SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
+SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column", passes=("view", "tile"))
 
 
 class Renderer:
@@ -79,11 +80,16 @@ class Renderer:
         self.shading: DenoisedRenderer | ReferenceRenderer | None = None
         if colors:
             self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
+            self.image.passes.fill_(ALL_PASSES)
+            if has_effects(effects):
+                settings = replace(settings, reuse=False)
+            kept, history_row = 0, None
             if settings.mode == schema.REFERENCE:
                 self.shading = ReferenceRenderer(settings, seed, scene)
             else:
                 self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
-            self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
+                kept, history_row = histories if self.shading.reuses else 0, self.shading.tiles.history_row
+            self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)

@@ -17,7 +17,7 @@ from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ShadedImage, ViewBodies
+from synpick_warp.kernels.render.visibility.gbuffer import ALL_PASSES, GBuffer, ShadedImage, ViewBodies
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate
@@ -77,6 +77,7 @@ def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops:
     image = ShadedImage()
     image.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
     image.resolve = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
+    image.passes = wp.full((views, scene.grid.tiles), ALL_PASSES, dtype=wp.uint8, device=device)
     batch = aimed_views(range(views), at.camera, 0, build_cameras((lens,) * 9, device), device)
     shot = make_shot(scene, world.frames, ViewBodies(), GBuffer(), batch)  # type: ignore[arg-type]
     PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views).process(shot, image, out)

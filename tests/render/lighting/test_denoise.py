@@ -174,7 +174,7 @@ def test_aligned_squares_hold_aligned_runs_of_morton_indices(device, period):
 # ---- lists of paths ----
 
 
-VIEWS, REGIONS, MAX_KNOWN, MAX_BITS = 2, 3, 255, 3
+VIEWS, REGIONS, MAX_KNOWN, MAX_BITS = 2, 3, 255, 7
 REGION = int(REGION_PIXELS)
 THREADS = REGIONS * REGION
 
@@ -196,7 +196,9 @@ def test_every_listed_pixel_is_read_once_with_its_history(device, listed):
     bits = np.where(known > 0, rng.integers(0, MAX_BITS + 1, known.size), 0).astype(np.int32)
     known[rng.random(known.size) >= listed] = -1
     known[:REGION], bits[:REGION] = MAX_KNOWN, MAX_BITS  # A full region, to the last bit of its entries.
-    lists = allocate_struct(PATH_LISTS, {"view": VIEWS, "region": REGIONS, "rank": REGION, "path_kind": 2}, device)
+    lists = allocate_struct(
+        PATH_LISTS, {"view": VIEWS, "region": REGIONS, "rank": REGION, "path_kind": 2, "cell_row": 1, "cell_column": 1}, device
+    )
     lists.count.zero_()
     threads = np.arange(known.size)
     append(lists, threads // THREADS, threads, known, bits, device=device)

@@ -10,12 +10,14 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
+    COLOR_PASS,
     MASK_BITS,
     AnyShot,
     GBuffer,
@@ -220,6 +222,12 @@ def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: Sh
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
+    colored = needs(grid, image_inout.passes, COLOR_PASS, view, top, left) or needs(
+        grid, image_inout.passes, COLOR_PASS, view, bottom, right
+    )
+    if not colored and not needs(grid, image_inout.passes, COLOR_PASS, view, top, right):
+        if not needs(grid, image_inout.passes, COLOR_PASS, view, bottom, left):
+            return
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
     if has_contrast(image_inout.radiance, view, top, left, bottom, right):
         if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):

@@ -17,9 +17,10 @@ from synpick_warp.kernels.render.images.camera_effects import (
     vignette_factor,
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
+from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, in_image, loop_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage
+from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, AnyShot, ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -62,22 +63,33 @@ def postprocess_kernel(
     shot: AnyShot,
     image: ShadedImage,
     tone: int,
+    history_row: wp.array[int],  # (view)
     first: int,
+    # State:
+    kept_inout: wp.array3d[wp.vec3ub],  # (world_camera, row, column)
     # Out:
     color_out: wp.array3d[wp.vec3ub],  # (view, row, column)
 ):
     """Radiance to sRGB without camera effects: exposure (the map's factor times 2 to the episode's exposure value), tone map, transfer.
 
-    `color_out` receives red, green, blue bytes. Launched over view, pixel (tile order, from flat index `first` on).
+    `color_out` receives red, green, blue bytes; outside tiles of COLOR_PASS those of the frame before, from `kept_inout`, to which others
+    are added if it is not empty. Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
     if not in_image(shot.grid, row, column):
+        return
+    history = history_row[view]
+    if not needs(shot.grid, image.passes, COLOR_PASS, view, row, column):
+        color_out[view, row, column] = kept_inout[history, row, column]
         return
     world, snapshot = shot.views.world[view], shot.snapshot
     value = (
         lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world]) * resolve_radiance(image, view, row, column)
     )
-    color_out[view, row, column] = wp.vec3ub(encode_display(value[0], tone), encode_display(value[1], tone), encode_display(value[2], tone))
+    color = wp.vec3ub(encode_display(value[0], tone), encode_display(value[1], tone), encode_display(value[2], tone))
+    color_out[view, row, column] = color
+    if kept_inout.shape[0] > 0:
+        kept_inout[history, row, column] = color
 
 
 @wp.func

@@ -22,7 +22,17 @@ from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_l
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import (
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    AnyCameras,
+    AnyViews,
+    ImageGrid,
+    clamp_index,
+    in_image,
+    tile_of,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
@@ -40,12 +50,51 @@ BlockRow = wp.types.vector(length=2 * int(HALF_BLOCK) + 1, dtype=wp.float32)
 """Weights of a row of a block."""
 BLOCKS_START = wp.constant(-(int(BLOCK) * (int(BLOCKS) - 1) // 2))
 """Offset of the first block of the wide kernel [coarse pixels]."""
+RATIO_STAGE, CHOICE_STAGE, BLOCK_STAGE, LIGHT_STAGE = wp.constant(1), wp.constant(2), wp.constant(4), wp.constant(8)
+"""Bits of the stages that a tile of coarse pixels needs in a frame: its ratios, its choice of kernels, its block means, its light."""
+ALL_STAGES = int(RATIO_STAGE) | int(CHOICE_STAGE) | int(BLOCK_STAGE) | int(LIGHT_STAGE)
 BORDER_VARIANCE = wp.constant(64.0 / 49.0)
 """Ratio of the variances of a mean over BLOCK² samples and over a block, whose border counts half but is shared with its neighbours."""
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
+
+
+@wp.func
+def any_due(due: wp.array2d[wp.uint8], grid: ImageGrid, view: int, tile: int, reach: int) -> bool:
+    """Whether new ratios are due in any tile with coarse pixels within `reach` of those of a tile."""
+    row, column = (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH
+    bottom = wp.min(row + TILE_HEIGHT - 1 + reach, grid.height - 1) // TILE_HEIGHT
+    right = wp.min(column + TILE_WIDTH - 1 + reach, grid.width - 1) // TILE_WIDTH
+    for r in range(wp.max(row - reach, 0) // TILE_HEIGHT, bottom + 1):
+        for c in range(wp.max(column - reach, 0) // TILE_WIDTH, right + 1):
+            if due[view, r * grid.tile_columns + c] != wp.uint8(0):
+                return True
+    return False
+
+
+@wp.kernel
+def plan_stages_kernel(grid: ImageGrid, due: wp.array2d[wp.uint8], stages_out: wp.array2d[wp.uint8]):
+    """Plan the stages of each tile of coarse pixels, so that all that the ratios of `due` tiles depend on is computed.
+
+    Launched over view, tile of coarse pixels.
+    """
+    view, tile = wp.tid()
+    stages = int(due[view, tile]) * RATIO_STAGE
+    if any_due(due, grid, view, tile, 1):
+        stages = stages | CHOICE_STAGE
+    if any_due(due, grid, view, tile, 1 - BLOCKS_START):
+        stages = stages | BLOCK_STAGE
+    if any_due(due, grid, view, tile, 1 - BLOCKS_START + HALF_BLOCK):
+        stages = stages | LIGHT_STAGE
+    stages_out[view, tile] = wp.uint8(stages)
+
+
+@wp.func
+def skips(grid: ImageGrid, stages: wp.array2d[wp.uint8], stage: int, view: int, row: int, column: int) -> bool:
+    """Whether a coarse pixel lies outside the image, or its tile does not need a stage."""
+    return not in_image(grid, row, column) or (int(stages[view, tile_of(grid, row, column)]) & stage) == 0
 
 
 @wp.func
@@ -164,14 +213,22 @@ def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, ro
 
 
 @kernel_of_views(cuda_max_registers=FILTER_REGISTERS)
-def filter_blocks_kernel(coarse: CoarseGrid, guide: Guide, coarse_light: CoarseLight, views: AnyViews, first: int, blocks_out: CoarseLight):
+def filter_blocks_kernel(
+    coarse: CoarseGrid,
+    guide: Guide,
+    coarse_light: CoarseLight,
+    views: AnyViews,
+    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    first: int,
+    blocks_out: CoarseLight,
+):
     """Narrow filter: bilateral mean over the block of 4 x 4 around each coarse pixel, and the variance of the mean visibility ratio.
 
     The variance of a mean is that of its samples over their effective number, (Σ w)² / Σ w². All members of `blocks_out` are written.
     Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if not in_image(coarse.grid, row, column):
+    if skips(coarse.grid, stages, BLOCK_STAGE, view, row, column):
         return
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
@@ -261,7 +318,14 @@ def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.v
 
 @kernel_of_views(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
-    coarse: CoarseGrid, guide: Guide, blocks: CoarseLight, views: AnyViews, variance_scale: float, first: int, ratios_out: RatioImages
+    coarse: CoarseGrid,
+    guide: Guide,
+    blocks: CoarseLight,
+    views: AnyViews,
+    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    variance_scale: float,
+    first: int,
+    ratios_out: RatioImages,
 ):
     """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
 
@@ -270,7 +334,7 @@ def choose_widths_kernel(
     Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if not in_image(coarse.grid, row, column):
+    if skips(coarse.grid, stages, CHOICE_STAGE, view, row, column):
         return
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
@@ -313,19 +377,30 @@ def choose_widths_kernel(
 
 
 @kernel_of_views
-def smooth_ratios_kernel(coarse: CoarseGrid, guide: Guide, ratios: RatioImages, views: AnyViews, first: int, ratios_out: RatioImages):
-    """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths. All members of `ratios_out` are written.
+def smooth_ratios_kernel(
+    coarse: CoarseGrid,
+    guide: Guide,
+    ratios: RatioImages,
+    views: AnyViews,
+    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    history_row: wp.array[int],  # (view)
+    first: int,
+    ratios_out: RatioImages,
+):
+    """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths.
 
-    Launched over view, coarse pixel (tile order, from flat index `first` on).
+    `ratios_out` keeps those of the frame before in tiles without RATIO_STAGE; its first dimension is that of the light history. Launched
+    over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if not in_image(coarse.grid, row, column):
+    if skips(coarse.grid, stages, RATIO_STAGE, view, row, column):
         return
+    history = history_row[view]
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
     segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
-        ratios_out.record[view, row, column] = RatioRecord()
+        ratios_out.record[history, row, column] = RatioRecord()
         return
     plane = coarse_plane(coarse, surface, views.cameras, view, row, column)
     sums = Ratios()
@@ -340,6 +415,6 @@ def smooth_ratios_kernel(coarse: CoarseGrid, guide: Guide, ratios: RatioImages, 
                     sums = add_ratios(sums, ratios.record[view, r, c], weight)
                     total += weight
     scale = 1.0 / total
-    ratios_out.record[view, row, column] = pack_ratios(
+    ratios_out.record[history, row, column] = pack_ratios(
         scale * sums.diffuse, scale * sums.specular, scale * sums.indirect, surface_depth(surface), segment
     )

@@ -17,7 +17,7 @@ from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
-LIGHT_CHANGE = wp.constant(0.05)
+LIGHT_CHANGE = wp.constant(0.15)
 """Temporal lag that an average may have, as a fraction of the light; see `lag_frames`."""
 MAX_TRAVEL = wp.constant(2.0)
 """Displacement of a body [sizes] from which on it changes no more of a point's light: it has uncovered all that it covered, and covers as
@@ -29,10 +29,10 @@ MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
 MIN_SKIP_PATHS = wp.constant(2)
 """Shortest history [paths] that is updated in only some of the frames."""
-MAX_PERIOD_BITS = wp.constant(3)
+MAX_PERIOD_BITS = wp.constant(5)
 """Binary logarithm of the longest update period [frames]."""
-BAYER_BITS = wp.constant(4)
-"""Bits of a threshold of the 4 x 4 Bayer matrix."""
+PHASE_STEP = wp.constant(11)
+"""Difference of the phases of the update periods of two cameras, or of two episodes [frames]; odd, so that views are updated in turn."""
 PERIOD_PATHS = wp.constant(64)
 """Length of the sample sequence of each update period [paths], after which it repeats: twice the default maximum history length."""
 NEVER = wp.constant(-2)
@@ -68,15 +68,18 @@ class LightHistory:
 
 
 @kernel_of_views
-def advance_history_kernel(snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies):
+def advance_history_kernel(
+    snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies, history_row_out: wp.array[int]
+):
     """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
-    frame's.
+    frame's. `history_row_out` (view) receives the history's rows.
 
     Launched over view.
     """
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.slot[view]
+    history_row_out[view] = slot
     moving_out.holds[view] = int(
         history_inout.episode[slot] == snapshot.episode[world] and history_inout.frame[slot] + 1 == snapshot.frame[world]
     )
@@ -183,15 +186,19 @@ def path_number(frame: int, bits: int) -> int:
 
 
 @wp.func
-def update_frame(row: int, column: int, bits: int) -> int:
-    """Frame of the update period, 0 to 2^bits - 1, in which a coarse pixel traces its path: 4 x 4 ordered dithering (Bayer, 1973).
+def phase_frame(history: LightHistory, slot: int) -> int:
+    """Frame of a row of the history, counted from the phase of its camera and episode (`is_due`)."""
+    return history.frame[slot] + PHASE_STEP * (history.episode[slot] + slot % history.cameras)
 
-    Coarse pixels that trace in the same frame are spread evenly. The pattern repeats every LANE_STRIDE coarse pixels, so that threads of
-    a warp with the same update period trace in the same frame.
+
+@wp.func
+def is_due(frame: int, bits: int) -> bool:
+    """Whether coarse pixels with update periods of 2^bits frames trace their path in a frame of `phase_frame`.
+
+    All of a view do so in the same frame, and those of longer periods together with those of shorter ones: so in most frames much of a
+    picture keeps its light, and whole tiles of it their bits (`dirty_tiles`).
     """
-    other = row ^ column
-    threshold = ((other & 1) << 3) | ((row & 1) << 2) | (other & 2) | ((row & 2) >> 1)
-    return threshold >> (BAYER_BITS - bits)
+    return frame % (1 << bits) == 0
 
 
 @wp.func

@@ -5,14 +5,13 @@ The light of resting surfaces is reused (`history`, `shadows`) where none of the
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, fixture_mesh
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, body_of, fixture_mesh
 from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
 
-REST_DISPLACEMENT = wp.constant(2.5e-4)
-"""Rest threshold: a body that displaces none of its points by more in a frame is taken not to change the light of others [m]."""
 MAX_DRIFT = wp.constant(4.0e-3)
 """Maximum displacement of a body over the frames that its own histories average [m]: at most two coarse pixels in full HD."""
 MAX_FRAMES = wp.constant(1 << 20)
@@ -25,6 +24,8 @@ class MovingBodies:
 
     holds: wp.array[int]
     """(view): 1: the history contains the previous frame of the same episode."""
+    moved: wp.array2d[wp.uint8]
+    """(view, body): 1: the body moved, appeared or disappeared; 0: its mesh and the bits of its pose are those of the previous frame."""
     drift_frames: wp.array2d[int]
     """(view, body): maximum history length on the body itself, MAX_DRIFT over its displacement in a frame."""
     count: wp.array[int]
@@ -44,6 +45,14 @@ class MovingBodies:
 
 
 @wp.func
+def rests(moving: MovingBodies, view: int, segment: int, instances: int) -> bool:
+    """Whether what a segmentation id stands for has not moved since the previous frame; nothing and the table never do."""
+    if segment == Segment.NOTHING or segment == Segment.TABLE:
+        return True
+    return moving.moved[view, body_of(segment, instances)] == wp.uint8(0)
+
+
+@wp.func
 def mean_projected_area(size: wp.vec3) -> float:
     """Mean area of the projections of a box along all directions: a quarter of its surface (Cauchy) [m²]."""
     return 0.5 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
@@ -59,10 +68,17 @@ def max_displacement(now: wp.transformf, then: wp.transformf, center: wp.vec3, r
 
 @wp.func
 def displacement_fraction(meshes: Meshes, mesh: int, displacement: float) -> float:
-    """Displacement of a body's points [m] as a fraction of its size, at most 1; 0: it rests."""
-    if displacement <= REST_DISPLACEMENT:
-        return 0.0
+    """Displacement of a body's points [m] as a fraction of its size, at most 1."""
     return wp.min(displacement / wp.sqrt(mean_projected_area(meshes.upper[mesh] - meshes.lower[mesh])), 1.0)
+
+
+@wp.func
+def same_pose(now: wp.transformf, then: wp.transformf) -> bool:
+    """Whether all numbers of two poses are equal."""
+    for i in range(7):
+        if now[i] != then[i]:
+            return False
+    return True
 
 
 @wp.func
@@ -153,13 +169,16 @@ def find_moving_bodies_kernel(
             now = snapshot.fixture_pose[world, fixture]
             then = snapshot.last_fixture_pose[world, fixture]
         change = float(mesh != last_mesh)
+        moved = mesh != last_mesh
         drift_frames = wp.where(mesh != last_mesh, 0, MAX_FRAMES)
-        if mesh == last_mesh and mesh >= 0:
+        if mesh == last_mesh and mesh >= 0 and not same_pose(now, then):
+            moved = True
             displacement = max_displacement(now, then, meshes.center[mesh], meshes.radius[mesh])
             change = displacement_fraction(meshes, mesh, displacement)
             drift_frames = int(MAX_DRIFT / wp.max(displacement, MAX_DRIFT / float(MAX_FRAMES)))
         moving_inout.drift_frames[view, body] = drift_frames
-        if change > 0.0:
+        moving_inout.moved[view, body] = wp.uint8(moved)
+        if moved:
             list_moving_body(meshes, moving_inout, view, count, mesh, last_mesh, now, then, change)
             count += 1
     moving_inout.count[view] = count

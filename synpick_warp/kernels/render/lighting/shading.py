@@ -11,6 +11,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
+from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.environment import (
     Lights,
     environment_radiance,
@@ -36,7 +37,7 @@ from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
 from synpick_warp.kernels.render.visibility.camera import hit_position, in_image, loop_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS, AnyShot, ShadedImage, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
@@ -66,6 +67,8 @@ class DenoisedLight:
 
     coarse: CoarseGrid
     ratios: RatioImages
+    history_row: wp.array[int]
+    """(view): row of a view's ratios."""
     shadow_grid: CoarseGrid
     shadows: LampShadows
 
@@ -126,7 +129,7 @@ def gather_light(
     result = PixelLight()
     if scene.lights.lamps[sky.light] > 0:
         result.lamps = upsample_shadows(denoised.shadows, image.radiance, denoised.shadow_grid, view, row, column, plane)
-    result.ratios = upsample_ratios(denoised.ratios, denoised.coarse, view, row, column, plane)
+    result.ratios = upsample_ratios(denoised.ratios, denoised.coarse, denoised.history_row[view], row, column, plane)
     result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
     return result
 
@@ -234,7 +237,7 @@ def kernel_of_shading(name: str, samples_per_axis: int, registers: int) -> Any:
     def shade_pixels_kernel(scene: AnyScene, shot: AnyShot, denoised: DenoisedLight, first: int, image_inout: ShadedImage):
         """`shade_pixel` of each pixel."""
         view, row, column = tile_pixel(shot.grid, wp.tid() + first)
-        if in_image(shot.grid, row, column):
+        if in_image(shot.grid, row, column) and needs(shot.grid, image_inout.passes, SHADE_PASS, view, row, column):
             image_inout.radiance[view, row, column] = shade_pixel(
                 scene, shot, denoised, image_inout, view, row, column, wp.static(samples_per_axis)
             )

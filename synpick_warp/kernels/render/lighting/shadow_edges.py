@@ -8,14 +8,16 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.environment import lamp_direction, unit_heading
+from synpick_warp.kernels.render.lighting.dirty_tiles import needs
+from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, unit_heading
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
-from synpick_warp.kernels.render.lighting.shadows import is_shadowed, point_direction, visible_normal
+from synpick_warp.kernels.render.lighting.shadows import is_shadowed, may_change, point_direction, visible_normal
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, ShadedImage, read_hit
+from synpick_warp.kernels.render.visibility.gbuffer import EDGE_PASS, SHADE_PASS, AnyShot, Meshes, ShadedImage, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
@@ -91,19 +93,43 @@ def pixel_plane(meshes: Meshes, shot: AnyShot, view: int, row: int, column: int)
     return tangent_plane(cameras, cameras.intrinsics[view], view, row, column, segment, depth, local)
 
 
+@wp.func
+def edges_may_change(
+    lights: Lights, coarse: CoarseGrid, shot: AnyShot, moving: MovingBodies, steep: wp.uint32, view: int, row: int, column: int
+) -> bool:
+    """Whether a moving body may change a ray of a pixel to the lamps whose steepness, packed in `steep`, is above 0."""
+    if moving.count[view] == 0:
+        return False
+    cameras, world = shot.views.cameras, shot.views.world[view]
+    which, heading = shot.snapshot.light[world], unit_heading(shot.snapshot.light_yaw[world])
+    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
+    position = hit_position(cameras, view, ray, shot.gbuffer.depth[view, row, column])
+    for lamp in range(lights.lamps[which]):
+        if (steep >> wp.uint32(STEEPNESS_BITS * lamp)) & wp.uint32(STEEPNESS_LEVELS) != wp.uint32(0):
+            for number in range(coarse.rays):
+                direction = point_direction(lights, which, heading, lamp, coarse.rays, number, row, column)
+                if may_change(moving, view, position, direction):
+                    return True
+    return False
+
+
 @kernel_of_views
 def list_edge_pixels_kernel(
     meshes: Meshes,
     coarse: CoarseGrid,
+    lights: Lights,
     shot: AnyShot,
+    moving: MovingBodies,
     threads: int,
     first: int,
     shadows_inout: LampShadows,
     lists_inout: EdgeLists,
+    dirty_inout: wp.array2d[wp.uint8],  # (view, tile)
 ):
     """Stream compaction: `pixel` receives the pixels at which a lamp's shadow is steep, in any order; `count` their number at PIXELS.
 
-    The steepness at these pixels is written to `edge`, which must be 0. Launched over view, chunk, thread (flat, from `first` on): the host
+    The steepness at these pixels is written to `edge`, which must be 0. Their tile becomes dirty if a moving body may change their rays.
+    Launched over view, chunk, thread (flat, from `first` on): the host
     does not read the counts, so a fixed number of `threads` strides over the listed pixels of the shadow grid of each chunk.
     """
     view, chunk, start = list_place(lists_inout, wp.tid() + first, threads)
@@ -118,6 +144,10 @@ def list_edge_pixels_kernel(
                 steepness = all_steepness(find_shadow_taps(shadows_inout, coarse, view, row, column, plane))
                 if steepness != wp.uint32(0):
                     shadows_inout.edge[view, row, column] = steepness
+                    tile = tile_of(shot.grid, row, column)
+                    if dirty_inout[view, tile] == wp.uint8(0):
+                        if edges_may_change(lights, coarse, shot, moving, steepness, view, row, column):
+                            dirty_inout[view, tile] = wp.uint8(1)
                     rank = wp.atomic_add(lists_inout.count, view, chunk, PIXELS, 1)
                     lists_inout.pixel[view, chunk, rank] = wp.uint16(index)
 
@@ -147,7 +177,14 @@ def trace_pixel_edges(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_edges_kernel(
-    scene: PathScene, coarse: CoarseGrid, shot: AnyShot, lists: EdgeLists, threads: int, first: int, shadows_inout: LampShadows
+    scene: PathScene,
+    coarse: CoarseGrid,
+    shot: AnyShot,
+    lists: EdgeLists,
+    passes: wp.array2d[wp.uint8],  # (view, tile)
+    threads: int,
+    first: int,
+    shadows_inout: LampShadows,
 ):
     """Adaptive sampling: trace shadow rays from each listed pixel to each lamp whose shadow is steep; the results replace the steepness in
     `edge`.
@@ -164,6 +201,8 @@ def trace_shadow_edges_kernel(
     heading = unit_heading(shot.snapshot.light_yaw[world])
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
+        if not needs(shot.grid, passes, EDGE_PASS, view, row, column):
+            continue
         steep = shadows_inout.edge[view, row, column]
         shadows_inout.edge[view, row, column] = trace_pixel_edges(scene, coarse, shot, which, heading, steep, view, row, column)
 
@@ -190,6 +229,8 @@ def filter_shadow_edges_kernel(
     lamps = scene.lights.lamps[shot.snapshot.light[shot.views.world[view]]]
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
+        if not needs(shot.grid, image_out.passes, SHADE_PASS, view, row, column):
+            continue
         plane = pixel_plane(scene.meshes, shot, view, row, column)
         fractions = filter_edge(shadows, coarse, shot.gbuffer, lamps, view, row, column, plane)
         image_out.radiance[view, row, column] = pack_fractions(fractions)

@@ -2,7 +2,7 @@
 
 The sample points of neighbouring pixels are stratified, so that a filter sees the whole lamp (interleaved sampling; Keller and Heidrich,
 2001): `shadow_filter` filters wide penumbrae, and `shadow_edges` traces further rays in narrow ones. On a resting surface a ray is traced
-again only if a moving body may block it now, or may have blocked it in the previous frame; and all of them every REFRESH_FRAMES frames.
+again only if a moving body may block it now, or may have blocked it in the previous frame; so its result is that of tracing all.
 """
 
 import warp as wp
@@ -11,11 +11,11 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, middle_pixel, morton_index, pack_normal
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, rotate_heading, unit_heading
 from synpick_warp.kernels.render.lighting.history import LightHistory
-from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, rests
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, camera_ray, hit_position, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, body_of, face_normal, read_hit
+from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, face_normal, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
@@ -32,14 +32,6 @@ LAMP_POINTS = wp.constant(int(LAMP_STRATA) << int(POINT_BITS))
 """Number of a lamp's sample points; the low bits of a point's index are that of its part."""
 STRATA_PERIOD = wp.constant(4)
 """Period of the parts of a lamp to which pixels send rays [pixels of the shadow grid, or pixels]."""
-REFRESH_FRAMES = wp.constant(16)
-"""Period in which all shadow rays are traced again [frames]: bodies that move by less than `moving_bodies.REST_DISPLACEMENT` a frame change
-shadows, too."""
-CALM_FRAMES = wp.constant(64)
-"""Minimum of `MovingBodies.drift_frames` of a surface whose shadows are reused: it then moves by at most MAX_DRIFT / 4 in REFRESH_FRAMES
-frames, half the width of a coarse pixel at full HD."""
-TILE_SHIFT = wp.constant(3)
-"""A row of tiles refreshes its shadow rays this many frames before the row above."""
 MIN_DIRECTION = wp.constant(1.0e-9)
 """Components of directions with a smaller magnitude are replaced by this before they divide."""
 SPREAD_BITS = wp.constant(wp.uint64(0x8040201008040201))
@@ -169,24 +161,6 @@ def may_change(moving: MovingBodies, view: int, origin: wp.vec3, direction: wp.v
 
 
 @wp.func
-def is_refreshed(row: int, column: int, frame: int) -> bool:
-    """Whether a pixel of the shadow grid traces all its shadow rays in this frame, as in one of REFRESH_FRAMES frames.
-
-    The frame is chosen by tile, so that all threads of a warp refresh together.
-    """
-    return (TILE_SHIFT * (row // TILE_HEIGHT) + column // TILE_WIDTH + frame) % REFRESH_FRAMES == 0
-
-
-@wp.func
-def is_calm(moving: MovingBodies, view: int, segment: int, instances: int) -> bool:
-    """Whether the visible body moved by at most MAX_DRIFT / CALM_FRAMES in this frame, so that shadows on it may be reused; the table is
-    always calm."""
-    if segment == Segment.TABLE:
-        return True
-    return moving.drift_frames[view, body_of(segment, instances)] >= CALM_FRAMES
-
-
-@wp.func
 def faces_lamp(lights: Lights, which: int, heading: wp.vec2, ray: int, normal: wp.vec3) -> bool:
     """Whether the center of a shadow ray's lamp lies before a surface of unit `normal`."""
     return wp.dot(normal, lamp_direction(lights, which, ray // lights.lamp_rays[which], heading)) > 0.0
@@ -214,13 +188,12 @@ def last_rays(
 ) -> tuple[bool, int]:
     """Temporal reuse: (True, bits of a pixel's shadow rays in the previous frame) if these may be reused, else (False, 0).
 
-    They may if the history contains that frame, the pixel showed the same body, the body is calm (`is_calm`), and the pixel is not
-    refreshed in this frame (`is_refreshed`). `slot`: row of the history.
+    They may if the history contains that frame, and the pixel showed the same body, which `rests`. `slot`: row of the history.
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return False, 0
     last = int(history.shadows[slot, row, column])
-    if last >> 8 != segment or is_refreshed(row, column, history.frame[slot]) or not is_calm(moving, view, segment, shot.views.instances):
+    if last >> 8 != segment or not rests(moving, view, segment, shot.views.instances):
         return False, 0
     return True, last & ALL_RAYS
 
@@ -248,8 +221,10 @@ def trace_shadow_rays_kernel(
     first: int,
     history_inout: LightHistory,
     rays_out: ShadowRays,
+    shadowed_out: wp.array2d[wp.uint8],  # (view, shadow_tile)
 ):
     """Shadow rays from the middle pixels of the shadow grid, traced or reused from the last frame; writes `rays_out` and the history.
+    `shadowed_out`, which must be 0, becomes 1 in tiles where their results or surfaces differ from the last frame's.
 
     Nothing is written under a map without lamps. Rays to lamps behind the surface count as unblocked. Launched over view, grid pixel.
     """
@@ -267,6 +242,7 @@ def trace_shadow_rays_kernel(
     depth = gbuffer.depth[view, pixel[0], pixel[1]]
     slot = world * history_inout.cameras + shot.views.slot[view]
     free, packed_normal = int(ALL_RAYS), int(0)
+    known, last = last_rays(history_inout, moving, shot, view, slot, row, column, segment)
     if segment != Segment.NOTHING:
         camera_direction = camera_ray(cameras, view, pixel[0], pixel[1], wp.vec2(0.0, 0.0))
         position = hit_position(cameras, view, camera_direction, depth)
@@ -274,7 +250,6 @@ def trace_shadow_rays_kernel(
         hit = read_hit(gbuffer, view, pixel[0], pixel[1])
         normal = visible_normal(scene.meshes, shot, view, hit, cameras.to_world[view] * camera_direction)
         packed_normal = pack_normal(wp.transpose(cameras.to_world[view]) * normal)
-        known, last = last_rays(history_inout, moving, shot, view, slot, row, column, segment)
         traced = int(ALL_RAYS)
         if known:
             free = last
@@ -287,6 +262,8 @@ def trace_shadow_rays_kernel(
                     direction = ray_direction(lights, which, heading, ray, row, column)
                     if is_shadowed(scene, shot, view, position, normal, direction):
                         free -= bit
+    if not known or free != last:
+        shadowed_out[view, tile_of(coarse.grid, row, column)] = wp.uint8(1)
     if history_inout.max_paths > 0:
         history_inout.shadows[slot, row, column] = pack_last(segment, free)
     rays_out.packed[view, row, column] = pack_rays(free, depth, segment, packed_normal)

@@ -28,7 +28,7 @@ class RatioImages:
     """Denoised visibility ratios and indirect light of the coarse pixels, with depth and segmentation id. Scratch."""
 
     record: wp.array3d[RatioRecord]
-    """(view, cell_row, cell_column): 0, with the segmentation id NOTHING, where no surface is visible."""
+    """(view, or row of the light history, cell_row, cell_column): 0, with the segmentation id NOTHING, where no surface is visible."""
 
 
 @wp.struct
@@ -99,11 +99,11 @@ def unoccluded_ratios() -> Ratios:
 
 
 @wp.func
-def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
+def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, history: int, row: int, column: int, plane: Plane) -> Ratios:
     """Joint bilateral upsampling: ratios and indirect light at a pixel from those of the four nearest coarse pixels on its surface.
 
     If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
-    surfaces. `plane` is the pixel's tangent plane. Without coarse pixels all light is unoccluded.
+    surfaces. `history` is the row of the ratios, `plane` the pixel's tangent plane. Without coarse pixels all light is unoccluded.
     """
     if coarse.size == 0:
         return unoccluded_ratios()
@@ -119,7 +119,7 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
             c = clamp_index(left + j, coarse.grid.width)
-            record = ratios.record[view, r, c]
+            record = ratios.record[history, r, c]
             surface_weight = upsampling_weight(record, coarse, plane, row, column, r, c)
             # Background has weight 0 and holds zeros: adding it costs less than a branch.
             weight = surface_weight * (vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT)
@@ -133,7 +133,7 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int
             r = clamp_index(top + i, coarse.grid.height)
             for j in range(-ring, 2 + ring):
                 c = clamp_index(left + j, coarse.grid.width)
-                record = ratios.record[view, r, c]
+                record = ratios.record[history, r, c]
                 if upsampling_weight(record, coarse, plane, row, column, r, c) == 1.0:
                     result = add_ratios(result, record, 1.0)
                     total += 1.0

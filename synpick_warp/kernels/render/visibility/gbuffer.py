@@ -150,6 +150,11 @@ AnyShot = Any
 VARIANTS["shot"] = ShotData, LensShot
 
 
+COLOR_PASS, SHADE_PASS, EDGE_PASS = wp.constant(1), wp.constant(2), wp.constant(4)
+"""Bits of `ShadedImage.passes`: the tile's colours, its radiance, and rays at its steep shadow edges are computed anew."""
+ALL_PASSES = int(COLOR_PASS) | int(SHADE_PASS) | int(EDGE_PASS)
+
+
 @wp.struct
 class ShadedImage:
     """Linear radiance of a batch of views before post-processing, and for each pixel a resolve code: 0, it keeps its radiance, else packed
@@ -161,6 +166,9 @@ class ShadedImage:
     resolve: wp.array3d[wp.uint32]
     """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
     SOURCE_BITS that select the pixel whose radiance it takes, see `images.antialias.source_offset`."""
+    passes: wp.array2d[wp.uint8]
+    """(view, tile): what is computed anew in a tile: bits as COLOR_PASS. Elsewhere the image is undefined, and colours are those of the
+    frame before."""
     samples: int
     """Number of coverage samples per anti-aliased pixel: 4, 8 or 16, distributed equally over its quadrants."""
 

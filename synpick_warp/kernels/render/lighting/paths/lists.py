@@ -17,8 +17,8 @@ FRESH, AGED = wp.constant(0), wp.constant(1)
 """Kinds of listed coarse pixels: without a valid history (`PathRules.samples` paths each), and with one (one path each)."""
 KNOWN_BITS = wp.constant(8)
 """Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
-_PERIOD_BITS = wp.constant(2)
-"""Bits of an entry for `period_bits`, which is at most 3."""
+_PERIOD_BITS = wp.constant(3)
+"""Bits of an entry for `period_bits`, which is at most 7."""
 
 
 @wp.struct
@@ -27,6 +27,8 @@ class PathLists:
 
     count: wp.array3d[int]
     """(view, region, path_kind): number of FRESH and of AGED coarse pixels."""
+    listed: wp.array3d[wp.uint8]
+    """(view, cell_row, cell_column): 1: the coarse pixel is in a list."""
     entry: wp.array3d[int]
     """(view, region, rank): see `pack_entry`. FRESH ones from the front, AGED ones from the back, so that most warps hold one kind."""
 

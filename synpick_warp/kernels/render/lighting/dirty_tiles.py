@@ -1,0 +1,157 @@
+"""Dirty tiles: which tiles of an image may differ from the frame before, by what bodies, light and shadows there did (damage tracking).
+
+A tile's pixels are functions of the bodies whose boxes its rays may hit, of the denoised light of the coarse pixels around, and of the
+shadow rays around. If none of these has changed since the previous frame, down to the bits, the tile keeps its colours of that frame.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
+from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
+from synpick_warp.kernels.render.lighting.shadow_filter import FILTER_RADIUS, STEEPNESS_DISTANCE
+from synpick_warp.kernels.render.lighting.upsampling import RING
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index, tile_of
+from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, EDGE_PASS, MASK_BITS, SHADE_PASS, AnyShot, ViewBodies
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
+
+wp.set_module_options({"enable_backward": False})
+
+LIGHT_REACH = wp.constant(1 + int(RING))
+"""Largest distance of the coarse pixels whose light a pixel interpolates [coarse pixels]."""
+SHADOW_REACH = wp.constant(1 + int(STEEPNESS_DISTANCE) + int(FILTER_RADIUS))
+"""Largest distance of the shadow rays that a pixel's shadows depend on [pixels of the shadow grid]: it reads its neighbours and their
+marks of edges, which depend on the steepness, and that on filtered rays."""
+
+
+@wp.struct
+class DirtyTiles:
+    """Flags of tiles that may differ from the previous frame, and what each tile showed in it."""
+
+    history_row: wp.array[int]
+    """(view): row of the light history; the view itself without histories."""
+    stages: wp.array2d[wp.uint8]
+    """(view, cell_tile): stages of the denoiser that the tile needs, bits as `denoise.RATIO_STAGE`."""
+    due: wp.array2d[wp.uint8]
+    """(view, cell_tile): 1: the denoised light of the tile's coarse pixels is new."""
+    shadowed: wp.array2d[wp.uint8]
+    """(view, shadow_tile): 1: a shadow ray of the tile's pixels of the shadow grid changed."""
+    dirty: wp.array2d[wp.uint8]
+    """(view, tile): 1: a pixel of the tile may have changed."""
+    bodies: wp.array3d[wp.uint64]
+    """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
+
+
+@wp.func
+def tile_word(bodies: ViewBodies, view: int, tile: int, word: int) -> wp.uint64:
+    """Word of the bit set, by body, of the bodies that rays through a tile can hit; `ViewBodies.body_mask` has them by place in `order`."""
+    result = wp.uint64(0)
+    for source in range(bodies.body_mask.shape[2]):
+        left = bodies.body_mask[view, tile, source]
+        while left != wp.uint64(0):
+            others = left & (left - wp.uint64(1))
+            # The number of bits below the lowest one that is set.
+            rank = source * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
+            body = bodies.order[view, rank]
+            if body // MASK_BITS == word:
+                result = result | (wp.uint64(1) << wp.uint64(body % MASK_BITS))
+            left = others
+    return result
+
+
+@wp.func
+def any_moved(moving: MovingBodies, view: int, word: int, members: wp.uint64) -> bool:
+    """Whether any body of word `word` of a bit set moved since the previous frame."""
+    left = members
+    while left != wp.uint64(0):
+        others = left & (left - wp.uint64(1))
+        body = word * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
+        if moving.moved[view, body] != wp.uint8(0):
+            return True
+        left = others
+    return False
+
+
+@wp.func
+def any_near(flags: wp.array2d[wp.uint8], coarse: CoarseGrid, view: int, row: int, column: int, reach: int) -> bool:
+    """Whether any tile of a coarse grid is flagged that has pixels within `reach` of those below an image tile at (row, column)."""
+    last_row, last_column = coarse.grid.height - 1, coarse.grid.width - 1
+    top = wp.max(row // coarse.size - reach, 0) // TILE_HEIGHT
+    left = wp.max(column // coarse.size - reach, 0) // TILE_WIDTH
+    bottom = wp.min((row + TILE_HEIGHT - 1) // coarse.size + reach, last_row) // TILE_HEIGHT
+    right = wp.min((column + TILE_WIDTH - 1) // coarse.size + reach, last_column) // TILE_WIDTH
+    for r in range(top, bottom + 1):
+        for c in range(left, right + 1):
+            if flags[view, r * coarse.grid.tile_columns + c] != wp.uint8(0):
+                return True
+    return False
+
+
+@kernel_of_views
+def mark_dirty_tiles_kernel(
+    coarse: CoarseGrid,
+    shadow_grid: CoarseGrid,
+    shot: AnyShot,
+    moving: MovingBodies,
+    tiles_inout: DirtyTiles,
+):
+    """Mark the tiles of an image whose bodies, light or shadows changed since the previous frame; all if the history does not contain
+    that frame. Writes `dirty` and `bodies`. Launched over view, tile.
+    """
+    view, tile = wp.tid()
+    history = tiles_inout.history_row[view]
+    grid = shot.grid
+    row, column = (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH
+    dirty = moving.holds[view] == 0
+    for word in range(tiles_inout.bodies.shape[2]):
+        members = tile_word(shot.bodies, view, tile, word)
+        if members != tiles_inout.bodies[history, tile, word]:
+            dirty = True
+            tiles_inout.bodies[history, tile, word] = members
+        elif not dirty:
+            dirty = any_moved(moving, view, word, members)
+    if not dirty:
+        dirty = any_near(tiles_inout.due, coarse, view, row, column, LIGHT_REACH)
+    if not dirty:
+        dirty = any_near(tiles_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
+    tiles_inout.dirty[view, tile] = wp.uint8(dirty)
+
+
+@wp.func
+def distance_to_dirty(grid: ImageGrid, dirty: wp.array2d[wp.uint8], view: int, tile: int, most: int) -> int:
+    """Chebyshev distance of a tile from the nearest dirty one [tiles], `most` + 1 beyond `most`."""
+    row, column = tile // grid.tile_columns, tile % grid.tile_columns
+    last_row = (grid.height - 1) // TILE_HEIGHT
+    nearest = most + 1
+    for down in range(-most, most + 1):
+        r = clamp_index(row + down, last_row + 1)
+        for right in range(-most, most + 1):
+            c = clamp_index(column + right, grid.tile_columns)
+            if dirty[view, r * grid.tile_columns + c] != wp.uint8(0):
+                nearest = wp.min(nearest, wp.max(wp.abs(r - row), wp.abs(c - column)))
+    return nearest
+
+
+@wp.kernel
+def plan_passes_kernel(grid: ImageGrid, dirty: wp.array2d[wp.uint8], passes_out: wp.array2d[wp.uint8]):
+    """Plan the passes of each tile, by its distance from the dirty ones.
+
+    Colours change in dirty tiles and their neighbours, since anti-aliasing and the filter of shadow edges read up to 4 pixels around. Their
+    colours are computed from the radiance of the next ring of tiles, too, and that from the shadow edges of one more ring. Launched over
+    view, tile.
+    """
+    view, tile = wp.tid()
+    distance = distance_to_dirty(grid, dirty, view, tile, 3)
+    passes = int(0)
+    if distance <= 1:
+        passes = passes | COLOR_PASS
+    if distance <= 2:
+        passes = passes | SHADE_PASS
+    if distance <= 3:
+        passes = passes | EDGE_PASS
+    passes_out[view, tile] = wp.uint8(passes)
+
+
+@wp.func
+def needs(grid: ImageGrid, passes: wp.array2d[wp.uint8], which: int, view: int, row: int, column: int) -> bool:
+    """Whether the tile of a pixel needs a pass of `ShadedImage.passes` in this frame."""
+    return (int(passes[view, tile_of(grid, row, column)]) & which) != 0

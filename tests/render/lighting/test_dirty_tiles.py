@@ -1,0 +1,111 @@
+"""Tiles that are kept from frame to frame: pictures have the bytes of those that are shaded whole, whatever moves, in any batches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.configs.schema import Render
+from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS
+from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.denoised import keeps_images
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import make_views
+from tests.render.lighting.test_history import LIGHT, link
+from tests.render.lighting.test_shadows import LAMPS
+from tests.worlds.shapes import UPRIGHT, ball, box, camera, entry, sheet
+from tests.worlds.toy_scene import ToyScene, build_scene, snapshot, with_render
+
+FRAMES = 24
+CAMERAS = (camera(90, 61, 200.0, (0.0, 0.0, 1.2)), camera(90, 61, 240.0, (0.05, 0.0, 1.5)))
+ENTRIES = [entry(sheet(0.5, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.03, 3)), entry(box(0.08, 0.01, 0.03))]
+ROOM = 6
+
+
+def scripts(seed: int) -> list[ToyScene]:
+    """Two worlds over the frames: bodies rest, creep, jump, turn, appear and disappear at random."""
+    random = np.random.default_rng(seed)
+    worlds = [
+        [[0, (0.0, 0.0, 0.0, *UPRIGHT)]]
+        + [[int(random.integers(1, 4)), (*random.uniform(-0.15, 0.15, 2), random.uniform(0.03, 0.15), *UPRIGHT)] for _ in range(4)]
+        for _ in range(2)
+    ]
+    frames = []
+    for _ in range(FRAMES):
+        for world in worlds:
+            kind, which = random.integers(0, 8), int(random.integers(1, 5))
+            position = np.array(world[which][1][:3])
+            if kind < 3:
+                position += random.normal(0.0, (1e-5, 1e-3, 3e-2)[kind], 3)
+            turn = random.uniform(0.0, 1.0) if kind == 3 else 0.0
+            pose = (*position, *UPRIGHT) if kind != 3 else (*position, 0.0, 0.0, np.sin(turn), np.cos(turn))
+            if kind < 4:
+                world[which][1] = pose
+            elif kind == 4:
+                world[which][0] = int(random.integers(1, 4)) if world[which][0] < 0 else -1
+        placed = [[(entry_index, pose) for entry_index, pose in world] for world in worlds]
+        frames.append(placed)
+    return frames  # type: ignore[return-value]
+
+
+def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[list[np.ndarray], list[float]]:
+    """Render the views of all frames, in random order and batches: colours (world, camera, row, column, 3) of each, and the share of tiles
+    that were shaded."""
+    random, device = np.random.default_rng(seed), renderer.scene.device
+    before: Snapshot | None = None
+    pictures, shares = [], []
+    for frame, placed in enumerate(frames):
+        state = snapshot(replace(toy, placed=placed), device)
+        state.frame.fill_(frame)
+        link(state, before or state)
+        picture = np.zeros((2, 2, 61, 90, 3), np.uint8)
+        order = random.permutation(4)
+        for part in np.split(order, np.flatnonzero(random.random(3) < 0.4) + 1):
+            world, which = (wp.array(values.astype(np.int32), dtype=wp.int32, device=device) for values in (part // 2, part % 2))
+            out = allocate_view_buffers(len(part), 90, 61, ROOM, device)
+            renderer.render(state, make_views(world, which, len(part), ROOM), out)
+            picture[part // 2, part % 2] = out.color.numpy()
+            shares.append(((renderer.image.passes.numpy()[: len(part)] & int(SHADE_PASS)) != 0).mean())
+        pictures.append(picture)
+        before = state
+    return pictures, shares
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize("lights", [LAMPS, LIGHT], ids=["lamps", "gradient"])
+def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights):
+    frames = scripts(size)
+    pictures, shares = {}, {}
+    for reuse in (True, False):
+        config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse)
+        toy = ToyScene(ENTRIES, frames[0], CAMERAS, lights=(lights,), instances=ROOM, config=config)
+        renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
+        pictures[reuse], shares[reuse] = play(renderer, frames, toy, seed=int(reuse))
+    for frame, (kept, whole) in enumerate(zip(pictures[True], pictures[False], strict=True)):
+        np.testing.assert_array_equal(kept, whole, err_msg=f"frame {frame}")
+    assert np.mean(shares[True]) < 0.9
+    assert np.mean(shares[False]) == 1.0
+
+
+def test_images_are_kept_if_a_gpu_has_room():
+    gpu = SimpleNamespace(is_cuda=True, total_memory=80 << 30)
+    assert keeps_images(Render(), 1920, 1080, 1536, gpu)
+    assert not keeps_images(Render(), 1920, 1080, 1536, SimpleNamespace(is_cuda=True, total_memory=24 << 30))
+    cpu = SimpleNamespace(is_cuda=False)
+    assert [keeps_images(Render(), 1920, 1080, cameras, cpu) for cameras in (170, 175)] == [True, False]
+    assert not any(keeps_images(Render(**off), 1920, 1080, 1, gpu) for off in ({"reuse": False}, {"history": 0}, {"mode": "unoccluded"}))
+
+
+def test_a_still_scene_is_shaded_when_its_light_is_due(device):
+    toy = ToyScene(ENTRIES, scripts(0)[0], CAMERAS, lights=(LAMPS,), instances=ROOM, config=with_render(coarse_pixel=2, coarse_paths=1))
+    renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
+    _, shares = play(renderer, [toy.placed] * 200, toy, seed=0)
+    due = np.array(shares)[-80:]
+    assert shares[0] == 1.0
+    assert set(np.unique(due.round(6)).tolist()) <= {0.0, 0.25, 0.333333, 0.5, 0.666667, 0.75, 1.0}
+    assert due.mean() < 0.2
