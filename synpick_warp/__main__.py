@@ -1,7 +1,5 @@
 """Entry point of `python -m synpick_warp`: the command line."""
 
-from __future__ import annotations
-
 import gc
 import sys
 

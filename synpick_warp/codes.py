@@ -4,8 +4,6 @@ Warp resolves members of an `IntEnum` in kernels, so device code, stages and exp
 `_Described` enum carry a sentence for people.
 """
 
-from __future__ import annotations
-
 import enum
 import functools
 from collections.abc import Mapping

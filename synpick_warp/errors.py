@@ -3,8 +3,6 @@
 The command line prints such a message as one line and exits with code 2.
 """
 
-from __future__ import annotations
-
 import difflib
 import json
 from collections.abc import Sequence

@@ -38,10 +38,6 @@ class Module(NamedTuple):
     """What rules ask of a file, whose syntax tree is too large to keep."""
 
     documented: bool
-    postponed: bool
-    """Annotations are."""
-    code: bool
-    """It has functions or classes."""
     functions: tuple[tuple[int, str, int], ...]
     """First line, name and number of lines."""
 
@@ -49,11 +45,9 @@ class Module(NamedTuple):
 @functools.cache
 def parsed(path: Path) -> Module:
     tree = ast.parse(path.read_text())
-    postponed = any(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in tree.body)
-    code = any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in tree.body)
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     sizes = tuple((node.lineno, node.name, (node.end_lineno or node.lineno) - node.lineno + 1) for node in functions)
-    return Module(ast.get_docstring(tree) is not None, postponed, code, sizes)
+    return Module(ast.get_docstring(tree) is not None, sizes)
 
 
 def ignored(name: str) -> bool:
@@ -111,11 +105,6 @@ def test_functions_are_short():
 def test_every_module_says_what_it_is_for():
     modules = [path for path in sources() if path.relative_to(ROOT).parts[0] != "tests"]
     assert [str(path.relative_to(ROOT)) for path in modules if not parsed(path).documented] == []
-
-
-def test_host_code_postpones_annotations():
-    host = [path for path in sources() if path.relative_to(ROOT).parts[0] != "tests" and "kernels" not in path.relative_to(ROOT).parts]
-    assert [str(path.relative_to(ROOT)) for path in host if parsed(path).code and not parsed(path).postponed] == []
 
 
 def test_nobodys_own_paths_are_in_the_tree():

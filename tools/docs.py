@@ -5,8 +5,6 @@ configs/REFERENCE.md: the settings; tools/README.md and tools/reports/real/READM
     python -m tools.docs          # writes them
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 from collections.abc import Callable, Mapping

@@ -7,8 +7,6 @@ configs/CELL.md, in a temporary folder; takes more than ten minutes on two CPU c
     python -m tools.draw_pictures --out DIR --device cuda:0
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

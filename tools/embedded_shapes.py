@@ -6,8 +6,6 @@
 Run both when an embedded object, a default of the section objects, or the decomposition changes.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

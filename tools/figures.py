@@ -4,8 +4,6 @@
 run `python -m tools.docs`.
 """
 
-from __future__ import annotations
-
 import datetime
 import json
 import shlex

@@ -5,8 +5,6 @@
 Run it when Warp or Newton has another version, or the package's archive lacks a module for another reason.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

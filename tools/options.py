@@ -1,7 +1,5 @@
 """Command-line options, report rows, tables and JSON output shared by all tools."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Command line of synpick-warp: its subcommands and their options. User errors: one line, exit code 2."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Shared parts of the commands: option parsers, range checks, an exit code, error messages in one line, and examples for `--help`."""
 
-from __future__ import annotations
-
 import errno
 import re
 import resource

@@ -3,8 +3,6 @@
 What an episode adds to lists of lines is made by its worker: the last worker only appends it to the parts of the lists, below LINES.
 """
 
-from __future__ import annotations
-
 import gzip
 import io
 import os

@@ -3,8 +3,6 @@
 Workers coordinate through the store alone. See README.md.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import itertools

@@ -3,8 +3,6 @@
 A thread polls the folder's manifest, so that the bake needs no hook, and episodes of several devices are uploaded alike.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

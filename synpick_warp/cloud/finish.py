@@ -1,7 +1,5 @@
 """Finalization of a data set in a store: the indices over all episodes, made in a local folder from the episodes' index files."""
 
-from __future__ import annotations
-
 import heapq
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commit log of a data set in a store: which episodes are committed, by their done marks. See README.md."""
 
-from __future__ import annotations
-
 import contextlib
 import heapq
 import itertools

@@ -3,8 +3,6 @@
 Ray places and restarts them, claims in the store deal the episodes out.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Reader of data sets in stores: copies of whole sets, episodes by an LRU cache, verification, streams of shards."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib

@@ -1,7 +1,5 @@
 """Distributed bake into an object store: episodes are baked in a temporary folder and uploaded meanwhile; the last worker finalizes."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import shutil

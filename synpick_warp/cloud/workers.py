@@ -3,8 +3,6 @@
 Apart from `run`, which the workers import.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import tempfile

@@ -1,7 +1,5 @@
 """Validation of single settings: type, length, range, choices."""
 
-from __future__ import annotations
-
 import dataclasses
 import operator
 import re

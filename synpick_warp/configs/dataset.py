@@ -6,8 +6,6 @@ share none; scene ids follow from episode indices, so a scene id names one scene
 from 0 to `bake.episodes`, in the folder `bop.split`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +22,7 @@ from synpick_warp.errors import ConfigError, format_value, suggest
 class ExportSettings:
     """Settings by which files are written: what all views and episodes of a data set have in common."""
 
-    layout: DataLayout
+    layout: "DataLayout"
     bake: Bake
     bop: Bop
     rig: Rig
@@ -40,7 +38,7 @@ class ExportSettings:
     """Maximum number of objects of an episode."""
 
     @classmethod
-    def of(cls, config: Config) -> ExportSettings:
+    def of(cls, config: Config) -> "ExportSettings":
         """Those of all settings."""
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
         names = ("bake", "bop", "rig", "physics", "render", "trajectory", "gripper")
@@ -108,7 +106,7 @@ class DataLayout:
     """Whether the cameras of an episode share a scene, as its sensors; else each has a scene of its own."""
 
     @classmethod
-    def of(cls, config: Config) -> DataLayout:
+    def of(cls, config: Config) -> "DataLayout":
         """Layout by the settings of a bake."""
         bake, bop, rig = config.bake, config.bop, config.rig
         return cls(bake.formats, config.splits, bake.episodes, bop.split, rig.names, rig.sensors, rig.every, bop.layout == MULTISENSOR)

@@ -1,7 +1,5 @@
 """Declaration of a setting: a dataclass field whose type has its bounds and unit, and whose metadata are its meaning and other rules."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools
@@ -33,7 +31,7 @@ class Bounds:
     unit: str = ""
 
     @classmethod
-    def parse(cls, text: str) -> Bounds:
+    def parse(cls, text: str) -> "Bounds":
         """Bounds of an interval, as in `Annotated[float, "(0, 10] m"]`: both, one or none of interval and unit; "inf" is no bound."""
         bracket, low, high, unit = _INTERVAL.fullmatch(text).groups()  # type: ignore[union-attr]
         least, most = (None if bound in (None, "inf") else ast.literal_eval(bound) for bound in (low, high))

@@ -5,8 +5,6 @@ The defaults are the paper's values (preset `synpick`); where the paper names no
 `picks`, `randomize` and `sensors`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
@@ -338,7 +336,7 @@ class Config:
         section, _, name = key.partition(".")
         return getattr(getattr(self, section), name)
 
-    def with_values(self, values: Mapping[str, object]) -> Config:
+    def with_values(self, values: Mapping[str, object]) -> "Config":
         """Copy with other values of settings, by full key. They are not validated; see `load.override_config`."""
         parts: dict[str, Any] = {}
         for key, value in values.items():

@@ -5,8 +5,6 @@ types and ranges hold afterwards: code behind this module does not check again. 
 and drawing that they go into.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 

@@ -3,8 +3,6 @@
 The files are validated when they are read; code behind may index their content without checks. Unknown keys are allowed and kept.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 

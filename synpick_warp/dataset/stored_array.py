@@ -7,8 +7,6 @@ and files that cannot be read are a DatasetError.
 Imports zarr, so import it when an array is opened.
 """
 
-from __future__ import annotations
-
 import asyncio
 import dataclasses
 import functools

@@ -1,7 +1,5 @@
 """Tracks: one instance over all cameras and frames of its episode, as arrays. Only annotations are read, no images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 What is read is checked once: annotations against their schemas, images against the camera's resolution.
 """
 
-from __future__ import annotations
-
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ webdataset's own image decoders ("rgb8", "torchrgb", "pil", ...) convert every P
 becomes 0 or 255, without a warning. This one keeps what was written; entries that it does not name go on to webdataset's decoders for JSON.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from synpick_warp.dataset.annotations import MASK_SCHEMA, check_json

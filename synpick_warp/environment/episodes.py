@@ -3,8 +3,6 @@
 The index of an episode is a hash of its environment's seed and episode counter, so it depends neither on other environments nor on time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -38,7 +36,7 @@ class Episodes:
     """Whether it has reached `max_steps`, or its simulation failed (environment) bool."""
 
     @classmethod
-    def of(cls, count: int) -> Episodes:
+    def of(cls, count: int) -> "Episodes":
         """Counters of `count` environments before their first episode: all truncated, so that each is due for a reset."""
         episodes, index, steps = (np.zeros(count, np.int64) for _ in range(3))
         return cls(np.zeros(count, np.uint64), episodes, index, steps, np.zeros(count, bool), np.ones(count, bool))
@@ -48,11 +46,11 @@ class Episodes:
         """Whether each episode has ended, terminated or truncated (environment) bool."""
         return self.terminated | self.truncated
 
-    def copy(self) -> Episodes:
+    def copy(self) -> "Episodes":
         """Deep copy."""
         return Episodes(*(getattr(self, item.name).copy() for item in fields(self)))
 
-    def assign(self, other: Episodes, environments: Sequence[int] | np.ndarray, rows: Any = None) -> None:
+    def assign(self, other: "Episodes", environments: Sequence[int] | np.ndarray, rows: Any = None) -> None:
         """Overwrite the counters of environments with rows of `other`; None: with the rows of the same indices."""
         for item in fields(self):
             getattr(self, item.name)[environments] = getattr(other, item.name)[environments if rows is None else rows]

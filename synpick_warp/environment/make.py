@@ -1,7 +1,5 @@
 """Builder of the vector environment: resolves settings, and allocates worlds and observations on a device."""
 
-from __future__ import annotations
-
 import importlib.util
 from collections.abc import Mapping
 from dataclasses import replace

@@ -3,8 +3,6 @@
 `vector` wraps it as a Gymnasium environment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -3,8 +3,6 @@
 env = gymnasium.make_vec("synpick_warp.environment.registration:SynPick/Pick-v0", num_envs=8)
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium  # pyright: ignore[reportMissingImports]

@@ -1,7 +1,5 @@
 """Arguments of `make_env`: their check, and the settings of the worlds and action bounds that follow from them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Gymnasium vector environment: a direct subclass of `gymnasium.vector.VectorEnv`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

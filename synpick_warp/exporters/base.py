@@ -1,7 +1,5 @@
 """Interface of all dataset writers: views and ticks of a bake or of a stored data set in, committed episodes on disk out."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence

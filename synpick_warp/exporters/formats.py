@@ -17,8 +17,6 @@ the table, of conversion and of the command line name what they expect, and `too
 format and no NumPy.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress

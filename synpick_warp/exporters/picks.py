@@ -1,7 +1,5 @@
 """Exporter of simulated picks: two Parquet tables per episode, of grasp trials and of the states from which they start."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exporters of the formats in `formats.FORMAT_TABLE`, and all exporters of a bake as one."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -44,7 +42,7 @@ class Needs:
     """Maximum size of the images of any task in the pool's shared memory [B]."""
 
     @classmethod
-    def of(cls, config: Config) -> Needs:
+    def of(cls, config: Config) -> "Needs":
         """Needs by the settings of a bake. Errors: see `load_exporter_classes`."""
         classes = load_exporter_classes(config.bake.formats)
         settings = ExportSettings.of(config)

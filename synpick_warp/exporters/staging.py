@@ -1,7 +1,5 @@
 """Staging of episodes: what all exporters do with an episode's files until it is committed or discarded."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil

@@ -4,8 +4,6 @@ its kernels ahead of time, in parallel threads.
 A bake generates a data set. Callers (bake, online stream, warm-up) pass the whole `Config`; stages take the sections that they need.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Attempt log: builds the records of attempts.jsonl and the counts of each episode from the reports of all ticks, on the host."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any

@@ -8,8 +8,6 @@ No process outlives the bake: a device's process ends its writers and itself whe
 process is killed; its writers end when theirs closes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Forecast of a bake: views, size on disk and time, from measured lengths of episodes, sizes of files and rates."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ The plan is a lower bound: what it refuses cannot run on this machine, what it a
 bake declares, Newton's by measured factors, the pinned copies of images, shared memory of writers, and the lists of episodes.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ The episodes that start last determine when a bake ends, so the longest of them 
 depends on the order or on its device.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import numpy as np

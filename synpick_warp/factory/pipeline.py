@@ -1,7 +1,5 @@
 """Pipeline of a bake, from settings to committed files: output folder, stages, exporters and writers, and the loop over their ticks."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence

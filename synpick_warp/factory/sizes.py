@@ -4,8 +4,6 @@ No output depends on them. Worlds follow from the number of episodes; where memo
 quarter, until the memory plan and its headroom fit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import warp as wp

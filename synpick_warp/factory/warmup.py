@@ -3,8 +3,6 @@
 Collision shapes go into their cache on the way.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

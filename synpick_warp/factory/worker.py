@@ -1,7 +1,5 @@
 """Main program of a device's process: receives its share of a bake, reports progress, and ends when the bake does, however that ends."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Broad phase of collision detection for worlds of many empty slots, in place of Newton's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, cast
 

@@ -4,8 +4,6 @@ Newton can reset this state for a world, but can neither save it nor copy it to 
 differently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,8 +1,6 @@
 """Narrow phase of collision detection: launch sizes on a GPU, early compilation of its kernels, which take longest to compile, and contact
 matching between substeps in which no contact loses its impulse to another one, in place of Newton's."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Kernel fusion for Newton's SolverSteel: one kernel for all iterations of a substep instead of ten kernels per iteration."""
 
-from __future__ import annotations
-
 import inspect
 import sys
 from collections.abc import Iterable

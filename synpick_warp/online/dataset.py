@@ -7,8 +7,6 @@
 This module needs PyTorch. On a GPU the tensors lie in the buffers of the batch, without a copy, and are valid until the next one.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Offscreen rendering of anyone's meshes at given poses: colour, depth, instance segmentation and layers, by the renderer of bakes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 """Settings of a stream: a preset, a file or a `Config`, overridden by full keys and by keyword arguments; and which episodes, and of these
 which cameras and frames it delivers."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +56,7 @@ class Selection:
     stride: int = 1
     """Every n-th frame of an episode, from the first on."""
 
-    def resolve(self, count: int) -> Selection:
+    def resolve(self, count: int) -> "Selection":
         """Selection with all its cameras named, out of `count` cameras; raises ConfigError if there is no such camera, or a value is out of
         range."""
         given = range(count) if self.cameras is None else self.cameras

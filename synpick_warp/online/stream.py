@@ -6,8 +6,6 @@
 It runs in the caller's process and starts no other (but CoACD's, while concave objects are decomposed for the first time).
 """
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Iterator, Sequence
@@ -49,7 +47,7 @@ class ViewStream:
         summary: How the episodes so far ended, as `bake` returns it; `views` counts those handed out.
     """
 
-    def __init__(self, producer: Producer) -> None:
+    def __init__(self, producer: "Producer") -> None:
         stages = producer.stages
         self.config, self.cameras, self.summary = stages.config, stages.cameras, producer.summary
         self.object_names = {entry.obj_id: entry.name for entry in stages.catalog.entries}

@@ -4,8 +4,6 @@ box with draft angle, rounded corners, flange and ribs.
 All geometry is in the bin's own frame, of the tote the world frame: origin at the centre of the inner floor, z up.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

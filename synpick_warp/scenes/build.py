@@ -5,8 +5,6 @@ or stays empty. Single-hull objects and compound (decomposed) ones have slots of
 largest variant, and every shape costs time in the broad phase.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

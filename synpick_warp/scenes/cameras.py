@@ -1,7 +1,5 @@
 """Cameras of a rig: matrices and poses in float64, what each episode draws of them, and which stand in the gripper's way."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,8 +1,6 @@
 """Capacities of a world for contacts, pairs of shapes and constraint rows, from the shapes of the catalog's objects and of the bins; and
 fills by `arrangement.counts`: numbers of each object, and whether they fit into the bins."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The object catalog of a bake: models from a folder or the embedded ones, validated, with collision shapes and mass properties."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,7 +68,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
 
 
 def _load_entries(
-    folder: str, rules: _Rules, cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[CatalogEntry] = ()
+    folder: str, rules: "_Rules", cache_dir: Path | None, report: Callable[[str], None], catalog: Sequence[CatalogEntry] = ()
 ) -> list[CatalogEntry]:
     """Load the objects of `_read_objects`, ordered by obj_id."""
     objects = rules.objects
@@ -107,7 +105,7 @@ def read_objects(
 
 
 def _read_objects(
-    folder: str, rules: _Rules, report: Callable[[str], None], faults: _Faults, catalog: Sequence[CatalogEntry] = ()
+    folder: str, rules: "_Rules", report: Callable[[str], None], faults: "_Faults", catalog: Sequence[CatalogEntry] = ()
 ) -> list[RawObject]:
     """The objects of a folder but for those that look like one of `catalog`; empty: the embedded ones, beside a `catalog` solids."""
     if not folder:

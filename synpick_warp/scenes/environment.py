@@ -7,8 +7,6 @@ median cut (Debevec, 2005), which turns the whole map into lights, this takes wh
 shift; Comaniciu and Meer, 2002).
 """
 
-from __future__ import annotations
-
 import functools
 from typing import NamedTuple
 

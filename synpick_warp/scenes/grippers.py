@@ -4,8 +4,6 @@
 under a mesh. To add a kind, see "Add a gripper" in scenes/README.md. The origins of both bodies' frames lie on the wrist axis; z up.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import math
@@ -34,7 +32,7 @@ CUP_ARMATURE = 1e-3
 
 
 def add_gripper(
-    world: newton.ModelBuilder, gripper: Gripper, head: Head, shape: newton.ModelBuilder.ShapeConfig
+    world: newton.ModelBuilder, gripper: Gripper, head: "Head", shape: newton.ModelBuilder.ShapeConfig
 ) -> tuple[int, tuple[int, ...]]:
     """Add shaft (three prismatic axes) and head (revolute wrist about y); returns the indices of the shaft's shape and of the head's.
 

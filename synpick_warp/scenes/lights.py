@@ -4,8 +4,6 @@ Radiance files (Ward, 1991) differ in the first line, comments, the order and pr
 OpenCV reads one variant; the pixels are coded alike.
 """
 
-from __future__ import annotations
-
 import configparser
 import itertools
 import os

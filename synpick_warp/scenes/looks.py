@@ -1,7 +1,5 @@
 """Randomized appearance of a cell: its distributions, and textures from folders and procedural ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

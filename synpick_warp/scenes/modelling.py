@@ -3,8 +3,6 @@
 A cross-section is a ring of points. Vertices are snapped to a grid when a mesh is made, so patches that share a ring join watertight.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,11 +43,11 @@ class Patch:
     uv: np.ndarray
     """Texture coordinates (T, 3, 2) float64."""
 
-    def translate(self, x: float, y: float, z: float) -> Patch:
+    def translate(self, x: float, y: float, z: float) -> "Patch":
         """Patch moved by (x, y, z) [m]."""
         return Patch(self.corners + np.array([x, y, z]), self.uv)
 
-    def rotate(self, axis: str, angle: float) -> Patch:
+    def rotate(self, axis: str, angle: float) -> "Patch":
         """Rotate the patch about a coordinate axis through the origin [°]."""
         return Patch(matmul(self.corners, rotation(axis, angle).T), self.uv)
 

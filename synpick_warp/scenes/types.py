@@ -1,7 +1,5 @@
 """Data types of a scene: meshes, materials, objects, fixtures, environment maps, cameras. Plain NumPy, in SI units."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -209,7 +207,7 @@ class Camera:
     """What carries the camera; rotation and translation lead from its frame, in place of the world's."""
 
     @classmethod
-    def at(cls, matrix: Sequence[Sequence[float]] | np.ndarray, resolution: tuple[int, int], pose: Any) -> Camera:
+    def at(cls, matrix: Sequence[Sequence[float]] | np.ndarray, resolution: tuple[int, int], pose: Any) -> "Camera":
         """Pinhole camera of an intrinsic matrix (3, 3) [px], with width and height [px], by its pose in the world (4, 4) [m]."""
         pose = np.asarray(pose, float).reshape(4, 4)
         rotation = pose[:3, :3].T

@@ -7,8 +7,6 @@ In a dry run (`dry_run`) the same calls allocate nothing: they return stand-ins 
 constructors of the stages would allocate.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Collection, Iterator, Mapping

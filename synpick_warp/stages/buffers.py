@@ -1,7 +1,5 @@
 """Device arrays that stages hand over to each other: snapshots of the worlds, and images of a batch of views."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, make_dataclass
 from functools import cached_property
 from typing import Any

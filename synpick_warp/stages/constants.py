@@ -1,7 +1,5 @@
 """Constants of the simulation's and perception's kernels: structs filled from the settings and the catalog."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

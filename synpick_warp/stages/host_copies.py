@@ -3,8 +3,6 @@
 Run boundaries are the positions at which masks change down a column, from which run lengths (RLE) are made; see `mask_runs`.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

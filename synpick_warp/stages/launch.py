@@ -1,7 +1,5 @@
 """Kernel launches: arguments by name; over pixels and views in blocks of whole tiles on the GPU, in several threads on the CPU."""
 
-from __future__ import annotations
-
 import functools
 import os
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """CUDA streams of the renderer, the encoders and the solver: on all multiprocessors (SMs) of a GPU, or on disjoint sets of them."""
 
-from __future__ import annotations
-
 import contextlib
 from types import TracebackType
 from typing import Self

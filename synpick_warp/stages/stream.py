@@ -1,7 +1,5 @@
 """Frame stream: renders snapshots in batches of views and copies them to the host asynchronously, as FrameBatches."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace

@@ -1,8 +1,6 @@
 """Tick loop with a bounded lead: the device simulates later ticks while earlier ones are rendered, copied and read. Between physics and
 renderer is a queue of ticks: a ring buffer of snapshots on the device and of reports in pinned host memory."""
 
-from __future__ import annotations
-
 import contextlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence

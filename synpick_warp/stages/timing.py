@@ -9,8 +9,6 @@ Host time is wall time between entering and leaving a scope; on a GPU, which wor
 measured by CUDA events on the current stream, without synchronization inside the scope. Scopes nest.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import time

@@ -6,8 +6,6 @@ more are rendered in batches of fewer views, each with room for masks as large a
 never waits for the device.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -106,7 +104,7 @@ class CameraGroup:
     lenses: tuple[LensMap | None, ...] = ()
     """Lens of each camera (None: a pinhole) if views have lenses of their own, as episodes draw their camera matrices; none: the scene has
     those of all views."""
-    bounds: MaskBounds | None = None
+    bounds: "MaskBounds | None" = None
     """Bounds of the words of views' masks; None: any masks fit a view's share of the pool."""
 
     def slots(self, camera: np.ndarray) -> np.ndarray:
@@ -300,7 +298,7 @@ class MaskBounds:
     """Width and height of the images [px]."""
 
     @classmethod
-    def of(cls, meshes: Any, cameras: Sequence[Camera]) -> MaskBounds:
+    def of(cls, meshes: Any, cameras: Sequence[Camera]) -> "MaskBounds":
         """Bounds for the objects of the struct `Meshes`, and the cameras of a group."""
         corner = np.abs(np.stack((meshes.lower.numpy(), meshes.upper.numpy()))).max(axis=0)[: meshes.entries].astype(np.float64)
         placed = {key: np.stack([getattr(camera, key) for camera in cameras]) for key in CAMERA_KEYS}

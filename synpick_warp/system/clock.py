@@ -3,8 +3,6 @@
 A module of its own, since a simulation replaces these names in one place: users write `clock.sleep(1.0)` and import none of them.
 """
 
-from __future__ import annotations
-
 import threading
 import time as _system
 from concurrent.futures import ThreadPoolExecutor

@@ -1,8 +1,6 @@
 """State of the interpreter: descriptors of the standard streams, of which closed ones are opened on the null device, so that no other file
 takes their numbers, and a pause of the garbage collector."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import gc

@@ -5,8 +5,6 @@ Here sums have a fixed order: `einsum` without `optimize` calls no BLAS. NumPy's
 level, too; where their results decide, they are rounded first (DECIMALS).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -13,8 +13,6 @@ Names are known without an import of the package; a module is imported when its 
 writers, so it imports little. Names of this package stay its own. A file of its own, since settings, scenes, stages and exporters read it.
 """
 
-from __future__ import annotations
-
 import functools
 from importlib import metadata
 from typing import Any, Literal

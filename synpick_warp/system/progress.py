@@ -1,7 +1,5 @@
 """Progress reporting: the observer interface of a bake, observers that are silent or log, and the callback of a pass over a data set."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from types import TracebackType

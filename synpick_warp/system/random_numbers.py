@@ -5,8 +5,6 @@ a square evenly for any count, and points of triangles by area: the golden-ratio
 The unreasonable effectiveness of quasirandom sequences, 2018).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 GAMMA, _MIX_A, _MIX_B = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB

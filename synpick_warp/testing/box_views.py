@@ -1,7 +1,5 @@
 """View and tick batches of scenes made of boxes, rendered by analytic ray-box intersection (slab test) in float64."""
 
-from __future__ import annotations
-
 import functools
 import pickle
 from collections.abc import Iterator

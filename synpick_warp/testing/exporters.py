@@ -1,7 +1,5 @@
 """Contract tests of the exporter interface: determinism, atomic commits, resuming. Test classes of exporters inherit `ExporterContract`."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Tables of simulated picks on the boxes of `box_views`: points, normals and pixels are exact, outcomes are drawn."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

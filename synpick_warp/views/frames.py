@@ -4,8 +4,6 @@ episodes, with the records of their bins.
 A tick is one output frame of simulated time (`physics.steps_per_tick` physics steps); a view is one camera's image of it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -180,7 +178,7 @@ class TickBatch:
     def __len__(self) -> int:
         return len(self.episode)
 
-    def select(self, rows: np.ndarray) -> TickBatch:
+    def select(self, rows: np.ndarray) -> "TickBatch":
         """Batch of the frames with these indices (row) int."""
         values: dict[str, Any] = {}
         for item in fields(self):

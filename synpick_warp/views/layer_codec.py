@@ -3,8 +3,6 @@
 The layers, with type, unit and meaning of their values: `layers.LAYER_TABLE`. Axes are the camera's: x right, y down, z forward.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from pathlib import Path

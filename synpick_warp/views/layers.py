@@ -12,8 +12,6 @@ To add a layer:
    `exporters/README.md`; the former bakes it by itself. A drawing in `apps/viz/false_colors.py` is optional.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields

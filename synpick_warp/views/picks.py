@@ -4,8 +4,6 @@ A state is a checkpoint of an episode at a moment of choice; a grasp candidate i
 executes a candidate from the state, possibly perturbed. One trial is one row.
 """
 
-from __future__ import annotations
-
 import enum
 import math
 from collections.abc import Mapping, Sequence

@@ -8,8 +8,6 @@ with light histories as in a bake. `--compare` measures other simulators and ren
     python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import sys

@@ -1,7 +1,5 @@
 """Parts of what trains without files: the online stream beside the bare renderer, and steps of the environment."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,8 +1,6 @@
 """Scenes of other renderers, with the bins, objects and cameras of our worlds: newton.sensors.SensorCamera, and MuJoCo Warp's ray renderer,
 where all are geoms without bodies; agreement of another renderer with ours."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Callable
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Engines of physics: our solver and MuJoCo Warp by Newton's interface, MuJoCo in threads; their rates and calm.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import math
@@ -199,7 +197,7 @@ class EqualPile:
     pose: np.ndarray
     """x, y, z [m], quaternion x, y, z, w (body, 7) float64."""
 
-    def lift(self) -> EqualPile:
+    def lift(self) -> "EqualPile":
         """Start of a fall: the same pile, stretched vertically by SPREAD and raised by LIFT; x, y and orientations stay."""
         pose = self.pose.copy()
         pose[:, 2] = LIFT + SPREAD * pose[:, 2]

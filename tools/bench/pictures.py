@@ -8,8 +8,6 @@ first kept tick, so that every pass does the same work, and even its first tick 
 and writers do not run. The size of a pass is fixed: `--seconds` is ignored.
 """
 
-from __future__ import annotations
-
 import itertools
 import statistics
 import time

@@ -1,7 +1,5 @@
 """What all parts of the benchmark share: the run with its options, and repeated timing, of calls and of scopes in them."""
 
-from __future__ import annotations
-
 import contextlib
 import statistics
 import time

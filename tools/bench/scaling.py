@@ -4,8 +4,6 @@ instances; physics with and without our replacements of Newton's components.
 For scaling, physics is timed from DROP_TICKS ticks after the objects are dropped, without gripper; rendering is timed on these piles.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import resource

@@ -1,7 +1,5 @@
 """Parts that are measured in the same worlds: physics, perception, rendering, encoders; the part stream follows there."""
 
-from __future__ import annotations
-
 import contextlib
 import resource
 import time

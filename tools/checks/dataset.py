@@ -7,8 +7,6 @@ say of each other, without models (counts of masks, COCO annotations, missing fi
     python -m tools.checks.dataset DIR --views 24
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import defaultdict

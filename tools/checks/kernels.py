@@ -12,8 +12,6 @@ lists built in the same function by `inputs = [...]` and `inputs += [...]`. An a
     python -m tools.checks.kernels
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

@@ -1,7 +1,5 @@
 """Bounded quantities of a data set check: their worst value, their verdict, the table of all, and the command line of a check."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ with 2 if the folder cannot be checked.
     python -m tools.checks.trajectory DIR --episodes 8
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tomllib

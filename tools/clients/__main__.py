@@ -7,8 +7,6 @@ disagrees or fails, with 2 if the data set cannot be opened. Nothing is fetched.
     python -m tools.clients DATA --python blender=BPY/bin/python --bop-toolkit DIR
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

@@ -1,8 +1,6 @@
 """Interface of a client, a third-party library that reads our formats, and shared helpers. Imports only NumPy: clients also run in
 interpreters without our packages."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

@@ -10,8 +10,6 @@ not installed is listed as such. Exits with 1 if a client fails. Nothing is fetc
 # Runs where these libraries are, which the type checker may not see.
 # pyright: reportMissingImports=false
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Callable, Mapping

@@ -3,8 +3,6 @@
 # Runs where the packages are, which the type checker may not see; webdataset does not declare its names.
 # pyright: reportMissingImports=false, reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import io

@@ -1,7 +1,5 @@
 """Processes of clients in their interpreters, and the table of what became of them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 """Table of clients, third-party libraries that read our data sets in a test, and the script that runs one of them: it saves what it read
 (.npz) and a report (.json)."""
 
-from __future__ import annotations
-
 import json
 import sys
 from importlib import metadata

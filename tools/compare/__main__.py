@@ -5,8 +5,6 @@ python -m tools.compare pictures          # the same pictures on two devices
 python -m tools.compare guard OLD NEW     # two checkouts, in all that they write, read and compile
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 

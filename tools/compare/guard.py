@@ -16,8 +16,6 @@ compared.
 With `--work DIR` results are kept, by the content of the checkout: the next run repeats only what it lacks. Neither checkout needs git.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import inspect

@@ -1,8 +1,6 @@
 """Commands that `tools.compare guard`, the regression test of two checkouts, runs: bakes of six small data sets on the CPU, the commands
 that read them, and the bake of its GPU part."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ The canonical source of a kernel is its own and that of all functions and struct
 left out, and definitions and parameters are numbered instead of named. No GPU and no compiler are needed.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import pkgutil

@@ -6,8 +6,6 @@ exceeds its tolerance, with 2 if nothing can be compared.
     python -m tools.compare pictures --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from dataclasses import dataclass, fields

@@ -7,8 +7,6 @@ on, such as the count of worlds, and the program's version in the manifest are i
     python -m tools.compare runs A B
 """
 
-from __future__ import annotations
-
 import argparse
 import filecmp
 import io

@@ -6,8 +6,6 @@ episodes. Needs PyTorch; the defaults are for a GPU.
     python -m tools.examples.train_online --device cuda:0 --worlds 64 --models MODELS --lights LIGHTS --views 2000,8000,32000
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math

@@ -9,8 +9,6 @@ PyTorch; the defaults are for a GPU.
     python -m tools.examples.train_picker run --picker picker.pt --config synpick --worlds 512 --attempts 1000
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time
@@ -81,7 +79,7 @@ class PickSamples:
     trials: dict[str, np.ndarray]
     """Columns by trial, sorted by state: `state`, `x` and `y` [px], LABELS, `weight`."""
 
-    def part(self, states: np.ndarray) -> PickSamples:
+    def part(self, states: np.ndarray) -> "PickSamples":
         """Subset of the states, in ascending order; `state` of trials becomes the position in `states`."""
         place = np.full(len(self.episode), -1)
         place[states] = np.arange(len(states))

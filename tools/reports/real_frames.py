@@ -7,8 +7,6 @@ is there once), `mask` rendered from pose and model, poses in the frames of the 
 pixel centres are at + 0.5 in data sets of this project, at whole numbers in those frames.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

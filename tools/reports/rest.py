@@ -7,8 +7,6 @@ arrangement, so that there may be more arrangements than worlds. Exits with 1 if
     python -m tools.reports.rest --config full-bin --arrangements 8 --set arrangement.counts={box=150}
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import Counter

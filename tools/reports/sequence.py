@@ -8,8 +8,6 @@ references, with half of `--samples` each: the product of the two differences es
     python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -4,8 +4,6 @@ copied without decoding where the format has the same file type; annotations are
 Like the source, the result has no settings and no manifest. It is written to a temporary folder and renamed when it is complete.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shutil

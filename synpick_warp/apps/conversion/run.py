@@ -1,7 +1,5 @@
 """Run of a conversion: output folder, processes, episodes, commits, indices; resumed by running it again."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from functools import partial
 from pathlib import Path

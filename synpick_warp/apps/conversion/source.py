@@ -4,8 +4,6 @@ Exporters take image files byte for byte, annotations unchanged, and masks as ru
 format needs are checked before any of them is converted.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

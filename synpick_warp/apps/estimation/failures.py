@@ -1,7 +1,5 @@
 """Pictures of failures: the worst estimate of each object as observed, rendered and residual, side by side."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

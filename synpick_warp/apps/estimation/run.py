@@ -6,8 +6,6 @@ afterwards from its own estimate, without restart (ICG's protocol). All are give
 from anywhere, so models and textures are read in isolated processes, as a bake reads them.
 """
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Iterable, Iterator, Sequence

@@ -3,8 +3,6 @@
 Images are selected by mode, camera, episode, every n-th frame, or a BOP target list.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

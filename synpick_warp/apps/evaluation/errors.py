@@ -12,8 +12,6 @@ are in use, and they differ for few instances:
   instances score up to 1 / n more.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -149,7 +147,7 @@ class Model:
         """Nearest-vertex search over the model's vertices, built on first use."""
         return VertexSearch(self.vertices)
 
-    def thinned(self, count: int) -> Model:
+    def thinned(self, count: int) -> "Model":
         """Model with at most `count` vertices, taken evenly in their order; 0: all."""
         if not 0 < count < len(self.vertices):
             return self

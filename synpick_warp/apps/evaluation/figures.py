@@ -4,8 +4,6 @@ All are drawn before the first is written, from charts as `system.codecs.charts`
 evaluation; axes say what they show. A missed detection has the error infinity.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ those of scene_gt.json: object to camera. A target list (test_targets_bop19.json
 and scored on.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter
@@ -275,7 +273,7 @@ class TargetList:
                 known.add(target.obj_id)
         return {image: None if known is None else frozenset(known) for image, known in found.items()}
 
-    def in_classic_layout(self, sensors: Sequence[str]) -> TargetList:
+    def in_classic_layout(self, sensors: Sequence[str]) -> "TargetList":
         """The list with a scene for each camera, as result files have it; that of a data set of several `sensors` has one for all of them.
         Raises ResultError if it names a sensor that the data set does not have."""
         known = {name: index for index, name in enumerate(sensors)}

@@ -1,7 +1,5 @@
 """Evaluation of BOP result files: read estimates and ground truth, match them, and average the errors by object, mode and visibility."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple

@@ -8,8 +8,6 @@ An estimate takes, of the instances that are left, the one with the smallest err
 are worked on at once: a round matches the best remaining estimate of each.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -70,7 +68,7 @@ def score(
     return Scores(name, rows, errors, rotation, translation, mean_seconds(estimates))
 
 
-def _pair_errors(truth: PoseTable, estimates: PoseTable, pairs: Pairs, models: Mapping[int, Model]) -> dict[str, np.ndarray]:
+def _pair_errors(truth: PoseTable, estimates: PoseTable, pairs: "Pairs", models: Mapping[int, Model]) -> dict[str, np.ndarray]:
     """Metric -> error of each pair (P,) [m]; infinity where a bound shows that it is above LIMIT, so that no match could have it."""
     errors = {metric: np.full(len(pairs.estimate), np.inf) for metric in METRICS}
     object_ids = truth.object_id[pairs.truth]
@@ -95,7 +93,7 @@ def _poses(table: PoseTable, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _motion_errors(
-    truth: PoseTable, estimates: PoseTable, pairs: Pairs, found: np.ndarray, models: Mapping[int, Model]
+    truth: PoseTable, estimates: PoseTable, pairs: "Pairs", found: np.ndarray, models: Mapping[int, Model]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (T,) [°] and translation (T,) [m] errors of matched pairs; NaN for index -1."""
     rotation, translation = np.full(len(found), np.nan), np.full(len(found), np.nan)

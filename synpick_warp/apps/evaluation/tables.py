@@ -4,8 +4,6 @@ A row for a group of instances is the mean over its objects of each object's are
 all instances. Areas and recalls are in percent.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import statistics

@@ -19,8 +19,6 @@ the jumps. What the paper leaves open, and what is chosen here:
 - Symmetric objects: nothing is done, so that an estimate that jumps to an equivalent pose pulls the filtered one through poses between.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

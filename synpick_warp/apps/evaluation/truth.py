@@ -1,8 +1,6 @@
 """Pose tables: poses of many images as columns, and the ground truth of a data set as one, with visibility, episode, camera, mode and speed
 of each instance in each image."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -38,7 +36,7 @@ class PoseTable:
     def __len__(self) -> int:
         return len(self.scene)
 
-    def select(self, rows: np.ndarray) -> PoseTable:
+    def select(self, rows: np.ndarray) -> "PoseTable":
         """Table of the rows that a mask or an index array selects."""
         return PoseTable(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
@@ -114,7 +112,7 @@ class Truth:
         """Whether instances are at least so visible (N,) bool; also those of which it is not known."""
         return ~(self.visibility < minimum)
 
-    def select(self, rows: np.ndarray) -> Truth:
+    def select(self, rows: np.ndarray) -> "Truth":
         """Ground truth of the rows that a mask selects; images stay."""
         columns = {name: getattr(self, name)[rows] for name in ("visibility", "episode", "camera", "mode", "speed")}
         return replace(self, poses=self.poses.select(rows), **columns)

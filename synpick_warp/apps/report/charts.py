@@ -3,8 +3,6 @@
 A chart is a table of rows with the marks that show it: bars by name, a histogram, a line over time, or a heat map.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Report of a data set: reads figures and samples, and writes one HTML file."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial

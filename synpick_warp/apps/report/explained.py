@@ -1,7 +1,5 @@
 """Attempts and simulated picks explained on a page; drawing and sentences are those of `explain`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any

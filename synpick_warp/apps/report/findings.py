@@ -1,7 +1,5 @@
 """Findings: what a person who looks through a data set's figures would raise. Pure functions of the figures."""
 
-from __future__ import annotations
-
 import statistics as mean_of
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

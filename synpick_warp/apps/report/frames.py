@@ -4,8 +4,6 @@ Sampled frames have colour, visible and amodal masks as ids, boxes, depth and la
 in up to three cameras, with the episode's attempts on the time axis.
 """
 
-from __future__ import annotations
-
 import base64
 import enum
 from collections import Counter

@@ -3,8 +3,6 @@
 Data cannot break out of its HTML and JSON: text is escaped when it becomes markup, JSON when it is embedded in a script element.
 """
 
-from __future__ import annotations
-
 import base64
 import functools
 import hashlib

@@ -5,8 +5,6 @@ Values are columns of bins where they are counted by bin, and integers where the
 with the data set are the keys of the sums, of which there are as many as groups, objects, and bins of values.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -93,7 +91,7 @@ class Counts:
                     for key, amount in zip(zip(*keys, repeat(value)), rows[value]):  # noqa: B905, repeat has no end
                         self.sums[name][key] += amount
 
-    def merge(self, other: Counts) -> None:
+    def merge(self, other: "Counts") -> None:
         """Add the sums of another part. The order of merges does not change the result. Raises DatasetError if there are more than
         MAX_OBJECTS objects."""
         for name, sums in self.sums.items():

@@ -3,8 +3,6 @@
 Counts come from a streaming pass: scenes one at a time, spread over processes, each of which holds its counts only.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import re

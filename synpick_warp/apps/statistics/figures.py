@@ -1,7 +1,5 @@
 """Figures of a data set: what its statistics say, as records of numbers. `stats --json` has their fields."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple

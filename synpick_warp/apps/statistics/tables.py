@@ -1,7 +1,5 @@
 """Tables of statistics: title, columns and values, one list for text, CSV and pages alike; statistics as text, JSON and CSV."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -3,8 +3,6 @@
 On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently.
 """
 
-from __future__ import annotations
-
 import math
 import random
 import tempfile

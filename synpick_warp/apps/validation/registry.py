@@ -3,8 +3,6 @@
 Deviations are summed up by rule and object as median, 95th percentile and maximum, which `validate --tolerance` reports.
 """
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Depth of single objects, re-rendered by the bake's rasterizer from a data set's models, poses and intrinsics, cropped to the object."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any

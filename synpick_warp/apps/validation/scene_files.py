@@ -4,8 +4,6 @@ Masks are crops, with the bit depth and colour type that the file states. Schema
 parser, name what is wrong.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
 from functools import cached_property

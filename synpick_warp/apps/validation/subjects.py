@@ -1,7 +1,5 @@
 """Subjects of the rules: data set, target lists, scene of one sensor, view; their files are read once and when they are needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -1,8 +1,6 @@
 """Pictures of a cell before anything is simulated: bins, gripper and objects on the floor, from outside with the frusta of the cameras, and
 from each camera."""
 
-from __future__ import annotations
-
 import colorsys
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Drawing primitives of all figures: text, colours and short labels of instances, picture files."""
 
-from __future__ import annotations
-
 import colorsys
 from collections import Counter
 from collections.abc import Iterable, Sequence

@@ -1,8 +1,6 @@
 """Figure of a pick attempt, from a data set's files: image with contours and suction points, clutter graph, explanation in sentences, table
 of objects, plot of the seal force over time. The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Arrows run downward, from the object on top to the one below. Layers by longest 
 lies on its nodes, and spread evenly about the middle; an arrow that would run over another node is bent aside.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

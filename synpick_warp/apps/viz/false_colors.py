@@ -1,7 +1,5 @@
 """False-colour images of depth, on one scale for all pictures that stand beside each other, and of layers (AOVs)."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple

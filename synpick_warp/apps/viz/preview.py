@@ -1,7 +1,5 @@
 """Contact sheet of a BOP data set, from its files: colour, depth colour map, instance masks, bounding boxes and layers of sampled views."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import math
@@ -339,7 +337,7 @@ class Box(NamedTuple):
     width: float
     height: float
 
-    def meets(self, other: Box) -> bool:
+    def meets(self, other: "Box") -> bool:
         """Whether two rectangles overlap; common edges do not count."""
         return (
             self.x < other.x + other.width

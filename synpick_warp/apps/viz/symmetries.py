@@ -1,7 +1,5 @@
 """Sheet of object symmetries: each object with its axes, and overlaid on its rotated selves, coloured by the distance between both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

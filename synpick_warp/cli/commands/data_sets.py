@@ -1,7 +1,5 @@
 """Commands `stats`, `report` and `convert`: statistics of a data set beside the paper's, one HTML page about it, and other formats."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

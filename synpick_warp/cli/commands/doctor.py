@@ -1,7 +1,5 @@
 """Machine report (versions, CPU, device, caches, memory plan, verdict), and forecast of a bake (views, disk, memory, time)."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.metadata
 import os

@@ -3,8 +3,6 @@
 OpenCV's own reader is not used: it fails by exceptions of C++, and takes files of any size.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

@@ -16,8 +16,6 @@
 A file of several cameras is read where they are equal. Raw images are described: rectification and projection matrices are not read.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -105,7 +103,7 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
     return read.pop()
 
 
-def _format(tree: Tree) -> _Format | None:
+def _format(tree: Tree) -> "_Format | None":
     """The first of the formats that a tree is of."""
     return next((row for row in _FORMATS if row[1](tree)), None)
 

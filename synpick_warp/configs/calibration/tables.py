@@ -5,8 +5,6 @@ A preset sets `depth_sensor.*`. Its noise is noise of disparity, from which dept
 sigma_z = z² sigma_d / (f b). Two cameras of one model differ by some pixels: a calibration of the own camera is better.
 """
 
-from __future__ import annotations
-
 import os
 import tomllib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Settings of the bins that stand under the cameras, and their extents; a table and a pallet are bins without walls."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -164,13 +162,13 @@ class BinSizes:
     """Of a bin whose mesh has been read."""
 
     @classmethod
-    def of_tote(cls, tote: Tote, name: str = TOTE, noun: str = TOTE) -> BinSizes:
+    def of_tote(cls, tote: Tote, name: str = TOTE, noun: str = TOTE) -> "BinSizes":
         """Sizes of the tote, or of a box like it."""
         height = tote.outer_size[2] - tote.wall
         return cls(name, noun, tote, tote.outer_size[:2], tote.floor_size, tote.rim_size, height, -tote.wall)
 
     @classmethod
-    def of_row(cls, row: BinRow) -> BinSizes:
+    def of_row(cls, row: BinRow) -> "BinSizes":
         """Sizes of a row of [[bin]]; one with a file must be measured."""
         if (found := row.measured) is not None:
             x, y = (2 * max(abs(found.box[axis]), abs(found.box[axis + 3])) for axis in (0, 1))
@@ -280,7 +278,7 @@ class Cell:
     """Names of the bins, where data sets record that of each episode; empty for a tote that is always in its place."""
 
     @classmethod
-    def of(cls, tote: Tote, bins: Bins, rows: tuple[BinRow, ...]) -> Cell:
+    def of(cls, tote: Tote, bins: Bins, rows: tuple[BinRow, ...]) -> "Cell":
         """The cell of these settings."""
         tables: dict[str, Tote] = {}
         if bins.kind == NONE:

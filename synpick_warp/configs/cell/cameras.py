@@ -1,7 +1,5 @@
 """Settings of the cameras: the section [cameras] for identical cameras that look at one point, and [[camera]] tables for any others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 

@@ -1,7 +1,5 @@
 """Settings of the gripper and its suction, and the constraints between them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Settings of sensor models: camera effects on colour images, and a depth camera. None of it is in the paper."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

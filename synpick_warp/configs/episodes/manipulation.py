@@ -1,7 +1,5 @@
 """Settings of the gripper's tasks: stirring, picking, targeted picking, perception, and grasp trials."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Settings of objects, and part counts of an episode's bin (`arrangement.counts`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """Domain randomization settings (Tobin et al., IROS 2017): probability distributions of what each episode looks like."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

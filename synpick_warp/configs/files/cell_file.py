@@ -1,7 +1,5 @@
 """Settings file of a new cell: cameras, bin, parts and randomization as commented TOML, each setting with meaning, unit and range."""
 
-from __future__ import annotations
-
 import shlex
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Configuration loading: presets and TOML files, overridden by single settings, checked and resolved to a `Config`."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

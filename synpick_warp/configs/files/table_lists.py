@@ -6,8 +6,6 @@ be changed as a whole by a single table, [object_rows]. A setting may be a table
 the setting's type.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import re

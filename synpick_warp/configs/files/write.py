@@ -1,7 +1,5 @@
 """Configuration serialization to TOML: complete, and `load_config` reads the same configuration back."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

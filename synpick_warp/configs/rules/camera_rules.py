@@ -1,7 +1,5 @@
 """Validation across the settings of cameras, bins and depth: invalid poses and matrices, cameras that do not see the bin."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

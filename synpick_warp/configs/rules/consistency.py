@@ -1,7 +1,5 @@
 """Validation across settings: constraints between several of them."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

@@ -1,7 +1,5 @@
 """Ground truth of a scene as columns: a row per instance and image, read from annotations alone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

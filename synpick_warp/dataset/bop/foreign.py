@@ -5,8 +5,6 @@ are measured from masks as the BOP toolkit does (calc_gt_info.py), instances are
 module such a scene is read as that of a bake.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ A key names the view, SCENE_IMAGE, as in 000001_000042.rgb.jpg. BOP has two such
 key_to_shard.json that says which), and the imagewise layout (the files themselves, all in one folder).
 """
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

@@ -4,8 +4,6 @@ names.
 Listings are confined to the data set: symbolic links that lead out of it are named and never followed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass
@@ -60,7 +58,7 @@ class Listing:
             raise DatasetError(f"there is no file {self.name(entry)}")
         return read_file(self.path(entry), limit, DatasetError)
 
-    def enter(self, folder: str) -> Listing:
+    def enter(self, folder: str) -> "Listing":
         """List a folder in this one; empty if there is none."""
         return list_folder(self.root, self.name(folder)) if folder in self.folders else Listing(self.root, self.name(folder))
 

@@ -9,8 +9,6 @@ An entry is two files: `NAME.sha256` lists the checksums of its files, as `sha25
 is written after it and commits them. Nothing here depends on the machine, the time, or the number of worlds and writers.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import hashlib

@@ -3,8 +3,6 @@
 Parts may have been edited: names come from checked lists only, symbolic links are refused, and files are created, never overwritten.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools

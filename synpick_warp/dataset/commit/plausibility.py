@@ -7,8 +7,6 @@ A record states how many frames an episode has, and may be edited or damaged; ar
 compared with the sizes of the files that are there before anything is made of it.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import re

@@ -3,8 +3,6 @@
 Large data sets are verified by several processes; the result is the same for any number of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
 from itertools import islice

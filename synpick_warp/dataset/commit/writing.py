@@ -5,8 +5,6 @@ renamed into place; resuming deletes the files of planned episodes that are not 
 files in the folder. The manifest marks the folder as ours: it is written first and removed last.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import errno
@@ -110,7 +108,7 @@ class OutputFolder:
             os.close(self.lock)
             raise
 
-    def __enter__(self) -> OutputFolder:
+    def __enter__(self) -> "OutputFolder":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -1,7 +1,5 @@
 """Exporter of scenewise BOP datasets: one folder per scene, with a file for each image and mask."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

@@ -4,8 +4,6 @@ Nodes are ground-truth indices: positions in a frame's list of scene_gt.json. Ru
 Newton.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ they lie on the surface, so the depth image tells whether one is hidden; corners
 Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -4,8 +4,6 @@ A polygon of a part with holes is one closed line: a bridge leads from the outli
 the even-odd rule gets the mask. Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -3,8 +3,6 @@
 Trials are spooled to the staged scene as table rows when they arrive; the JSON file is written when the scene is complete.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Base class of BOP exporters: each camera of an episode is a scene, each view a task; scenes of an episode are committed together."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial

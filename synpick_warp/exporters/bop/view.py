@@ -3,8 +3,6 @@
 Runs in writer processes, so it imports neither Warp nor Newton. Only BOP's formats (bop, shards, coco) use millimetres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -4,8 +4,6 @@ outcomes), as a JSON file. It runs in writer processes.
 LeRobot numbers frames and episodes over the whole data set, so the tables are written when the bake ends, from the parts of all episodes.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence

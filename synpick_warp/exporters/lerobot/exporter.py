@@ -1,7 +1,5 @@
 """Exporter of LeRobot v3 data sets: videos a camera and episode, states, actions and task sentences a frame, for robot learning."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

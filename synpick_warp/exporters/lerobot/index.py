@@ -5,8 +5,6 @@ numbers are merged as LeRobot does it: quantiles of all are means of the episode
 histograms, which add up exactly.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -4,8 +4,6 @@ Checked against `lerobot` 0.4.4 (codebase_version v3.0). LeRobot numbers the epi
 by the episode's index in the bake, which may have gaps, and meta/episodes says which file is whose.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import Counter
 from collections.abc import Sequence

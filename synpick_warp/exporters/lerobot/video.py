@@ -4,8 +4,6 @@ A group has its own encoder of one thread, and colour is converted in fixed-poin
 threads, processes or worlds, nor on the CPU. Of AV1 and H.264 at equal quality, H.264 takes a quarter of the time (exporters/README.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path

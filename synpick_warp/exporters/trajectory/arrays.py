@@ -3,8 +3,6 @@
 Descriptions are written into the store.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

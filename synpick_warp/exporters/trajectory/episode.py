@@ -1,7 +1,5 @@
 """Task that writes an episode's group in the zarr store. It runs in writer processes."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

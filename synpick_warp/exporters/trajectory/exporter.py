@@ -1,7 +1,5 @@
 """Exporter of physics trajectories to zarr: poses, velocities, forces and attempts, one group per episode."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Spool files of trajectories: fixed-size records, one per tick of an episode. A write task has one tick of many episodes."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """Zarr arrays with units and descriptions as attributes, and the groups of the store that all episodes share."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from typing import Any

@@ -1,8 +1,6 @@
 """Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table; and
 environment maps: EXR files, and the parameters of dome and distant lights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

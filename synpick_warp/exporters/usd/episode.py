@@ -4,8 +4,6 @@ USD file of them.
 It runs in writer processes, so this module imports neither Warp nor Newton, and pxr only when there is an episode to write.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exporter of USD scenes: one file per episode, and an asset library that all episodes reference."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path

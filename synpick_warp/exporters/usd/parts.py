@@ -6,8 +6,6 @@ Stages are in metres, z up, as everywhere in this package. Imports pxr, so only 
 # pxr's modules are filled when they are loaded, invisible to type checkers.
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 import errno
 import os
 import re

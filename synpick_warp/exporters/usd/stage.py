@@ -6,8 +6,6 @@ Every moving prim also has its first pose as default value: physics engines read
 # pxr's modules are filled when they are loaded, invisible to type checkers.
 # pyright: reportAttributeAccessIssue=false
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any

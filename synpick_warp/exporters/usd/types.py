@@ -1,7 +1,5 @@
 """Plain descriptions that the bake sends to the writer processes of USD episodes. Imports neither pxr nor OpenCV."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 from synpick_warp.codes import LookPart
@@ -43,7 +41,7 @@ class AssetSurface:
     """File of its texture, relative to the asset library; None: it has none."""
 
     @staticmethod
-    def of(name: str, material: Material) -> AssetSurface:
+    def of(name: str, material: Material) -> "AssetSurface":
         """That of the asset of this name."""
         return AssetSurface(replace(material, texture=None), None if material.texture is None else texture_file(name))
 

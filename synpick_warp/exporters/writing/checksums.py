@@ -1,7 +1,5 @@
 """Checksums and manifest entries: SHA-256 lists in the format of `sha256sum`. Runs in writer processes."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """File writes: atomic replacement by rename, fsync, many files of one folder, and the check that an output folder is usable."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

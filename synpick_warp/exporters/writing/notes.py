@@ -1,7 +1,5 @@
 """Camera files (camera.json), and the card dataset_info.md of data sets without the formats bop and shards, which write their own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

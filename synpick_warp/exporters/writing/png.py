@@ -3,8 +3,6 @@
 Equal pixels give equal bytes with one version of ISA-L on one type of CPU.
 """
 
-from __future__ import annotations
-
 import functools
 import hashlib
 import struct

@@ -1,7 +1,5 @@
 """Writer process pool: bounded queues with back-pressure, images handed over in shared memory, errors raised in the caller."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import subprocess
@@ -182,7 +180,7 @@ class WriterPool:
         self._answered.clear()
         self._slots.close()
 
-    def __enter__(self) -> WriterPool:
+    def __enter__(self) -> "WriterPool":
         return self
 
     def __exit__(self, exception: type[BaseException] | None, *_: object) -> None:

@@ -1,7 +1,5 @@
 """Run-length encoding of masks along image columns, as in COCO RLE: from run boundaries of masks and id images to runs, boxes, counts."""
 
-from __future__ import annotations
-
 import functools
 from collections import OrderedDict
 from collections.abc import Callable, Sequence

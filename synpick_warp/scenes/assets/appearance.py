@@ -1,7 +1,5 @@
 """Colour conversion and textures: sRGB transfer function, image decoding, vertex colour baking, texture atlases."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 A model folder or light folder may come from anywhere. Its files are read whole, up to the limits here, and libraries get bytes.
 """
 
-from __future__ import annotations
-
 import codecs
 import logging
 import os

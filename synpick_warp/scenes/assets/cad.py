@@ -1,8 +1,6 @@
 """Import of STL, binary and text, and of STEP (ISO 10303-21), whose surfaces are tessellated by OpenCASCADE through cascadio, which is
 optional, and read as the GLB that it makes."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Mesh import: PLY, OBJ, glTF, STL and STEP files, each as one triangle mesh with one material."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -4,8 +4,6 @@ Three layouts: BOP's (obj_NNNNNN.ply), meshes side by side, and a folder per obj
 YCB (Calli et al., 2015) have.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass

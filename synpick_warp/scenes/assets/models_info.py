@@ -1,7 +1,5 @@
 """BOP model folders: obj_ids in file names, and models_info.json (diameters, symmetries)."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """Vertex normals: smooth ones, and ones with creases, where vertices are split along sharp edges."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components

@@ -4,8 +4,6 @@ Rows of text are read by trimesh. Binary ones are read here: trimesh takes all l
 triangles and quads are not.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import struct

@@ -5,8 +5,6 @@ the visible faces are merged to nearly flat facets (region growing), each facet 
 polygon is extruded into the solid: floors downward, walls outward, as deep as the faces on the other side of a divider allow.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections import deque
 from collections.abc import Sequence

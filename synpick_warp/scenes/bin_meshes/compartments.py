@@ -5,8 +5,6 @@ parts can lie, at the foot of walls that lean. With upright walls alone both are
 triangles of walls meet floor and rim.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -5,8 +5,6 @@ where it would spill. Holes of the floor and of the walls do not matter, since n
 where wall: `scenes.bin_meshes.compartments`.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Settings loading, with what the meshes of bins and gripper measure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

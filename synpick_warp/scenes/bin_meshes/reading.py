@@ -1,7 +1,5 @@
 """Meshes of bins: read in an isolated process, turned and placed, measured, and given collision shapes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

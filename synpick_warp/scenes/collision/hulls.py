@@ -1,8 +1,6 @@
 """Convex hulls: volume and diameter; depth above the surface of their mesh, which says whether a hull may stand for it in collisions; mass
 properties and half-spaces (H-representation) of convex polyhedra."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ single contact point, which jumps from step to step, and resting objects jitter.
 planar up to rounding, between which it finds several contacts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

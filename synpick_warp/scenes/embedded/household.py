@@ -1,8 +1,6 @@
 """Household objects: open vessels with walls (bowl, mug, pitcher), banana, drill, wood block, scissors, marker, clamps, foam block.
 Lengths [m]."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 

@@ -1,8 +1,6 @@
 """The embedded object sets: 21 household objects, with sizes and masses like those of the YCB-Video objects, and 7 industrial parts; and
 geometric solids as distractors beside them (Tobin et al., IROS 2017), plain or textured. Lengths [m]."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from functools import cache, partial

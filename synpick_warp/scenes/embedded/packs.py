@@ -1,7 +1,5 @@
 """Packaging: procedural cartons, tins and bottles with printed labels, by the table goods.toml. Lengths [m]."""
 
-from __future__ import annotations
-
 import functools
 import tomllib
 from dataclasses import dataclass

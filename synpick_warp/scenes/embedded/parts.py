@@ -1,7 +1,5 @@
 """Embedded industrial parts: bolt, nut, bracket, pipe tee, gear, sheet part, box. Lengths in this file are millimetres, as in CAD."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 

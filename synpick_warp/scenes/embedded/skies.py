@@ -1,7 +1,5 @@
 """The embedded HDR environment maps: six procedural skies and interiors. Radiance in arbitrary units; a white wall is about 1."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

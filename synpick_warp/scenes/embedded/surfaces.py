@@ -4,8 +4,6 @@ Images are (SIDE, SIDE, 3) uint8, sRGB, RGB order, of one repeat of a surface. I
 more images keep those before them.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 

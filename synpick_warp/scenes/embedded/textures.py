@@ -4,8 +4,6 @@ Images are (H, W, 3) uint8, sRGB, RGB order, top row first. Boxes are (left, top
 numbers have fixed seeds.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -4,8 +4,6 @@ The surface is symmetric under a rotation if the Hausdorff distance between it a
 condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, at least 15 mm. Texture does not count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

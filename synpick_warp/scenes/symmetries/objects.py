@@ -1,7 +1,5 @@
 """Symmetries of an object: those that its row of the object table or models_info.json declares, or else those that are detected."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

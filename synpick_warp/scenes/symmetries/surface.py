@@ -3,8 +3,6 @@
 Likeness of shapes in any size and pose is that of their shape distributions (D2; Osada et al., ACM TOG 2002).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point

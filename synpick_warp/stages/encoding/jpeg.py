@@ -4,8 +4,6 @@ Its files equal libjpeg's (`system.codecs.jpeg.encode_jpeg`) byte for byte. Only
 tenth of the image's size.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 See `system.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

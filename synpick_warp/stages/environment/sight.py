@@ -1,7 +1,5 @@
 """Observations of the vector environment, on the device: images of one camera in all worlds, and state vectors."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 

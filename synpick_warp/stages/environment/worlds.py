@@ -5,8 +5,6 @@ A world whose attempt has ended is saved in that tick; when all have ended, ever
 depends neither on the others nor on how long these take.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Ring of view batches on the device: rendered views with their ground truth, which nothing copies to the host."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from typing import Any

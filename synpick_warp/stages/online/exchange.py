@@ -8,8 +8,6 @@ On the CPU both hold by themselves for libraries that compute when they are call
 too, and on streams of its own: its users must wait for their results before they request the next batch.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

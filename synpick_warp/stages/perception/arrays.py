@@ -3,8 +3,6 @@
 Pixels are (column, row) indices of the perception image; pixel centres have integer coordinates here, as in OpenCV's contours.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import warp as wp

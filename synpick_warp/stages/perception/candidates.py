@@ -1,7 +1,5 @@
 """Two-phase stratified sampling of grasp candidates of saved states, in perception's images; their grasps are planned as in attempts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

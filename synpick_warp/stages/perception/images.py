@@ -1,7 +1,5 @@
 """Perception images: G-buffers of one camera without the gripper, for batches of worlds, entirely on the device."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

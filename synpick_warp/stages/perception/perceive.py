@@ -1,8 +1,6 @@
 """Batched perception and grasp planning for every world whose task is LOOK, as a conditional graph loop; instance segmentation and suction
 grasp points of its images, entirely on the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields
 from types import SimpleNamespace

@@ -4,8 +4,6 @@ An occlusion vote that instance j lies above i is a point on the contour of i ou
 directed acyclic graph, has edges from upper to lower instances by their votes. See the kernels for the rules.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -1,7 +1,5 @@
 """Pixel counts and bounding boxes of every instance, for a batch of views."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

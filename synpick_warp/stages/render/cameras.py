@@ -1,7 +1,5 @@
 """Cameras on the device: tables of a scene's cameras, and of the views of a batch whose matrices and poses are their own."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Mode unoccluded leaves out the first two: no ambient occlusion, no indirect light.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

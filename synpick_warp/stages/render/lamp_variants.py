@@ -1,7 +1,5 @@
 """Light randomization: variants of environment maps with lamps drawn into them, as distant discs of black-body colour."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

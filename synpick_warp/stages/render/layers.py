@@ -1,7 +1,5 @@
 """Annotation layers (AOVs) of a batch of views: those named in `render.layers`, computed from the G-buffer."""
 
-from __future__ import annotations
-
 import math
 import pkgutil
 from typing import Any

@@ -1,8 +1,6 @@
 """Tables that lighting precomputes: per environment map its lamps, SH irradiance, prefiltered specular map, exposure and sampling CDFs;
 once per device the directional albedo of the GGX lobe."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from typing import Any

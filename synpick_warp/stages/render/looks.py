@@ -1,7 +1,5 @@
 """Domain randomization of materials: tables of distributions on the device, materials of each batch of views, and records for the host."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping
 from dataclasses import replace

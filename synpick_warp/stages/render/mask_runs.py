@@ -1,7 +1,5 @@
 """Run boundaries of a batch's segmentation ids and amodal masks, from which writers build RLE and PNG masks without images."""
 
-from __future__ import annotations
-
 import warp as wp
 
 from synpick_warp.kernels.render.images.mask_runs import (

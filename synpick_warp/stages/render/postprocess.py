@@ -1,7 +1,5 @@
 """Post-processing of shaded images to sRGB bytes: exposure, tone map, and camera effects if the settings ask for them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Launcher of the triangle rasterizer, and the cached static background: tote and table, rendered once a camera."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

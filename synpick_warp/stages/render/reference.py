@@ -1,7 +1,5 @@
 """Path-traced reference renderer."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from synpick_warp.configs.schema import Render

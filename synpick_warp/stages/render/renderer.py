@@ -1,7 +1,5 @@
 """Renderer: images, annotation layers and ground truth of a batch of views, from a snapshot of all worlds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sampling rates of the denoised renderer by settings and resolution: width of coarse pixels, paths, shading samples, coverage rays."""
 
-from __future__ import annotations
-
 from synpick_warp.configs.schema import UNOCCLUDED, Render
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE

@@ -1,7 +1,5 @@
 """Constant device data of the renderer: meshes, surfaces, cameras, lights. Shared by all worlds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

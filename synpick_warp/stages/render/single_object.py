@@ -1,7 +1,5 @@
 """Renders single objects without light or surroundings, by the rasterizer, for validation and pictures of estimated poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Active stereo camera of a batch of views: launches of the infrared pair, and of stereo matching, a few views at a time."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Suctionable surface area of objects: low-discrepancy surface samples, each scored as the seal map scores a pixel."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

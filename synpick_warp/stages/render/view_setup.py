@@ -1,7 +1,5 @@
 """Per-view setup of a batch: which camera shows which world, camera-space transforms of its bodies, and tile binning."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 `kernels.render.visibility.wide_bvh` has the data layout and the ray queries.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Episode life cycle: assign, sample, drop, settle, end. Launches kernels.sim.arrangement, drop, rest and endings."""
 
-from __future__ import annotations
-
 import numpy as np
 import warp as wp
 

@@ -1,7 +1,5 @@
 """What the simulation asks of a kind of gripper: what binds objects to its head, the path of its setpoint, and its choice of grasps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol

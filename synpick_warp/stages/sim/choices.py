@@ -3,8 +3,6 @@
 A moment of choice is the end of a tick in which an attempt was planned; the attempt begins with the next tick.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gripper control and attempts: setpoints, impedance control, task transitions. Launches kernels.sim.gripper and tasks."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import newton

@@ -1,7 +1,5 @@
 """Wrapper of Newton's solver and collision pipeline: time stepping, and new objects in a world without a new model."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Simulation of all worlds, tick by tick: one tick is one output frame of simulated time. Nothing here waits for the device."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -4,8 +4,6 @@ Launches kernels.sim.sleep. Flags and islands are integers computed from contact
 and the order of threads, and are part of a world's state.
 """
 
-from __future__ import annotations
-
 import newton
 import warp as wp
 

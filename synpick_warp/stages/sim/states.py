@@ -7,8 +7,6 @@ counter-based: functions of episode, arrangement and attempt, without a state of
 checkpoint: environments render without one (`environment.settings.fixed_settings`), and candidates are sampled from G-buffers.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Step log: records poses, velocities and forces of every physics step on the device, and the support graph of every tick."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 

@@ -1,7 +1,5 @@
 """Suction: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays, vacuum, seal and seal_array."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Grasp trials: runs many grasps in parallel, each from a saved state; a work queue gives worlds that finish a trial the next one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Simulation state: device arrays of all worlds, one row a world, which persist between ticks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import warp as wp

@@ -4,8 +4,6 @@ A chart is made of panels above each other with a common x axis; a panel has lay
 only, never fields, expressions or titles.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 import struct

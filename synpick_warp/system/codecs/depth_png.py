@@ -4,8 +4,6 @@ Here are the codes, and what precedes them in the file's data (IDAT); the encode
 samples, at most eight, in the same row, so that segments of rows are coded in parallel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 MAX_RUN = 129

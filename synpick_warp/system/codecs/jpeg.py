@@ -3,8 +3,6 @@
 Both give the same bytes. Restart intervals, which the device codes in parallel, cost 0.2 % of a file's size.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import struct

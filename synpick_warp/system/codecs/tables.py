@@ -1,7 +1,5 @@
 """Tables of named columns as text, CSV, LaTeX, and texts of cells for a page."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterator, Sequence

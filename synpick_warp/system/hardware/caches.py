@@ -4,8 +4,6 @@ Both lie in the user's cache directory (XDG base directory specification) unless
 read-only or full is common in containers and batch systems, and no reason to fail.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import os

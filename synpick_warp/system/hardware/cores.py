@@ -1,7 +1,5 @@
 """CPU cores that this process may use, and the control groups (cgroups) that limit it."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Device selection, and start of Warp without its banner."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

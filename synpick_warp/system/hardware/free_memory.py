@@ -3,8 +3,6 @@
 Every number is an upper bound: caches that the system can reclaim, and swap, count as free.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Iterator

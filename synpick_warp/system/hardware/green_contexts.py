@@ -1,7 +1,5 @@
 """Spatial partitioning of a GPU with CUDA green contexts: streams restricted to disjoint sets of multiprocessors (SMs)."""
 
-from __future__ import annotations
-
 import ctypes
 from functools import cache
 

@@ -4,8 +4,6 @@ Warp compiles each module when one of its kernels is first launched, one after t
 progress, and lets compilers run in parallel; Warp generates their source code under a lock.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -6,8 +6,6 @@ error; numbers are finite, integers fit into 64 bits unless declared otherwise, 
 size, nesting and the length of dotted keys, where the standard library's parser is quadratic.
 """
 
-from __future__ import annotations
-
 import codecs
 import os
 import re

@@ -4,8 +4,6 @@ Several times as fast as OpenCV's for a crop, twice as fast for a whole depth im
 left to OpenCV, as are damaged ones.
 """
 
-from __future__ import annotations
-
 import struct
 from itertools import pairwise
 

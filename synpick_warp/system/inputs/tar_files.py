@@ -1,7 +1,5 @@
 """Members of tar files (webdataset shards), listed by their headers alone."""
 
-from __future__ import annotations
-
 import re
 import tarfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Places of data sets: a folder of this machine, also as a file:// URL, or a prefix in an object store by its URL. Imports no store."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from urllib.parse import unquote_to_bytes

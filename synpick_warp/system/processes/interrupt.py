@@ -3,8 +3,6 @@
 SIGTERM is the signal by which job schedulers announce the end of a job's time.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -6,8 +6,6 @@ call costs milliseconds, and starts from the same state each time, whatever libr
 kills it when the caller ends or closes the link (Ctrl-C). Limits are of processor time, which a busy machine does not shorten.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import importlib

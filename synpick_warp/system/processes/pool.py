@@ -4,8 +4,6 @@ The one pool of the package: files are written, images decoded, and data sets ve
 interpreters (see `processes`), so Python's global lock is no limit, and nothing of them outlives this one.
 """
 
-from __future__ import annotations
-
 import pickle
 import selectors
 import signal

@@ -1,7 +1,5 @@
 """Anonymous shared memory (memfd), the arrays in it, and slots for those of tasks: nothing leaks however the processes end."""
 
-from __future__ import annotations
-
 import contextlib
 import mmap
 import os

@@ -1,7 +1,5 @@
 """Thread utilities: a parallel map, thread names, and a check whether other threads may launch Warp kernels."""
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Callable, Iterable

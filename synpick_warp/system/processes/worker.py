@@ -4,8 +4,6 @@ Started by `subprocess`: not forked, because CUDA and threads do not survive a f
 import the main script again, and with it the whole simulator (and fail for scripts without `if __name__ == "__main__":`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

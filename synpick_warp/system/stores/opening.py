@@ -1,7 +1,5 @@
 """Factory of object stores by URL, and a capability probe: rights, difference of the clocks, conditional writes."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import importlib

@@ -4,8 +4,6 @@ generation). Objects are neither renamed nor appended to. Keys are relative to t
 By obstore, the Python binding of the Rust crate object_store.
 """
 
-from __future__ import annotations
-
 import datetime
 import functools
 import importlib

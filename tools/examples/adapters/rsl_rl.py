@@ -4,8 +4,6 @@ env = RslRlEnv(synpick_warp.make_env(task="pick", num_envs=512, action="point", 
 OnPolicyRunner(env, settings).learn(100)
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch  # pyright: ignore[reportMissingImports]

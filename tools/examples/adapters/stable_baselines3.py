@@ -4,8 +4,6 @@ env = Sb3Env(synpick_warp.make_env(task="pick", num_envs=8, action="point", obs=
 PPO("MultiInputPolicy", env).learn(1000)
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 env = TorchRlEnv(synpick_warp.make_env(task="pick", num_envs=512, autoreset="disabled"))
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 from torchrl.envs.libs.gym import GymWrapper  # pyright: ignore[reportMissingImports]

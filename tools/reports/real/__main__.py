@@ -9,8 +9,6 @@ IoU is over the pixels of all views (PASCAL VOC; Everingham et al., 2010). Each 
 of its class. Predictions are those of the network at its own size; logits are upsampled to the size of the labels.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Generator, Iterable, Iterator, Sequence

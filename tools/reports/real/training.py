@@ -8,8 +8,6 @@ The network is a residual U-Net (Zhang et al., GRSL 2018), from scratch. AdamW w
 gamma, blur, noise, JPEG), each image by its own draw.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -1,7 +1,5 @@
 """Rules about scene_gt_coco.json and scene_gt_coco_modal.json, as the toolkit's calc_gt_coco.py writes them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rules that compare files with each other: target lists with scenes, scenes of cameras that recorded together, shards with their keys."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any

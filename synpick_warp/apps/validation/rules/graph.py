@@ -1,7 +1,5 @@
 """Validation rules of scene_graph.json: edges and unstacking order against each other, support edges against the models' geometry."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 from itertools import chain
 

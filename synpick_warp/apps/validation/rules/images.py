@@ -1,7 +1,5 @@
 """Rules about colour, greyscale and depth images, and about masks: that they decode, sizes, types, and agreement with annotations."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import cv2

@@ -1,7 +1,5 @@
 """Models folders as subjects of rules, and rules about them: PLY dialect, geometry against models_info.json, symmetries."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property

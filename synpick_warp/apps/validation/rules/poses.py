@@ -4,8 +4,6 @@ Three things must agree: the pose (by its rendered silhouette and depth), the ma
 third is named, with how much it is off.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Rules about scene_camera.json, scene_gt.json and scene_gt_info.json; the last by the definitions of the toolkit's calc_gt_info.py."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from typing import Any

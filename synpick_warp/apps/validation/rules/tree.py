@@ -1,7 +1,5 @@
 """Rules about the tree: names of folders and files, links, files of the data set as a whole, and files of each scene."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Validation rules of simulated picks: tables against each other, geometry against views, outcomes against measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property

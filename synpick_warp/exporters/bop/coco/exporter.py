@@ -3,8 +3,6 @@
 Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ The header declares each split's files, as key_to_shard.json lies beside them, a
 views, and miss masks of scenes with more objects, or find nothing but null where a later scene has a light's direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Exporter of BOP datasets as webdataset shards: one tar file per scene that holds its complete views, for sequential reading."""
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 from collections.abc import Callable, Iterator, Sequence

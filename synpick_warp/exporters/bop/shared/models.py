@@ -1,7 +1,5 @@
 """Files of a BOP dataset that all scenes share: models with sizes and symmetries, camera.json, and notes for humans."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Evaluation target lists of BOP (test_targets_bop19.json, test_targets_bop24.json), from the committed scenes of the splits."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

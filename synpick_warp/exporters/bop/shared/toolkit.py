@@ -1,7 +1,5 @@
 """Entry of a data set for the BOP toolkit, which has no registry: bop_dataset_params.py, and the lines of dataset_info.md that use it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from synpick_warp.configs.cell.cameras import COLOR, DEPTH

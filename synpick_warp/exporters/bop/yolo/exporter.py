@@ -1,7 +1,5 @@
 """Exporter of YOLO's text labels, as Ultralytics reads them: segments, boxes and oriented boxes of the visible masks."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -3,8 +3,6 @@
 Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,6 @@
 Of the JSON only what is declared here is read: geometry, nodes, base colour and metallic-roughness with their images.
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import os

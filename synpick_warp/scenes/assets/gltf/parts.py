@@ -1,7 +1,5 @@
 """glTF import: accessors, materials and nodes of a validated document, as one part for each instance of a primitive."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path
