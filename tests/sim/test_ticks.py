@@ -1,6 +1,6 @@
 """Tick loop: ticks come in order, physics is ahead as far as it may be, and no snapshot is overwritten while a queue still reads it.
 
-First on the device; then on a model of a GPU that executes its streams in random order; last, what a snapshot says of the frame before.
+First on the device; then on a model of a GPU that executes its streams in random order.
 """
 
 import contextlib
@@ -15,26 +15,18 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given
-from hypothesis import settings as examples
-from hypothesis import strategies as st
 
 from synpick_warp.codes import Phase, Status, column_names
 from synpick_warp.factory import memory_plan
-from synpick_warp.kernels.sim import snapshot as snapshots
-from synpick_warp.kernels.structs import CatalogData
 from synpick_warp.stages import host_copies, ticks
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.buffers import LastFrame, Snapshot
-from synpick_warp.stages.launch import launch
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.ticks import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
-from synpick_warp.system.hardware.device import pick_device
 from tests.harness.cuda_model import ModelArray, ModelDevice
-from tests.harness.environment import default_device
 from tests.harness.memory_tables import queued_ticks
 from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings
@@ -422,86 +414,3 @@ def test_the_solver_is_restricted_to_reserved_multiprocessors_if_few_worlds_are_
         assert simulation.physics.solver_stream == ("reserved" if is_confined else None)
         loop.confine_solver(None)
         assert simulation.physics.solver_stream is None
-
-
-# ---- the frame before ----
-
-LINKED_WORLDS = 3
-SIZES = {"world": LINKED_WORLDS, "instance": 2, "fixture": 3}
-KEPT = ("catalog_index", "pose", "fixture_pose", "fixture_visible")
-TICK = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(-1, 3)), min_size=LINKED_WORLDS, max_size=LINKED_WORLDS)
-"""live, episode and frame of each world."""
-
-
-class Linked:
-    """Snapshots one after the other, told by their number: tick t of world w puts t + 10 w into every array."""
-
-    def __init__(self) -> None:
-        self.device = pick_device(default_device())
-        self.last, self.count = allocate(LastFrame, SIZES, self.device), 0
-        self.catalog = CatalogData()
-        self.catalog.radius = wp.full(32, 0.1, dtype=float, device=self.device)
-
-    def tick(self, worlds: list[tuple[int, int, int]]) -> Snapshot:
-        self.count += 1
-        made = allocate(Snapshot, SIZES, self.device)
-        for column, name in enumerate(("live", "episode", "frame")):
-            getattr(made, name).assign(np.array([row[column] for row in worlds]))
-        for name in KEPT:
-            values = getattr(made, name).numpy()
-            values[:] = (self.count + 10 * np.arange(LINKED_WORLDS)).reshape(LINKED_WORLDS, *(1,) * (values.ndim - 1))
-            getattr(made, name).assign(values)
-        launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, self.last, catalog=self.catalog)
-        return made
-
-
-@pytest.mark.parametrize(
-    ("world", "follows"),
-    [
-        ([(0, 4, -1), (1, 4, 0), (1, 4, 1), (1, 4, 2), (0, 7, -1), (1, 7, 0), (1, 7, 1)], [0, 0, 1, 1, 0, 0, 1]),
-        # The last frame of a failed try is not live; then the same number comes again from frame 0.
-        ([(1, 4, 0), (1, 4, 1), (0, 4, 2), (0, 4, -1), (1, 4, 0), (1, 4, 1)], [0, 1, 0, 0, 0, 1]),
-    ],
-    ids=["never across episodes", "drawn again"],
-)
-def test_frames_follow_within_an_episode(world, follows):
-    linked = Linked()
-    assert [linked.tick([tick] * LINKED_WORLDS).follows.numpy()[0] for tick in world] == follows
-
-
-@given(st.lists(TICK, min_size=1, max_size=6))
-@examples(max_examples=30)
-def test_every_snapshot_has_the_one_before_beside_it(script):
-    linked, before = Linked(), [(0, 0, 0)] * LINKED_WORLDS
-    for number, worlds in enumerate(script):
-        made = linked.tick(worlds)
-        pairs = zip(worlds, before, strict=True)
-        expected = [now[0] and was[0] and now[1] == was[1] and now[2] == was[2] + 1 for now, was in pairs]
-        assert made.follows.numpy().tolist() == expected
-        for name in KEPT:
-            values = getattr(made, f"last_{name}").numpy().reshape(LINKED_WORLDS, -1)
-            told = number + 10 * np.arange(LINKED_WORLDS) if number else np.zeros(LINKED_WORLDS)
-            np.testing.assert_array_equal(values, np.broadcast_to(told[:, None], values.shape))
-        before = worlds
-
-
-@pytest.mark.parametrize(
-    ("moved", "turned", "held"), [(0.0, 0.0, True), (9e-6, 0.0, True), (1.1e-5, 0.0, False), (0.0, 9e-5, True), (0.0, 1.1e-4, False)]
-)
-def test_poses_are_held_until_a_point_moves_by_10_um(moved, turned, held):
-    """Of an object whose points lie within 0.1 m of its origin."""
-    linked = Linked()
-    first = linked.tick([(1, 0, 0)] * LINKED_WORLDS)
-    first.catalog_index.zero_()
-    poses = np.tile(np.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0], np.float32), (LINKED_WORLDS, 2, 1))
-    linked.last.pose.assign(poses)
-    linked.last.catalog_index.zero_()
-    made = allocate(Snapshot, SIZES, linked.device)
-    made.live.fill_(1)
-    made.frame.fill_(1)
-    now = poses + np.array([moved, 0.0, 0.0, np.sin(turned / 2), 0.0, 0.0, np.cos(turned / 2) - 1.0], np.float32)
-    made.pose.assign(now)
-    launch(snapshots.link_frames_kernel, LINKED_WORLDS, made, linked.last, catalog=linked.catalog)
-    np.testing.assert_array_equal(made.pose.numpy(), poses if held else now)
-    np.testing.assert_array_equal(made.last_pose.numpy(), poses)
-    np.testing.assert_array_equal(linked.last.pose.numpy(), made.pose.numpy())
