@@ -37,7 +37,7 @@ WORLDS = MIN_GPU_WORLDS + 1
 NAMES = (
     "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewBodies GBuffer ShadedImage "
     "BoundaryBuffers BoundaryScratch Guide CoarseLight RatioImages LampShadows ShadowRays EdgeLists FootprintLists VisibilityBuffer "
-    "CameraTable BorderBoxes DirtyTiles KeptColors LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums"
+    "CameraTable BorderBoxes KeptColors LightHistory MovingBodies PathLists PathQueues DepthBuffers DepthScratch SlotSums TileFlags"
 )
 BASE = set(NAMES.split())
 """Declarations of which every bake has arrays."""

@@ -6,7 +6,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
-from synpick_warp.kernels.render.lighting.denoise import ALL_STAGES, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
+from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
+from synpick_warp.kernels.render.lighting.tile_flags import ALL_STAGES, TileFlags
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
@@ -36,8 +37,9 @@ class FlatDenoiser:
         self.show(np.ones((height, width)), np.ones((height, width)))
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, device) for _ in range(2))
-        self.stages = wp.full((1, self.count // 32), ALL_STAGES, dtype=wp.uint8, device=device)
-        self.history_row = wp.zeros(1, dtype=wp.int32, device=device)
+        self.flags = TileFlags()
+        self.flags.stages = wp.full((1, self.count // 32), ALL_STAGES, dtype=wp.uint8, device=device)
+        self.flags.history_row = wp.zeros(1, dtype=wp.int32, device=device)
         names = ("diffuse", "specular", "unoccluded_diffuse", "unoccluded_specular", "indirect")
         self.light = {name: np.full((height, width, 3), float(name.startswith("unoccluded"))) for name in names}
 
@@ -60,9 +62,9 @@ class FlatDenoiser:
         for kernel, source, rules, out in (
             (filter_blocks_kernel, self.coarse_light, (), self.blocks),
             (choose_widths_kernel, self.blocks, (variance_scale,), self.chosen),
-            (smooth_ratios_kernel, self.chosen, (self.history_row,), self.ratios),
+            (smooth_ratios_kernel, self.chosen, (), self.ratios),
         ):
-            wp.launch(kernel, self.count, [*shared, source, self.views, self.stages, *rules, 0], [out], device=self.device)
+            wp.launch(kernel, self.count, [*shared, source, self.views, self.flags, *rules, 0], [out], device=self.device)
         pairs = (("", self.ratios), ("chosen_", self.chosen))
         return {
             prefix + name: values for prefix, images in pairs for name, values in unpack_ratio_records(images.record.numpy()[0]).items()

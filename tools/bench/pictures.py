@@ -58,7 +58,7 @@ def _history_arrays(renderer: Renderer) -> dict[str, wp.array]:
     history, shading = light_history(renderer), renderer.shading
     if history is None or not isinstance(shading, DenoisedRenderer):
         return {}
-    kept = {"ratios": shading.ratios.record, "bodies": shading.tiles.bodies, "color": renderer.postprocessor.kept}
+    kept = {"ratios": shading.ratios.record, "bodies": shading.flags.bodies, "color": renderer.postprocessor.kept}
     return {name: getattr(history, name) for name in LIGHT_HISTORY.specs} | {name: array for name, array in kept.items() if array.size}
 
 

@@ -19,13 +19,12 @@ from synpick_warp.kernels.render.images.antialias import (
 )
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.denoise import (
-    ALL_STAGES,
     choose_widths_kernel,
     filter_blocks_kernel,
     plan_stages_kernel,
     smooth_ratios_kernel,
 )
-from synpick_warp.kernels.render.lighting.dirty_tiles import DirtyTiles, mark_dirty_tiles_kernel, plan_passes_kernel
+from synpick_warp.kernels.render.lighting.dirty_tiles import mark_dirty_tiles_kernel, plan_passes_kernel
 from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, advance_history_kernel
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.paths.bounces import extend_queued_paths_kernel
@@ -46,6 +45,7 @@ from synpick_warp.kernels.render.lighting.shadow_edges import (
 )
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
 from synpick_warp.kernels.render.lighting.shadows import ShadowRays, trace_shadow_rays_kernel
+from synpick_warp.kernels.render.lighting.tile_flags import ALL_STAGES, TileFlags
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -118,8 +118,8 @@ LIGHT_HISTORY = struct_arrays(
     episode=("world_camera",),
     frame=("world_camera",),
 )
-DIRTY_TILES = struct_arrays(
-    DirtyTiles,
+TILE_FLAGS = struct_arrays(
+    TileFlags,
     "view",
     history_row=("view",),
     stages=("view", "cell_tile"),
@@ -289,9 +289,9 @@ class DenoisedRenderer:
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
         sizes["cell_tile"], sizes["shadow_tile"] = self.coarse.grid.tiles, self.shadow_grid.grid.tiles
-        self.tiles = allocate_struct(DIRTY_TILES, sizes if self.reuses else sizes | {"world_camera": 0}, scene.device)
-        self.tiles.stages.fill_(ALL_STAGES)
-        self.tiles.history_row.assign(np.arange(views))
+        self.flags = allocate_struct(TILE_FLAGS, sizes if self.reuses else sizes | {"world_camera": 0}, scene.device)
+        self.flags.stages.fill_(ALL_STAGES)
+        self.flags.history_row.assign(np.arange(views))
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
 
@@ -328,9 +328,7 @@ class DenoisedRenderer:
             return
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.frames, views]
-        wp.launch(
-            kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving, self.tiles.history_row], **options
-        )
+        wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving, self.flags], **options)
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
@@ -342,13 +340,13 @@ class DenoisedRenderer:
         scene, views, threads = self.scene, shot.views, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
         if self.history.max_paths > 0:
             self.path_lists.count.zero_()
-            self.tiles.due.zero_()
-            inputs, outputs = [scene.paths, self.coarse, shot, self.moving], [self.history, self.path_lists, self.tiles.due]
+            self.flags.due.zero_()
+            inputs, outputs = [scene.paths, self.coarse, shot, self.moving], [self.history, self.path_lists, self.flags]
             launch_views(schedule_paths_kernel, views.count, threads, inputs, outputs, scene.device)
-            dim, inputs = (views.count, self.coarse.grid.tiles), [self.coarse.grid, self.tiles.due]
-            wp.launch(plan_stages_kernel, dim=dim, inputs=inputs, outputs=[self.tiles.stages], device=scene.device)
+            dim, inputs = (views.count, self.coarse.grid.tiles), [self.coarse.grid]
+            wp.launch(plan_stages_kernel, dim=dim, inputs=inputs, outputs=[self.flags], device=scene.device)
             inputs, outputs = (
-                [scene.paths, self.coarse, shot, self.path_lists, self.tiles.stages],
+                [scene.paths, self.coarse, shot, self.path_lists, self.flags],
                 [self.history, self.guide, self.coarse_light],
             )
             self._launch(reuse_histories_kernel, self.coarse.grid, views, inputs, outputs)
@@ -376,17 +374,17 @@ class DenoisedRenderer:
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""
         shared = [self.coarse, self.guide]
-        self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views, self.tiles.stages], [self.blocks])
-        inputs = [*shared, self.blocks, views, self.tiles.stages, self.variance_scale]
+        self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views, self.flags], [self.blocks])
+        inputs = [*shared, self.blocks, views, self.flags, self.variance_scale]
         self._launch(choose_widths_kernel, self.coarse.grid, views, inputs, [self.chosen])
-        inputs = [*shared, self.chosen, views, self.tiles.stages, self.tiles.history_row]
+        inputs = [*shared, self.chosen, views, self.flags]
         self._launch(smooth_ratios_kernel, self.coarse.grid, views, inputs, [self.ratios])
 
     def trace_shadows(self, shot: Any, image: Any) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
         coarse, views, inputs = self.shadow_grid, shot.views, [self.scene.plain, self.shadow_grid, shot]
-        self.tiles.shadowed.zero_()
-        outputs = [self.history, self.shadow_rays, self.tiles.shadowed]
+        self.flags.shadowed.zero_()
+        outputs = [self.history, self.shadow_rays, self.flags]
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, self.moving], outputs)
         for kernel in (filter_shadows_kernel, measure_steepness_kernel):
             self._launch(kernel, coarse.grid, views, [*inputs, self.shadow_rays], [self.shadows])
@@ -399,13 +397,13 @@ class DenoisedRenderer:
             inputs = [self.coarse, self.shadow_grid, shot, self.moving]
             dim = (shot.views.count, shot.grid.tiles)
             kernel = kernel_for(mark_dirty_tiles_kernel, *inputs)
-            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.tiles], device=self.scene.device, block_dim=PIXEL_BLOCK)
+            wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.flags], device=self.scene.device, block_dim=PIXEL_BLOCK)
 
     def plan_passes(self, shot: Any, image: Any) -> None:
         """Plan what is computed anew in each tile, once all dirty ones are marked; nothing without reuse."""
         if self.reuses:
-            inputs, dim = [shot.grid, self.tiles.dirty], (shot.views.count, shot.grid.tiles)
-            wp.launch(plan_passes_kernel, dim=dim, inputs=inputs, outputs=[image.passes], device=self.scene.device, block_dim=PIXEL_BLOCK)
+            inputs, dim = [shot.grid, self.flags], (shot.views.count, shot.grid.tiles)
+            wp.launch(plan_passes_kernel, dim=dim, inputs=inputs, outputs=[image], device=self.scene.device, block_dim=PIXEL_BLOCK)
 
     def trace_shadow_edges(self, shot: Any, image: Any) -> None:
         """Adaptive sampling at steep shadow edges: list the pixels there, trace their shadow rays, and filter the visible fractions, which
@@ -418,15 +416,15 @@ class DenoisedRenderer:
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
         sharing = lists.count.shape[1] * threads
         inputs = [scene.meshes, coarse, scene.lights, shot, self.moving, threads]
-        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, [*outputs, self.tiles.dirty], device)
+        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, [*outputs, self.flags], device)
         self.plan_passes(shot, image)
         inputs = [scene.plain, coarse, shot, lists]
-        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, image.passes, threads], [self.shadows], device)
+        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, image, threads], [self.shadows], device)
         launch_pixels(filter_shadow_edges_kernel, views.count * sharing, [*inputs, self.shadows, threads], [image], device)
 
     def shade_pixels(self, shot: Any, image: Any) -> None:
         """Deferred shading: radiance of each pixel."""
-        self._launch(self.shade_kernel, shot.grid, shot.views, [self.scene.paths, shot, bundle(DenoisedLight, self, self.tiles)], [image])
+        self._launch(self.shade_kernel, shot.grid, shot.views, [self.scene.paths, shot, bundle(DenoisedLight, self, self.flags)], [image])
         shade_floor(self.scene, shot, image)
 
     def resolve_footprints(self, shot: Any, image: Any) -> None:

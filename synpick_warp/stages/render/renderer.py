@@ -86,7 +86,7 @@ class Renderer:
                 self.shading = ReferenceRenderer(settings, seed, scene)
             else:
                 self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
-                kept, history_row = histories if self.shading.reuses else 0, self.shading.tiles.history_row
+                kept, history_row = histories if self.shading.reuses else 0, self.shading.flags.history_row
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)

@@ -10,10 +10,10 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
+from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (

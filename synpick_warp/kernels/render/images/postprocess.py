@@ -17,8 +17,8 @@ from synpick_warp.kernels.render.images.camera_effects import (
     vignette_factor,
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.environment import Lights
+from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, AnyShot, ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -65,9 +65,8 @@ def postprocess_kernel(
     tone: int,
     history_row: wp.array[int],  # (view)
     first: int,
-    # State:
-    kept_inout: wp.array3d[wp.vec3ub],  # (world_camera, row, column)
     # Out:
+    kept_inout: wp.array3d[wp.vec3ub],  # (world_camera, row, column)
     color_out: wp.array3d[wp.vec3ub],  # (view, row, column)
 ):
     """Radiance to sRGB without camera effects: exposure (the map's factor times 2 to the episode's exposure value), tone map, transfer.

@@ -20,6 +20,7 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.color import luminance, pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_light, unpack_half2
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
+from synpick_warp.kernels.render.lighting.tile_flags import BLOCK_STAGE, CHOICE_STAGE, LIGHT_STAGE, RATIO_STAGE, TileFlags, skips
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import (
@@ -29,8 +30,6 @@ from synpick_warp.kernels.render.visibility.camera import (
     AnyViews,
     ImageGrid,
     clamp_index,
-    in_image,
-    tile_of,
     tile_pixel,
 )
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
@@ -50,9 +49,6 @@ BlockRow = wp.types.vector(length=2 * int(HALF_BLOCK) + 1, dtype=wp.float32)
 """Weights of a row of a block."""
 BLOCKS_START = wp.constant(-(int(BLOCK) * (int(BLOCKS) - 1) // 2))
 """Offset of the first block of the wide kernel [coarse pixels]."""
-RATIO_STAGE, CHOICE_STAGE, BLOCK_STAGE, LIGHT_STAGE = wp.constant(1), wp.constant(2), wp.constant(4), wp.constant(8)
-"""Bits of the stages that a tile of coarse pixels needs in a frame: its ratios, its choice of kernels, its block means, its light."""
-ALL_STAGES = int(RATIO_STAGE) | int(CHOICE_STAGE) | int(BLOCK_STAGE) | int(LIGHT_STAGE)
 BORDER_VARIANCE = wp.constant(64.0 / 49.0)
 """Ratio of the variances of a mean over BLOCK² samples and over a block, whose border counts half but is shared with its neighbours."""
 MEDIUM_BLOCKS = wp.constant(4.0)
@@ -75,26 +71,20 @@ def any_due(due: wp.array2d[wp.uint8], grid: ImageGrid, view: int, tile: int, re
 
 
 @wp.kernel
-def plan_stages_kernel(grid: ImageGrid, due: wp.array2d[wp.uint8], stages_out: wp.array2d[wp.uint8]):
+def plan_stages_kernel(grid: ImageGrid, flags_inout: TileFlags):
     """Plan the stages of each tile of coarse pixels, so that all that the ratios of `due` tiles depend on is computed.
 
     Launched over view, tile of coarse pixels.
     """
     view, tile = wp.tid()
-    stages = int(due[view, tile]) * RATIO_STAGE
-    if any_due(due, grid, view, tile, 1):
+    stages = int(flags_inout.due[view, tile]) * RATIO_STAGE
+    if any_due(flags_inout.due, grid, view, tile, 1):
         stages = stages | CHOICE_STAGE
-    if any_due(due, grid, view, tile, 1 - BLOCKS_START):
+    if any_due(flags_inout.due, grid, view, tile, 1 - BLOCKS_START):
         stages = stages | BLOCK_STAGE
-    if any_due(due, grid, view, tile, 1 - BLOCKS_START + HALF_BLOCK):
+    if any_due(flags_inout.due, grid, view, tile, 1 - BLOCKS_START + HALF_BLOCK):
         stages = stages | LIGHT_STAGE
-    stages_out[view, tile] = wp.uint8(stages)
-
-
-@wp.func
-def skips(grid: ImageGrid, stages: wp.array2d[wp.uint8], stage: int, view: int, row: int, column: int) -> bool:
-    """Whether a coarse pixel lies outside the image, or its tile does not need a stage."""
-    return not in_image(grid, row, column) or (int(stages[view, tile_of(grid, row, column)]) & stage) == 0
+    flags_inout.stages[view, tile] = wp.uint8(stages)
 
 
 @wp.func
@@ -218,7 +208,7 @@ def filter_blocks_kernel(
     guide: Guide,
     coarse_light: CoarseLight,
     views: AnyViews,
-    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    flags: TileFlags,
     first: int,
     blocks_out: CoarseLight,
 ):
@@ -228,7 +218,7 @@ def filter_blocks_kernel(
     Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if skips(coarse.grid, stages, BLOCK_STAGE, view, row, column):
+    if skips(coarse.grid, flags, BLOCK_STAGE, view, row, column):
         return
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
@@ -322,7 +312,7 @@ def choose_widths_kernel(
     guide: Guide,
     blocks: CoarseLight,
     views: AnyViews,
-    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    flags: TileFlags,
     variance_scale: float,
     first: int,
     ratios_out: RatioImages,
@@ -334,7 +324,7 @@ def choose_widths_kernel(
     Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if skips(coarse.grid, stages, CHOICE_STAGE, view, row, column):
+    if skips(coarse.grid, flags, CHOICE_STAGE, view, row, column):
         return
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
@@ -382,8 +372,7 @@ def smooth_ratios_kernel(
     guide: Guide,
     ratios: RatioImages,
     views: AnyViews,
-    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
-    history_row: wp.array[int],  # (view)
+    flags: TileFlags,
     first: int,
     ratios_out: RatioImages,
 ):
@@ -393,9 +382,9 @@ def smooth_ratios_kernel(
     over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if skips(coarse.grid, stages, RATIO_STAGE, view, row, column):
+    if skips(coarse.grid, flags, RATIO_STAGE, view, row, column):
         return
-    history = history_row[view]
+    history = flags.history_row[view]
     index = flat_index(coarse.grid, view, row, column)
     surface = read_record(guide.surface, index)
     segment = surface_segment(surface)

@@ -9,9 +9,10 @@ import warp as wp
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.shadow_filter import FILTER_RADIUS, STEEPNESS_DISTANCE
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags
 from synpick_warp.kernels.render.lighting.upsampling import RING
-from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index, tile_of
-from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, EDGE_PASS, MASK_BITS, SHADE_PASS, AnyShot, ViewBodies
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index
+from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, EDGE_PASS, MASK_BITS, SHADE_PASS, AnyShot, ShadedImage, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False})
@@ -21,24 +22,6 @@ LIGHT_REACH = wp.constant(1 + int(RING))
 SHADOW_REACH = wp.constant(1 + int(STEEPNESS_DISTANCE) + int(FILTER_RADIUS))
 """Largest distance of the shadow rays that a pixel's shadows depend on [pixels of the shadow grid]: it reads its neighbours and their
 marks of edges, which depend on the steepness, and that on filtered rays."""
-
-
-@wp.struct
-class DirtyTiles:
-    """Flags of tiles that may differ from the previous frame, and what each tile showed in it."""
-
-    history_row: wp.array[int]
-    """(view): row of the light history; the view itself without histories."""
-    stages: wp.array2d[wp.uint8]
-    """(view, cell_tile): stages of the denoiser that the tile needs, bits as `denoise.RATIO_STAGE`."""
-    due: wp.array2d[wp.uint8]
-    """(view, cell_tile): 1: the denoised light of the tile's coarse pixels is new."""
-    shadowed: wp.array2d[wp.uint8]
-    """(view, shadow_tile): 1: a shadow ray of the tile's pixels of the shadow grid changed."""
-    dirty: wp.array2d[wp.uint8]
-    """(view, tile): 1: a pixel of the tile may have changed."""
-    bodies: wp.array3d[wp.uint64]
-    """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
 
 
 @wp.func
@@ -92,28 +75,28 @@ def mark_dirty_tiles_kernel(
     shadow_grid: CoarseGrid,
     shot: AnyShot,
     moving: MovingBodies,
-    tiles_inout: DirtyTiles,
+    flags_inout: TileFlags,
 ):
     """Mark the tiles of an image whose bodies, light or shadows changed since the previous frame; all if the history does not contain
     that frame. Writes `dirty` and `bodies`. Launched over view, tile.
     """
     view, tile = wp.tid()
-    history = tiles_inout.history_row[view]
+    history = flags_inout.history_row[view]
     grid = shot.grid
     row, column = (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH
     dirty = moving.holds[view] == 0
-    for word in range(tiles_inout.bodies.shape[2]):
+    for word in range(flags_inout.bodies.shape[2]):
         members = tile_word(shot.bodies, view, tile, word)
-        if members != tiles_inout.bodies[history, tile, word]:
+        if members != flags_inout.bodies[history, tile, word]:
             dirty = True
-            tiles_inout.bodies[history, tile, word] = members
+            flags_inout.bodies[history, tile, word] = members
         elif not dirty:
             dirty = any_moved(moving, view, word, members)
     if not dirty:
-        dirty = any_near(tiles_inout.due, coarse, view, row, column, LIGHT_REACH)
+        dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
     if not dirty:
-        dirty = any_near(tiles_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
-    tiles_inout.dirty[view, tile] = wp.uint8(dirty)
+        dirty = any_near(flags_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
+    flags_inout.dirty[view, tile] = wp.uint8(dirty)
 
 
 @wp.func
@@ -132,15 +115,15 @@ def distance_to_dirty(grid: ImageGrid, dirty: wp.array2d[wp.uint8], view: int, t
 
 
 @wp.kernel
-def plan_passes_kernel(grid: ImageGrid, dirty: wp.array2d[wp.uint8], passes_out: wp.array2d[wp.uint8]):
-    """Plan the passes of each tile, by its distance from the dirty ones.
+def plan_passes_kernel(grid: ImageGrid, flags: TileFlags, image_inout: ShadedImage):
+    """Plan `ShadedImage.passes` of each tile, by its distance from the dirty ones.
 
     Colours change in dirty tiles and their neighbours, since anti-aliasing and the filter of shadow edges read up to 4 pixels around. Their
     colours are computed from the radiance of the next ring of tiles, too, and that from the shadow edges of one more ring. Launched over
     view, tile.
     """
     view, tile = wp.tid()
-    distance = distance_to_dirty(grid, dirty, view, tile, 3)
+    distance = distance_to_dirty(grid, flags.dirty, view, tile, 3)
     passes = int(0)
     if distance <= 1:
         passes = passes | COLOR_PASS
@@ -148,10 +131,4 @@ def plan_passes_kernel(grid: ImageGrid, dirty: wp.array2d[wp.uint8], passes_out:
         passes = passes | SHADE_PASS
     if distance <= 3:
         passes = passes | EDGE_PASS
-    passes_out[view, tile] = wp.uint8(passes)
-
-
-@wp.func
-def needs(grid: ImageGrid, passes: wp.array2d[wp.uint8], which: int, view: int, row: int, column: int) -> bool:
-    """Whether the tile of a pixel needs a pass of `ShadedImage.passes` in this frame."""
-    return (int(passes[view, tile_of(grid, row, column)]) & which) != 0
+    image_inout.passes[view, tile] = wp.uint8(passes)

@@ -10,6 +10,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
 from synpick_warp.kernels.render.lighting.color import pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.moving_bodies import MAX_FRAMES, MovingBodies, mean_projected_area
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, body_of
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -68,18 +69,16 @@ class LightHistory:
 
 
 @kernel_of_views
-def advance_history_kernel(
-    snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies, history_row_out: wp.array[int]
-):
+def advance_history_kernel(snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies, flags_out: TileFlags):
     """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
-    frame's. `history_row_out` (view) receives the history's rows.
+    frame's, and `history_row`.
 
     Launched over view.
     """
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.slot[view]
-    history_row_out[view] = slot
+    flags_out.history_row[view] = slot
     moving_out.holds[view] = int(
         history_inout.episode[slot] == snapshot.episode[world] and history_inout.frame[slot] + 1 == snapshot.frame[world]
     )

@@ -11,7 +11,6 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.environment import (
     Lights,
     environment_radiance,
@@ -34,6 +33,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
+from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
 from synpick_warp.kernels.render.visibility.camera import hit_position, in_image, loop_ray, tile_pixel

@@ -8,7 +8,6 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
-from synpick_warp.kernels.render.lighting.dirty_tiles import needs
 from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direction, unit_heading
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
@@ -16,6 +15,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_p
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, may_change, point_direction, visible_normal
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, needs
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import EDGE_PASS, SHADE_PASS, AnyShot, Meshes, ShadedImage, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -124,7 +124,7 @@ def list_edge_pixels_kernel(
     first: int,
     shadows_inout: LampShadows,
     lists_inout: EdgeLists,
-    dirty_inout: wp.array2d[wp.uint8],  # (view, tile)
+    flags_inout: TileFlags,
 ):
     """Stream compaction: `pixel` receives the pixels at which a lamp's shadow is steep, in any order; `count` their number at PIXELS.
 
@@ -145,9 +145,9 @@ def list_edge_pixels_kernel(
                 if steepness != wp.uint32(0):
                     shadows_inout.edge[view, row, column] = steepness
                     tile = tile_of(shot.grid, row, column)
-                    if dirty_inout[view, tile] == wp.uint8(0):
+                    if flags_inout.dirty[view, tile] == wp.uint8(0):
                         if edges_may_change(lights, coarse, shot, moving, steepness, view, row, column):
-                            dirty_inout[view, tile] = wp.uint8(1)
+                            flags_inout.dirty[view, tile] = wp.uint8(1)
                     rank = wp.atomic_add(lists_inout.count, view, chunk, PIXELS, 1)
                     lists_inout.pixel[view, chunk, rank] = wp.uint16(index)
 
@@ -181,7 +181,7 @@ def trace_shadow_edges_kernel(
     coarse: CoarseGrid,
     shot: AnyShot,
     lists: EdgeLists,
-    passes: wp.array2d[wp.uint8],  # (view, tile)
+    image: ShadedImage,
     threads: int,
     first: int,
     shadows_inout: LampShadows,
@@ -201,7 +201,7 @@ def trace_shadow_edges_kernel(
     heading = unit_heading(shot.snapshot.light_yaw[world])
     for index in range(start, lists.count[view, chunk, PIXELS], threads):
         row, column = listed_pixel(coarse, lists.cell, view, chunk, int(lists.pixel[view, chunk, index]))
-        if not needs(shot.grid, passes, EDGE_PASS, view, row, column):
+        if not needs(shot.grid, image.passes, EDGE_PASS, view, row, column):
             continue
         steep = shadows_inout.edge[view, row, column]
         shadows_inout.edge[view, row, column] = trace_pixel_edges(scene, coarse, shot, which, heading, steep, view, row, column)

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.lighting.environment import Lights, lamp_direct
 from synpick_warp.kernels.render.lighting.history import LightHistory
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, rests
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, face_normal, read_hit
@@ -221,10 +222,10 @@ def trace_shadow_rays_kernel(
     first: int,
     history_inout: LightHistory,
     rays_out: ShadowRays,
-    shadowed_out: wp.array2d[wp.uint8],  # (view, shadow_tile)
+    flags_out: TileFlags,
 ):
     """Shadow rays from the middle pixels of the shadow grid, traced or reused from the last frame; writes `rays_out` and the history.
-    `shadowed_out`, which must be 0, becomes 1 in tiles where their results or surfaces differ from the last frame's.
+    `shadowed`, which must be 0, becomes 1 in tiles where their results or surfaces differ from the last frame's.
 
     Nothing is written under a map without lamps. Rays to lamps behind the surface count as unblocked. Launched over view, grid pixel.
     """
@@ -263,7 +264,7 @@ def trace_shadow_rays_kernel(
                     if is_shadowed(scene, shot, view, position, normal, direction):
                         free -= bit
     if not known or free != last:
-        shadowed_out[view, tile_of(coarse.grid, row, column)] = wp.uint8(1)
+        flags_out.shadowed[view, tile_of(coarse.grid, row, column)] = wp.uint8(1)
     if history_inout.max_paths > 0:
         history_inout.shadows[slot, row, column] = pack_last(segment, free)
     rays_out.packed[view, row, column] = pack_rays(free, depth, segment, packed_normal)

@@ -4,7 +4,6 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, coarse_surface, flat_index, interleaved_pixel, write_guide
-from synpick_warp.kernels.render.lighting.denoise import LIGHT_STAGE
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
     MovingBodies,
@@ -19,6 +18,7 @@ from synpick_warp.kernels.render.lighting.moving_bodies import rests
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, store_light
 from synpick_warp.kernels.render.lighting.paths.lists import PathLists, append_pixel
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene, make_vertex
+from synpick_warp.kernels.render.lighting.tile_flags import LIGHT_STAGE, TileFlags, skips
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot
@@ -38,11 +38,11 @@ def schedule_paths_kernel(
     first: int,
     history_inout: LightHistory,
     lists_inout: PathLists,
-    due_out: wp.array2d[wp.uint8],  # (view, cell_tile)
+    flags_out: TileFlags,
 ):
     """Schedule paths: append the coarse pixels that trace paths in this frame (see `period_bits`) to the path lists.
 
-    Where no surface is visible, the history is reset. `due_out`, which must be 0, becomes 1 in tiles of coarse pixels whose light changes:
+    Where no surface is visible, the history is reset. `due`, which must be 0, becomes 1 in tiles of coarse pixels whose light changes:
     where a path is traced, and where the visible body moved. Launched over view, coarse pixel (interleaved order, from flat index `first`
     on).
     """
@@ -55,7 +55,7 @@ def schedule_paths_kernel(
     segment = surface.hit.segment
     tile = tile_of(coarse.grid, row, column)
     if not rests(moving, view, segment, shot.views.instances) or int(history_inout.segment[slot, row, column]) != segment:
-        due_out[view, tile] = wp.uint8(1)
+        flags_out.due[view, tile] = wp.uint8(1)
     lists_inout.listed[view, row, column] = wp.uint8(0)
     if segment == Segment.NOTHING:
         history_inout.segment[slot, row, column] = wp.uint8(Segment.NOTHING)
@@ -63,7 +63,7 @@ def schedule_paths_kernel(
     limit = lag_limit(scene.meshes, history_inout, moving, shot, view, row, column, segment, surface.position)
     known, bits = usable_paths(history_inout, slot, row, column, limit)
     if bits == 0 or is_due(phase_frame(history_inout, slot), bits):
-        due_out[view, tile] = wp.uint8(1)
+        flags_out.due[view, tile] = wp.uint8(1)
         lists_inout.listed[view, row, column] = wp.uint8(1)
         append_pixel(lists_inout, view, index, known, bits)
 
@@ -74,21 +74,18 @@ def reuse_histories_kernel(
     coarse: CoarseGrid,
     shot: AnyShot,
     lists: PathLists,
-    stages: wp.array2d[wp.uint8],  # (view, cell_tile)
+    flags: TileFlags,
     first: int,
     history: LightHistory,
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Temporal reuse: coarse pixels that trace no path in this frame get the light of their history, in tiles whose `stages` of denoising
-    need it.
+    """Temporal reuse: coarse pixels that trace no path in this frame get the light of their history, in tiles of LIGHT_STAGE.
 
     Launched over view, coarse pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
-    if not in_image(coarse.grid, row, column):
-        return
-    if (int(stages[view, tile_of(coarse.grid, row, column)]) & LIGHT_STAGE) == 0 or lists.listed[view, row, column] != wp.uint8(0):
+    if skips(coarse.grid, flags, LIGHT_STAGE, view, row, column) or lists.listed[view, row, column] != wp.uint8(0):
         return
     cell = flat_index(coarse.grid, view, row, column)
     world, snapshot = shot.views.world[view], shot.snapshot

@@ -1,0 +1,41 @@
+"""Flags of the tiles of images and of coarse grids: what is computed anew in a frame, and what keeps its values of the frame before."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, in_image, tile_of
+
+wp.set_module_options({"enable_backward": False})
+
+RATIO_STAGE, CHOICE_STAGE, BLOCK_STAGE, LIGHT_STAGE = wp.constant(1), wp.constant(2), wp.constant(4), wp.constant(8)
+"""Bits of the stages that a tile of coarse pixels needs in a frame: its ratios, its choice of kernels, its block means, its light."""
+ALL_STAGES = int(RATIO_STAGE) | int(CHOICE_STAGE) | int(BLOCK_STAGE) | int(LIGHT_STAGE)
+
+
+@wp.struct
+class TileFlags:
+    """Flags of tiles that may differ from the previous frame, and what each tile showed in it."""
+
+    history_row: wp.array[int]
+    """(view): row of the light history; the view itself without histories."""
+    stages: wp.array2d[wp.uint8]
+    """(view, cell_tile): stages of the denoiser that the tile needs, bits as RATIO_STAGE."""
+    due: wp.array2d[wp.uint8]
+    """(view, cell_tile): 1: the denoised light of the tile's coarse pixels is new."""
+    shadowed: wp.array2d[wp.uint8]
+    """(view, shadow_tile): 1: a shadow ray of the tile's pixels of the shadow grid changed."""
+    dirty: wp.array2d[wp.uint8]
+    """(view, tile): 1: a pixel of the tile may have changed."""
+    bodies: wp.array3d[wp.uint64]
+    """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
+
+
+@wp.func
+def skips(grid: ImageGrid, flags: TileFlags, stage: int, view: int, row: int, column: int) -> bool:
+    """Whether a coarse pixel lies outside the image, or its tile does not need a stage."""
+    return not in_image(grid, row, column) or (int(flags.stages[view, tile_of(grid, row, column)]) & stage) == 0
+
+
+@wp.func
+def needs(grid: ImageGrid, passes: wp.array2d[wp.uint8], which: int, view: int, row: int, column: int) -> bool:
+    """Whether the tile of a pixel needs a pass of `ShadedImage.passes` in this frame."""
+    return (int(passes[view, tile_of(grid, row, column)]) & which) != 0
