@@ -52,6 +52,8 @@ from synpick_warp.stages.view_ring import RING, allocate_ring, history_count, vi
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
+KEPT_PICTURES = "pictures kept over frames"
+"""Name of the term of `render.reuse`."""
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 ROW_BYTES = 12
@@ -259,7 +261,7 @@ def _images(
     if history:
         yield _term("light averaged over frames", (array for array in history if array not in kept), _HISTORY)
     # Kernels index these by image, row and column.
-    yield _term("pictures kept over frames", kept, _HISTORY, indexed=False)
+    yield _term(KEPT_PICTURES, kept, _HISTORY, indexed=False)
     yield _term(f"images of {views:,} views of {size}", others + images, _VIEWS)
     yield _term(f"backgrounds of {cameras:,} cameras of {size}", background, _CAMERAS)
     if copied and device.is_cuda:

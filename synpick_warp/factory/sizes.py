@@ -1,7 +1,7 @@
 """Sizes of a bake that its settings leave open (0): worlds and batches of a device, and writer processes, from what the machine has free.
 
-No output depends on them. Worlds follow from the number of episodes; where memory is short, batches are halved, and worlds reduced by a
-quarter, until the memory plan and its headroom fit.
+No output depends on them. Worlds follow from the number of episodes; where memory is short, pictures are no longer kept over frames, then
+batches are halved, and worlds reduced by a quarter, until the memory plan and its headroom fit.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
-from synpick_warp.factory.memory_plan import Term, free_memory, plan_memory, split_memories
+from synpick_warp.factory.memory_plan import KEPT_PICTURES, Term, free_memory, plan_memory, split_memories
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.sim.trials import count_trial_worlds
@@ -46,6 +46,9 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
     while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
+        if any(term.name == KEPT_PICTURES and term.size for term in terms):
+            config = config.with_values({"render.reuse": False})
+            continue
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
             "render.views_per_batch": max(

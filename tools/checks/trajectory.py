@@ -29,7 +29,8 @@ MAX_SPEED_FRACTION = 0.95
 def make_measures() -> dict[str, MeasuredValue]:
     """Make the measures of all bounded quantities, without values."""
     return {
-        "pose": MeasuredValue("objects: last step against frame", "m", 0.0),
+        "pose": MeasuredValue("objects: last step against frame, which holds poses", "m", 1.01e-5),
+        "turn": MeasuredValue("the same, quaternions", "", 1e-3),
         "labels": MeasuredValue("arrays without unit, description or dimension names", "", 0.0),
         "finite": MeasuredValue("objects: poses that are not finite", "", 0.0),
         "speed": MeasuredValue("objects: speed, by displacement over a tick", "m/s", MAX_SPEED),
@@ -72,7 +73,9 @@ def check_objects(
     """Check poses, velocities and contact forces of objects; `mass` (instance) [kg]."""
     count, step, gravity = root["steps_per_tick"], root["step"], root["gravity"]
     present = ticks["object_id"] >= 0
-    measures["pose"].update_max((steps["pose"][count - 1 :: count] - ticks["pose"])[present], where)
+    held = (steps["pose"][count - 1 :: count] - ticks["pose"])[present]
+    measures["pose"].update_max(held[:, :3], where)
+    measures["turn"].update_max(held[:, 3:], where)
     velocity, force = steps["velocity"].astype(float), steps["contact_force"].astype(float)
     inertial_force = mass[:, None] * np.diff(velocity, axis=0) / step
     residual = np.linalg.norm(inertial_force + mass[:, None] * np.array([0.0, 0.0, gravity]) - force[1:], axis=2)

@@ -196,6 +196,7 @@ def _found(data: DataSet) -> ForeignScenes:
 def convert_foreign(data: DataSet, out: Path, formats: Sequence[str], processes: int, report: Report) -> tuple[int, str]:
     """Convert all scenes of a data set from another source; returns their number, and a remark if masks were rendered (else empty).
     Arguments and errors: `run.convert`, but `out` must be new or empty."""
+    _renderer.cache_clear()  # Another data set may have stood in this folder before.
     index = next((index for index, episode in data.items() if len(episode)), None)
     if index is None:
         raise DatasetError(f"{data.folder} has no images")

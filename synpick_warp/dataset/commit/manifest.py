@@ -66,6 +66,7 @@ FREE_SETTINGS = (
     "randomize.distractor_models",
     "bake.writers",
     "render.views_per_batch",
+    "render.reuse",
     "perception.views",
     "gripper.mesh",
     "picks.worlds",

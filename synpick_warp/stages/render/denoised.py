@@ -210,13 +210,6 @@ def history_sizes(render: Render, width: int, height: int, histories: int) -> di
     return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
 
 
-def keeps_images(render: Render, width: int, height: int, histories: int, device: wp.Device) -> bool:
-    """Whether images are kept from frame to frame: with light histories, if they fit into MAX_KEPT_FRACTION of a GPU's memory, or
-    MAX_KEPT_HOST bytes of a CPU's."""
-    room = MAX_KEPT_FRACTION * device.total_memory if device.is_cuda else MAX_KEPT_HOST
-    return render.reuse and accumulates(render, histories) and histories * width * height * KEPT_BYTES <= room
-
-
 def build_coarse_grid(image: Any, size: int, rays: int = 1) -> Any:
     """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px; see there for `rays`."""
     coarse = CoarseGrid()
@@ -271,8 +264,8 @@ class DenoisedRenderer:
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
         self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
         self.history.frame.fill_(int(NEVER))
-        self.reuses = keeps_images(render, scene.width, scene.height, histories, scene.device)
         averages = accumulates(render, histories)
+        self.reuses = render.reuse and averages
         sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if averages else 0}
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import Render
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
-from synpick_warp.stages.render.denoised import keeps_images
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from tests.render.lighting.test_history import LIGHT, link
@@ -90,15 +87,6 @@ def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights):
         np.testing.assert_array_equal(kept, whole, err_msg=f"frame {frame}")
     assert np.mean(shares[True]) < 0.9
     assert np.mean(shares[False]) == 1.0
-
-
-def test_images_are_kept_if_a_gpu_has_room():
-    gpu = SimpleNamespace(is_cuda=True, total_memory=80 << 30)
-    assert keeps_images(Render(), 1920, 1080, 1536, gpu)
-    assert not keeps_images(Render(), 1920, 1080, 1536, SimpleNamespace(is_cuda=True, total_memory=24 << 30))
-    cpu = SimpleNamespace(is_cuda=False)
-    assert [keeps_images(Render(), 1920, 1080, cameras, cpu) for cameras in (170, 175)] == [True, False]
-    assert not any(keeps_images(Render(**off), 1920, 1080, 1, gpu) for off in ({"reuse": False}, {"history": 0}, {"mode": "unoccluded"}))
 
 
 def test_a_still_scene_is_shaded_when_its_light_is_due(device):
