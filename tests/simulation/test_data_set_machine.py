@@ -323,9 +323,6 @@ def test_what_a_killed_commit_leaves_is_removed_by_the_shard_that_finishes(tmp_p
 BUGS = {
     "uncommitted files stay": lambda patch: patch.setattr(OutputFolder, "_remove_incomplete", lambda self, end: None),
     "a data set may shrink": lambda patch: patch.setattr(DataLayout, "is_planned", lambda self, episode: True),
-    "a merge takes the first settings": lambda patch: patch.setattr(
-        merge, "_config", lambda parts, content: manifest.read_settings(parts[0], content)
-    ),
     "a merge moves files": lambda patch: patch.setattr(merge, "_link", _move),
 }
 """Planted bugs, by name."""
@@ -336,11 +333,7 @@ def _move(source: Path, target: Path) -> None:
     source.rename(target)
 
 
-LONG = ("uncommitted files stay", "a merge takes the first settings")
-"""Bugs that take longest to find."""
-
-
-@pytest.mark.parametrize("bug", [pytest.param(bug, marks=[pytest.mark.slow] * (bug in LONG)) for bug in BUGS])
+@pytest.mark.parametrize("bug", [pytest.param(bug, marks=[pytest.mark.slow] * (bug == "uncommitted files stay")) for bug in BUGS])
 def test_a_planted_bug_of_data_sets_is_found(bug, monkeypatch):
     BUGS[bug](monkeypatch)
     with pytest.raises((AssertionError, pytest.fail.Exception)):
