@@ -60,8 +60,8 @@ def blocks(document: str) -> list[tuple[str, str]]:
 
 
 def run_blocks(document: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **quick: object) -> str:
-    """Run the blocks of a document in a folder; returns what they print. Commands and Python run in this process, which has loaded the
-    kernels, except for PyTorch's loader, which forks; settings of a quick bake are all that is added."""
+    """Execute the code blocks of a document in a folder; returns their output. Commands and Python code run in this process, which has the
+    kernels loaded, except for PyTorch's data loader, which forks. `quick`: settings that are added to `bake`."""
     stubs = [] if importlib.util.find_spec("torch") else [str(ROOT / "tests" / "stubs")]
     paths = os.pathsep.join([*stubs, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]))

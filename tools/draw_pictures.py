@@ -147,8 +147,8 @@ def draw_pick(episode: Episode) -> list[Image]:
 
 
 def draw_cell(folder: Path) -> Image:
-    """Picture of the robot cell that the first STEPS code blocks of the page make in a folder without a CELL: CELL/cell.png. Raises
-    SynpickError: a block failed."""
+    """Render the robot cell of the documentation: the first STEPS code blocks of the page, run in `folder`, write CELL/cell.png. Raises
+    SynpickError if a block fails."""
     command, root = f'synpick-warp() {{ {shlex.quote(sys.executable)} -m synpick_warp "$@"; }}\n', str(PAGE.parents[1])
     for language, text in re.findall(r"```(bash|python)\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)[:STEPS]:
         program = [sys.executable, "-c", text] if language == "python" else ["bash", "-e", "-c", command + text]

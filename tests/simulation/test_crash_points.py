@@ -33,7 +33,7 @@ CONFIG = scripted_bake.small_settings()
 SENSORS = scripted_bake.settings(2, ("bop",)).with_values({"bop.layout": "multisensor", "bop.keypoints": 4, "bop.coco": False})
 PICKS = scripted_bake.settings(2, ("bop", "picks"))
 EVERY = 16
-"""Stride of the crash points of one test: fast tests take the first residue, slow tests the others, of some cases."""
+"""Each test takes every EVERY-th crash point. Fast tests begin with the first, slow tests with the others, of some cases."""
 
 
 BAKES = {

@@ -136,7 +136,7 @@ class DataSets(RuleBasedStateMachine):
         power=st.booleans(),
     )
     def bake(self, name, kind, planned, part, stop_after, crash, power):
-        """Bake a shard or all: new, resumed, or grown; perhaps stopped after an episode, or killed at a change, perhaps by a power cut."""
+        """Bake all episodes or a shard: start, resume or extend a data set; may be stopped after an episode, killed, or lose power."""
         if part[0] >= planned:
             return
         make = functools.partial(scripted_bake.bake, self.folder(name), config_of(kind, planned), part, stop_after)
@@ -158,7 +158,7 @@ class DataSets(RuleBasedStateMachine):
             self._look(name, known, after)
 
     def _ends(self, name: str, change: Callable[[], Any], number: int, power: bool = False) -> bool:
-        """Make a change that is killed at a modification of the folder (0: at none); returns whether it came to its end."""
+        """Run an operation that is killed at modification `number` of the folder (0: never); returns whether it completed."""
         folder = self.folder(name)
         folder.mkdir(exist_ok=True)
         with CrashingDisk(folder, number) as disk:
@@ -174,7 +174,7 @@ class DataSets(RuleBasedStateMachine):
         return False
 
     def _look(self, name: str, before: Known, after: Known) -> None:
-        """Take over what a killed bake left: nothing that was whole is lost, and nothing is there that it was not to make."""
+        """Update the model from the folder after a killed bake: no complete episode is lost, and none exists that was not requested."""
         folder = self.folder(name)
         if not (folder / MANIFEST_FILE).exists():
             assert not before.whole, "lost"
@@ -197,7 +197,7 @@ class DataSets(RuleBasedStateMachine):
     @precondition(lambda self: any(known.whole for known in self.known.values()))
     @rule(data=st.data())
     def lose(self, data):
-        """A file of an episode, or its mark, is lost."""
+        """Delete a file of an episode, or its commit mark."""
         name = data.draw(st.sampled_from(sorted(name for name, known in self.known.items() if known.whole)))
         known = self.known[name]
         episode = data.draw(st.sampled_from(sorted(known.whole)))

@@ -33,8 +33,8 @@ class Result:
 
 
 def run_module(client: str, python: str, module: str, *arguments: str) -> tuple[Result, str]:
-    """Run a module of this checkout in a client's interpreter. Returns its row, with the reason in `agreement` if it is not installed, has
-    failed or gave no answer; and what it printed (empty if so)."""
+    """Run a module of this checkout with a client's Python interpreter. Returns the client's result and its output. If the client is not
+    installed, fails or prints no result, `agreement` states the reason, and the output is empty."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONWARNINGS": "ignore"}
     command = (python, "-m", module, client, *arguments)
     try:

@@ -141,7 +141,7 @@ class BinSizes:
     noun: str
     """What it is, in sentences: tote, bin, pallet or table."""
     shell: Tote | None
-    """Sizes and material of its walls, or file of its mesh; None: it has none."""
+    """Dimensions and material of the walls, or their mesh file; None: a bin without walls."""
     outer: Sides
     floor: Sides
     """Inner floor."""
@@ -189,12 +189,12 @@ class BinSizes:
 
     @property
     def turn(self) -> float:
-        """Angle about z of its frame in the world, without that which an episode draws [rad]."""
+        """Yaw of the bin's frame in the world [rad], without the random yaw of an episode."""
         return math.radians(self.measured.yaw or 0.0) if self.measured else 0.0
 
     @property
     def ground(self) -> float:
-        """z of its underside in the world, if it is the first bin: that of the table."""
+        """Height of the underside of the floor in the world [m]; the table is at that of the first bin."""
         return self.origin[2] + self.base
 
     def to_world(self, point: Point) -> Point:

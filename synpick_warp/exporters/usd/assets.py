@@ -198,7 +198,7 @@ def write_light_maps(library: Path, lights: tuple[EnvironmentMap, ...]) -> None:
 
 
 def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
-    """Separate an environment map and its sun so that no light counts twice, by the same rule as the renderer.
+    """Split an environment map into sky and sun, so that the sun is not counted twice, as the renderer does.
 
     The sun has the colour given with the map. Its luminance is the given one or that of the bright region it replaces, whichever is larger.
     Returns the map (H, 2H, 3) without that region, or with a disc in its place if the sun is wide; the sun's irradiance (3), zero if it has

@@ -11,8 +11,8 @@ from synpick_warp.kernels.structs import BinData, CatalogData, LayoutData
 wp.set_module_options({"enable_backward": False})
 
 HOLD = wp.constant(1.0e-5)
-"""Hysteresis of snapshots: a body keeps its pose of the previous frame until a point of it is farther from it than this [m], a tenth of a
-count of depth. Bodies at rest creep by 0.1 to 50 µm a tick; held, most have the bits of the frame before, and so has what they show."""
+"""Hysteresis of poses: a body keeps the pose of the previous frame until one of its points is displaced by more than this [m], a tenth of
+a depth count. Bodies at rest creep by 0.1 to 50 µm a tick; with it, most have identical poses in successive frames."""
 FIXTURE_REACH = wp.constant(1.0)
 """Upper bound of the distance of a fixture's points from its origin [m]."""
 

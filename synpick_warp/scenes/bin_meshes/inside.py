@@ -102,16 +102,16 @@ def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarr
 
 
 def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (N, 3) of the triangles that `subdivide` makes, once for every edge that is cut there, and the given triangle of each."""
+    """Vertices (N, 3) of the triangles of `subdivide`, one for each split edge, and the index of the input triangle of each."""
     parts = [(middle, owner) for _, _, _, middle, owner in _bisect(corners, longest)]
     points = np.concatenate([corners.reshape(-1, 3).T, *(middle for middle, _ in parts)], axis=1).T
     return points, np.concatenate([np.repeat(np.arange(len(corners)), 3), *(owner for _, owner in parts)])
 
 
 def _bisect(corners: np.ndarray, longest: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Longest-edge bisection (Rivara, 1984), in batches that stay in the processor's cache. Yields triangles of a batch (3, 3, N) by corner
-    and coordinate, and the given one of each (N); which of them have no edge that exceeds `longest` (N) bool; middles of the longest edges
-    of all others (3, M), and the given triangle of each (M)."""
+    """Longest-edge bisection (Rivara, 1984), in batches that fit into the processor's cache. Yields for each batch its triangles
+    (corner, coordinate, N) and the indices of their input triangles (N); a mask of those whose edges are at most `longest` (N) bool; for
+    all others the midpoints of their longest edges (3, M) and the indices of their input triangles (M)."""
     corners = np.ascontiguousarray(corners.transpose(1, 2, 0))
     edges = np.stack([_distance(corners[k], corners[(k + 1) % 3]) for k in range(3)])
     waiting = [(corners, edges, np.arange(corners.shape[2]))]

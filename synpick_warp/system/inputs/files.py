@@ -157,15 +157,15 @@ def read_json(path: Path, schema: type[_Content], error: type[SynpickError], adv
 
 
 def _describe(fault: Exception) -> str:
-    """Text of a decoding error for a message, as part of a sentence."""
+    """Format a decoding error as part of an error message."""
     text: Any = "nested too deeply" if isinstance(fault, RecursionError) else str(fault).replace("`", "")
     return text if text.startswith("JSON") else f"{text[:1].lower()}{text[1:]}"
 
 
 MAX_TOML = 2**20
-"""Largest TOML file [bytes]; all settings with comments have 30 kB."""
+"""Maximum size of a TOML file [bytes]; all settings with comments take 30 kB."""
 MAX_KEY_PARTS = 8
-"""Most parts of a dotted key; settings have two."""
+"""Maximum number of parts of a dotted key; settings have two."""
 _STRINGS = re.compile(r'"""(?:[^\\]|\\.)*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:[^"\\\n]|\\.)*+"?|\'[^\'\n]*+\'?|#[^\n]*+', re.DOTALL)
 """Strings and comments, which may be left unclosed. Both patterns take linear time."""
 _LONG_KEY = re.compile(rf"(?<![\w'-])(?:[\w'-]++[ \t]*+\.[ \t]*+){{{MAX_KEY_PARTS}}}")

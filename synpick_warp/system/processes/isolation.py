@@ -248,8 +248,8 @@ def _exit_after(function: Callable[..., int], *arguments: Any) -> None:
 
 
 def _supervise(link: Connection, result: int, place: int) -> int:
-    """Run a request in a child, in the caller's folder (handle `place`), to which its paths are relative; send how it ended (`_outcome`),
-    and kill it if its time is over or the caller closed the link."""
+    """Supervise a request: run it in a forked child, in the caller's working directory (descriptor `place`), and send its `_outcome`. The
+    child is killed on timeout, or when the caller closes the connection."""
     os.fchdir(place)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     send(link, "started")

@@ -1,7 +1,7 @@
-"""Dirty tiles: which tiles of an image may differ from the frame before, by what bodies, light and shadows there did (damage tracking).
+"""Damage tracking: dirty tiles, which may differ from the previous frame, by bodies, light and shadows; and the passes that tiles need.
 
-A tile's pixels are functions of the bodies whose boxes its rays may hit, of the denoised light of the coarse pixels around, and of the
-shadow rays around. If none of these has changed since the previous frame, down to the bits, the tile keeps its colours of that frame.
+The pixels of a tile depend on the bodies whose boxes its rays may hit, and on the denoised light and the shadow rays around. If all of
+these are identical to those of the previous frame, the tile keeps its colours of that frame.
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""Flags of the tiles of images and of coarse grids: what is computed anew in a frame, and what keeps its values of the frame before."""
+"""Flags of the tiles of images and of coarse grids: what is recomputed in a frame; all else keeps its values of the previous frame."""
 
 import warp as wp
 

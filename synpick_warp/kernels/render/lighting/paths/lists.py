@@ -16,9 +16,9 @@ REGION_PIXELS = wp.constant(int(LANE_STRIDE) * int(LANE_STRIDE) * int(TILE_PIXEL
 FRESH, AGED = wp.constant(0), wp.constant(1)
 """Kinds of listed coarse pixels: without a valid history (`PathRules.samples` paths each), and with one (one path each)."""
 KNOWN_BITS = wp.constant(8)
-"""Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
+"""Bit width of the history length of a packed entry, as of `LightHistory.paths`."""
 _PERIOD_BITS = wp.constant(3)
-"""Bits of an entry for `period_bits`, which is at most 7."""
+"""Bit width of the field `period_bits` (0 to 7) of a packed entry."""
 
 
 @wp.struct
