@@ -1,5 +1,7 @@
 """Bit sets of instances: rows of 32-bit words, in which bit i % 32 of word i // 32 is set if instance i is a member."""
 
+from typing import Any
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -33,9 +35,9 @@ def has_members(words: wp.array2d[wp.uint32], row: int) -> bool:
 
 
 @wp.func
-def lowest_bit(word: wp.uint32) -> int:
-    """Index of the lowest bit that is set; 32 if there is none."""
-    return int(wp.bit_count(~word & (word - wp.uint32(1))))
+def lowest_bit(word: Any) -> int:
+    """Index of the lowest bit that is set in a word of 32 or 64 bits; their number if there is none."""
+    return int(wp.bit_count(~word & (word - type(word)(1))))
 
 
 @wp.func

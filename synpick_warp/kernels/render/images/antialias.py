@@ -10,6 +10,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.bitsets import lowest_bit
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
@@ -17,8 +18,8 @@ from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
-    COLOR_PASS,
     MASK_BITS,
+    SHADE_PASS,
     AnyShot,
     GBuffer,
     Hit,
@@ -222,12 +223,9 @@ def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: Sh
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
-    colored = needs(grid, image_inout.passes, COLOR_PASS, view, top, left) or needs(
-        grid, image_inout.passes, COLOR_PASS, view, bottom, right
-    )
-    if not colored and not needs(grid, image_inout.passes, COLOR_PASS, view, top, right):
-        if not needs(grid, image_inout.passes, COLOR_PASS, view, bottom, left):
-            return
+    # All pixels beside those of COLOR_PASS have it.
+    if not needs(grid, image_inout.passes, SHADE_PASS, view, bottom, right):
+        return
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
     if has_contrast(image_inout.radiance, view, top, left, bottom, right):
         if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
@@ -308,14 +306,12 @@ def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: w
     for word in range(words):
         left = bodies.body_mask[view, tile, word]
         while left != wp.uint64(0):
-            others = left & (left - wp.uint64(1))
-            # The number of bits below the lowest one that is set.
-            rank = word * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
+            rank = word * MASK_BITS + lowest_bit(left)
             segment = segment_of(bodies.order[view, rank], instances)
             if segment == segments[0] or segment == segments[1] or segment == segments[2] or segment == segments[3]:
                 ranks = ranks | (wp.uint32(rank) << wp.uint32(RANK_BITS * found))
                 found += 1
-            left = others
+            left = left & (left - wp.uint64(1))
     return ranks, found
 
 

@@ -20,7 +20,16 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.color import luminance, pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.paths.light import CoarseLight, pack_light, unpack_half2
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
-from synpick_warp.kernels.render.lighting.tile_flags import BLOCK_STAGE, CHOICE_STAGE, LIGHT_STAGE, RATIO_STAGE, TileFlags, skips
+from synpick_warp.kernels.render.lighting.tile_flags import (
+    BLOCK_STAGE,
+    CHOICE_STAGE,
+    LIGHT_STAGE,
+    RATIO_STAGE,
+    TileFlags,
+    any_flagged,
+    skips,
+    tile_corner,
+)
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import (
@@ -58,16 +67,11 @@ SAME_BODY_WEIGHT = wp.constant(0.02)
 
 
 @wp.func
-def any_due(due: wp.array2d[wp.uint8], grid: ImageGrid, view: int, tile: int, reach: int) -> bool:
+def any_due(flags: TileFlags, grid: ImageGrid, view: int, tile: int, reach: int) -> bool:
     """Whether new ratios are due in any tile with coarse pixels within `reach` of those of a tile."""
-    row, column = (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH
-    bottom = wp.min(row + TILE_HEIGHT - 1 + reach, grid.height - 1) // TILE_HEIGHT
-    right = wp.min(column + TILE_WIDTH - 1 + reach, grid.width - 1) // TILE_WIDTH
-    for r in range(wp.max(row - reach, 0) // TILE_HEIGHT, bottom + 1):
-        for c in range(wp.max(column - reach, 0) // TILE_WIDTH, right + 1):
-            if due[view, r * grid.tile_columns + c] != wp.uint8(0):
-                return True
-    return False
+    row, column = tile_corner(grid, tile)
+    bottom, right = row + TILE_HEIGHT - 1 + reach, column + TILE_WIDTH - 1 + reach
+    return any_flagged(flags.due, grid, view, row - reach, column - reach, bottom, right)
 
 
 @wp.kernel
@@ -78,11 +82,11 @@ def plan_stages_kernel(grid: ImageGrid, flags_inout: TileFlags):
     """
     view, tile = wp.tid()
     stages = int(flags_inout.due[view, tile]) * RATIO_STAGE
-    if any_due(flags_inout.due, grid, view, tile, 1):
+    if any_due(flags_inout, grid, view, tile, 1):
         stages = stages | CHOICE_STAGE
-    if any_due(flags_inout.due, grid, view, tile, 1 - BLOCKS_START):
+    if any_due(flags_inout, grid, view, tile, 1 - BLOCKS_START):
         stages = stages | BLOCK_STAGE
-    if any_due(flags_inout.due, grid, view, tile, 1 - BLOCKS_START + HALF_BLOCK):
+    if any_due(flags_inout, grid, view, tile, 1 - BLOCKS_START + HALF_BLOCK):
         stages = stages | LIGHT_STAGE
     flags_inout.stages[view, tile] = wp.uint8(stages)
 

@@ -6,10 +6,11 @@ these are identical to those of the previous frame, the tile keeps its colours o
 
 import warp as wp
 
+from synpick_warp.kernels.bitsets import lowest_bit
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.shadow_filter import FILTER_RADIUS, STEEPNESS_DISTANCE
-from synpick_warp.kernels.render.lighting.tile_flags import TileFlags
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, any_flagged, tile_corner
 from synpick_warp.kernels.render.lighting.upsampling import RING
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index
 from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, EDGE_PASS, MASK_BITS, SHADE_PASS, AnyShot, ShadedImage, ViewBodies
@@ -31,13 +32,10 @@ def tile_word(bodies: ViewBodies, view: int, tile: int, word: int) -> wp.uint64:
     for source in range(bodies.body_mask.shape[2]):
         left = bodies.body_mask[view, tile, source]
         while left != wp.uint64(0):
-            others = left & (left - wp.uint64(1))
-            # The number of bits below the lowest one that is set.
-            rank = source * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
-            body = bodies.order[view, rank]
+            body = bodies.order[view, source * MASK_BITS + lowest_bit(left)]
             if body // MASK_BITS == word:
                 result = result | (wp.uint64(1) << wp.uint64(body % MASK_BITS))
-            left = others
+            left = left & (left - wp.uint64(1))
     return result
 
 
@@ -46,44 +44,28 @@ def any_moved(moving: MovingBodies, view: int, word: int, members: wp.uint64) ->
     """Whether any body of word `word` of a bit set moved since the previous frame."""
     left = members
     while left != wp.uint64(0):
-        others = left & (left - wp.uint64(1))
-        body = word * MASK_BITS + int(wp.bit_count((left ^ others) - wp.uint64(1)))
-        if moving.moved[view, body] != wp.uint8(0):
+        if moving.moved[view, word * MASK_BITS + lowest_bit(left)] != wp.uint8(0):
             return True
-        left = others
+        left = left & (left - wp.uint64(1))
     return False
 
 
 @wp.func
 def any_near(flags: wp.array2d[wp.uint8], coarse: CoarseGrid, view: int, row: int, column: int, reach: int) -> bool:
     """Whether any tile of a coarse grid is flagged that has pixels within `reach` of those below an image tile at (row, column)."""
-    last_row, last_column = coarse.grid.height - 1, coarse.grid.width - 1
-    top = wp.max(row // coarse.size - reach, 0) // TILE_HEIGHT
-    left = wp.max(column // coarse.size - reach, 0) // TILE_WIDTH
-    bottom = wp.min((row + TILE_HEIGHT - 1) // coarse.size + reach, last_row) // TILE_HEIGHT
-    right = wp.min((column + TILE_WIDTH - 1) // coarse.size + reach, last_column) // TILE_WIDTH
-    for r in range(top, bottom + 1):
-        for c in range(left, right + 1):
-            if flags[view, r * coarse.grid.tile_columns + c] != wp.uint8(0):
-                return True
-    return False
+    bottom, right = (row + TILE_HEIGHT - 1) // coarse.size + reach, (column + TILE_WIDTH - 1) // coarse.size + reach
+    return any_flagged(flags, coarse.grid, view, row // coarse.size - reach, column // coarse.size - reach, bottom, right)
 
 
 @kernel_of_views
-def mark_dirty_tiles_kernel(
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    shot: AnyShot,
-    moving: MovingBodies,
-    flags_inout: TileFlags,
-):
+def mark_dirty_tiles_kernel(coarse: CoarseGrid, shadow_grid: CoarseGrid, shot: AnyShot, moving: MovingBodies, flags_inout: TileFlags):
     """Mark the tiles of an image whose bodies, light or shadows changed since the previous frame; all if the history does not contain
     that frame. Writes `dirty` and `bodies`. Launched over view, tile.
     """
     view, tile = wp.tid()
     history = flags_inout.history_row[view]
     grid = shot.grid
-    row, column = (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH
+    row, column = tile_corner(grid, tile)
     dirty = moving.holds[view] == 0
     for word in range(flags_inout.bodies.shape[2]):
         members = tile_word(shot.bodies, view, tile, word)

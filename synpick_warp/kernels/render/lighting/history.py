@@ -19,7 +19,7 @@ from synpick_warp.kernels.state import Frames
 wp.set_module_options({"enable_backward": False})
 
 LIGHT_CHANGE = wp.constant(0.15)
-"""Temporal lag that an average may have, as a fraction of the light; see `lag_frames`."""
+"""Temporal lag that an average may have, as a fraction of the light, see `lag_frames`; compared with others in tools/DECISIONS.md."""
 MAX_TRAVEL = wp.constant(2.0)
 """Displacement of a body [sizes] from which on it changes no more of a point's light: it has uncovered all that it covered, and covers as
 much elsewhere."""
@@ -187,7 +187,7 @@ def path_number(frame: int, bits: int) -> int:
 @wp.func
 def phase_frame(history: LightHistory, slot: int) -> int:
     """Frame of a row of the history, counted from the phase of its camera and episode (`is_due`)."""
-    return history.frame[slot] + PHASE_STEP * (history.episode[slot] + slot % history.cameras)
+    return history.frame[slot] + PHASE_STEP * (history.episode[slot] % (1 << MAX_PERIOD_BITS) + slot % history.cameras)
 
 
 @wp.func
