@@ -1,6 +1,9 @@
 """Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table; and
 environment maps: EXR files, and the parameters of dome and distant lights."""
 
+# pxr's modules are filled when they are loaded, invisible to type checkers.
+# pyright: reportAttributeAccessIssue=false
+
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
