@@ -11,6 +11,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp._version import __version__
+from synpick_warp.cli import options
 from synpick_warp.cli.commands.data_sets import convert, show_statistics, write_page
 from synpick_warp.cli.commands.estimate import estimate
 from synpick_warp.cli.commands.evaluate import evaluate
@@ -18,21 +19,6 @@ from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
 from synpick_warp.cli.commands.validate import prove, validate, verify
 from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
-from synpick_warp.cli.options import (
-    EXAMPLES,
-    EXIT_INCOMPLETE,
-    Count,
-    WholeNumber,
-    check_engine_options,
-    check_store_options,
-    describe_limit,
-    describe_misuse,
-    one_line,
-    parse_devices,
-    parse_resolution,
-    parse_shard,
-    parse_splits,
-)
 from synpick_warp.cli.streams import StreamError, describe_fault, flush_output, safe_streams
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.dataset import DataLayout
@@ -90,7 +76,7 @@ SetOption = Annotated[
         help=f"Any other setting, as section.key=value; may be repeated. `{NAME} config` prints all, with units, ranges and values.",
     ),
 ]
-WorldsOption = Annotated[Count | None, Parameter(help=_help("bake.worlds", " auto is 0."))]
+WorldsOption = Annotated[options.Count | None, Parameter(help=_help("bake.worlds", " auto is 0."))]
 ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolution", " As WIDTHxHEIGHT."))]
 DevicesOption = Annotated[
     str | None,
@@ -126,7 +112,7 @@ EngineOption = Annotated[
         "ray://HOST:PORT: by a cluster's Ray Client. pip install 'synpick-warp[ray]'."
     ),
 ]
-WorkersOption = Annotated[WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
+WorkersOption = Annotated[options.WholeNumber, Parameter(help="Workers of --engine; 0: as many as the cluster has room for at any time.")]
 PriceOption = Annotated[
     float, Parameter(help="Price an hour of a worker of --engine or --claim --devices: the progress shows the cost so far.")
 ]
@@ -143,15 +129,15 @@ def bake(
     out: OutOption = None,
     config: ConfigOption = None,
     worlds: WorldsOption = None,
-    episodes: Annotated[WholeNumber | None, Parameter(help=_help("bake.episodes"))] = None,
+    episodes: Annotated[options.WholeNumber | None, Parameter(help=_help("bake.episodes"))] = None,
     mode: Annotated[str | None, Parameter(help=_help("bake.mode", " Weights of mixed: --set bake.mix=[pick, target, move]."))] = None,
-    seed: Annotated[WholeNumber | None, Parameter(help=_help("bake.seed"))] = None,
+    seed: Annotated[options.WholeNumber | None, Parameter(help=_help("bake.seed"))] = None,
     device: DeviceOption = None,
     devices: DevicesOption = None,
     models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
     lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
     resolution: ResolutionOption = None,
-    writers: Annotated[Count | None, Parameter(help=_help("bake.writers", " auto is 0."))] = None,
+    writers: Annotated[options.Count | None, Parameter(help=_help("bake.writers", " auto is 0."))] = None,
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
     shard: ShardOption = None,
     split: SplitOption = None,
@@ -186,12 +172,12 @@ def bake(
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
     profiles = profile or profile_out is not None
-    several, names = parse_devices(devices, device, profiles), parse_splits(split)
-    part = parse_shard(shard) if shard is not None else (0, 1)
+    several, names = options.parse_devices(devices, device, profiles), options.parse_splits(split)
+    part = options.parse_shard(shard) if shard is not None else (0, 1)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     planned = DataLayout.of(resolved).plan_shard(names, part, "--shard")
-    check_store_options(out, claim=claim, shard=shard, profile=profiles)
-    check_engine_options(engine, workers, price, out, devices or shard, claim)
+    options.check_store_options(out, claim=claim, shard=shard, profile=profiles)
+    options.check_engine_options(engine, workers, price, out, devices or shard, claim)
     if dry_run:
         return _forecast(resolved, out, [episode for split in planned for episode in split])
     out = out or _default_out()
@@ -217,7 +203,7 @@ def merge(
     if merged.missing:
         shown = ", ".join(map(str, merged.missing[:MAX_LISTED])) + (", ..." if len(merged.missing) > MAX_LISTED else "")
         print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings generates them")
-    return EXIT_INCOMPLETE if merged.missing else 0
+    return options.EXIT_INCOMPLETE if merged.missing else 0
 
 
 @app.command
@@ -292,7 +278,7 @@ app.command(validate)
 app.command(verify)
 app.command(prove)
 app.command(write_page, name="report")
-for _name, _lines in EXAMPLES.items():
+for _name, _lines in options.EXAMPLES.items():
     app[_name].help_epilogue = "\n".join(["Examples:", "", "```", *(f"{NAME} {line}" for line in _lines), "```"])
 
 
@@ -318,17 +304,17 @@ def _run(arguments: list[str]) -> int:
         return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
         print(*getattr(error, "__notes__", ()), sep="", end="", file=sys.stderr)  # The traceback of a fault of ours, see `TaskError`.
-        said = describe_misuse(error) if isinstance(error, cyclopts.CycloptsError) else str(error)
-        print(f"{NAME}: error: {one_line(name_fetched(said))}", file=sys.stderr)
+        said = options.describe_misuse(error) if isinstance(error, cyclopts.CycloptsError) else str(error)
+        print(f"{NAME}: error: {options.one_line(name_fetched(said))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
-        said = describe_limit(error)
+        said = options.describe_limit(error)
         if said is None:
             raise
-        print(f"{NAME}: error: {one_line(said)}", file=sys.stderr)
+        print(f"{NAME}: error: {options.one_line(said)}", file=sys.stderr)
         return EXIT_MISTAKE
     finally:
         drop_fetched()
@@ -341,7 +327,7 @@ def _resolve(
     overrides = dict(parse_assignment(text) for text in assignments or [])
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
-        overrides["cameras.resolution"] = parse_resolution(resolution)
+        overrides["cameras.resolution"] = options.parse_resolution(resolution)
     return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
@@ -446,4 +432,4 @@ def _bake(
         print(f"{NAME}: interrupted: {done}; the same command {rest}", file=sys.stderr)
         return EXIT_SIGNAL + summary.stopped
     delivered = sum(1 for row in summary.episodes if row[2].delivers)
-    return 0 if delivered == summary.total else EXIT_INCOMPLETE
+    return 0 if delivered == summary.total else options.EXIT_INCOMPLETE

@@ -18,22 +18,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.dataset import DataLayout, episode_range
+from synpick_warp.dataset import trajectory
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.commit.plausibility import check_frames
 from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
-from synpick_warp.dataset.trajectory import (
-    GROUP_FILE,
-    Arrays,
-    GroupContext,
-    ObjectInfo,
-    StoreAttributes,
-    read_array,
-    read_attributes,
-    read_cameras,
-    read_objects,
-)
 from synpick_warp.errors import DatasetError, format_value
 from synpick_warp.exporters.formats import PartFiles, part_files
 from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
@@ -79,14 +69,14 @@ class Episode(PickTables):
         return read_checked(path, EpisodeEntry) if path.exists() else None
 
     @cached_property
-    def _context(self) -> GroupContext:
+    def _context(self) -> trajectory.GroupContext:
         """Sizes and files that the arrays must agree with."""
-        return GroupContext(lambda: self._sizes, lambda: self._files)
+        return trajectory.GroupContext(lambda: self._sizes, lambda: self._files)
 
     @cached_property
     def _sizes(self) -> dict[str, int]:
         """Sizes of the dimensions of the episode's arrays, by name."""
-        store = check_content(self._data_set.attributes, StoreAttributes, self._data_set.folder / STORE)
+        store = check_content(self._data_set.attributes, trajectory.StoreAttributes, self._data_set.folder / STORE)
         attempts = {} if self._record is None else {"attempt": len(self.attempts)}
         return {"tick": len(self), "step": len(self) * store.steps_per_tick} | attempts
 
@@ -95,9 +85,9 @@ class Episode(PickTables):
         """Paths of the episode's files, relative to the data set."""
         return self._data_set.listed_files(episode_entry(self.index))
 
-    def _arrays(self, name: str) -> Arrays:
+    def _arrays(self, name: str) -> trajectory.Arrays:
         """Arrays of a group of the episode in the zarr store."""
-        return Arrays(self.group / name, EPISODE_GROUPS[name], self._context)
+        return trajectory.Arrays(self.group / name, EPISODE_GROUPS[name], self._context)
 
     @cached_property
     def row(self) -> dict[str, Any]:
@@ -105,7 +95,7 @@ class Episode(PickTables):
         if self._data_set.found is not None:
             return {"episode": self.index, "frames": len(self.image_ids), "mode": UNKNOWN, "ending": UNKNOWN}
         row = self.attributes if self._record is None else self._record["row"]
-        frames = check_content(row, EpisodeRow, self.group / GROUP_FILE).frames
+        frames = check_content(row, EpisodeRow, self.group / trajectory.GROUP_FILE).frames
         data = self._data_set
         check_frames(data.folder, DataLayout.of(data.config) if (data.folder / CONFIG_FILE).exists() else None, self.index, frames)
         return row
@@ -114,25 +104,25 @@ class Episode(PickTables):
     def attributes(self) -> dict[str, Any]:
         """Attributes in the trajectory store: as `row`, and light. Raises DatasetError if the data set has no trajectories."""
         self._data_set.require_store()
-        return read_attributes(self.group)
+        return trajectory.read_attributes(self.group)
 
     @property
-    def ticks(self) -> Arrays:
+    def ticks(self) -> trajectory.Arrays:
         """Arrays with one row per frame; empty without trajectories, as are the following."""
         return self._arrays("ticks")
 
     @property
-    def steps(self) -> Arrays:
+    def steps(self) -> trajectory.Arrays:
         """Arrays with one row per physics step; empty if steps were not recorded."""
         return self._arrays("steps")
 
     @property
-    def arrangement(self) -> Arrays:
+    def arrangement(self) -> trajectory.Arrays:
         """Arrays of the drawn objects and how they were dropped."""
         return self._arrays("arrangement")
 
     @property
-    def attempt_arrays(self) -> Arrays:
+    def attempt_arrays(self) -> trajectory.Arrays:
         """Attempts of the episode as arrays of the zarr store, one row per attempt."""
         return self._arrays("attempts")
 
@@ -158,7 +148,7 @@ class Episode(PickTables):
             return tuple(self._record.get("attempts", ()))
         if "record" not in self.attempt_arrays:
             raise DatasetError(f"{self.group} has no array attempts/record; {ADVICE}")
-        lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
+        lines = trajectory.read_array(self.attempt_arrays["record"]).tobytes().splitlines()
         source = self.group / "attempts" / "record"
         return tuple(decode_json(line, dict[str, Any], f"{source}, line {row},", DatasetError, ADVICE) for row, line in enumerate(lines, 1))
 
@@ -259,19 +249,19 @@ class DataSet(Mapping[int, Episode]):
         """Attributes of the trajectory store: seed, step, steps per tick, names of light maps, ... Raises DatasetError if the data set has
         no trajectories."""
         self.require_store()
-        return read_attributes(self._store)
+        return trajectory.read_attributes(self._store)
 
     @cached_property
-    def objects(self) -> tuple[ObjectInfo, ...]:
+    def objects(self) -> tuple[trajectory.ObjectInfo, ...]:
         """Object table with physical properties, by catalog index; of the trajectory store. Raises DatasetError if the data set has no
         trajectories; `models_info` has sizes."""
         self.require_store()
-        return read_objects(self._store, self._constants)
+        return trajectory.read_objects(self._store, self._constants)
 
     @cached_property
-    def _constants(self) -> GroupContext:
+    def _constants(self) -> trajectory.GroupContext:
         """Files that the arrays of the store's tables must agree with."""
-        return GroupContext(files=lambda: self.listed_files(CONSTANTS))
+        return trajectory.GroupContext(files=lambda: self.listed_files(CONSTANTS))
 
     def listed_files(self, entry: Path) -> frozenset[Path]:
         """Files of the trajectory store that a manifest entry lists; none if the data set has no such entry. Raises DatasetError if the
@@ -292,7 +282,9 @@ class DataSet(Mapping[int, Episode]):
     def cameras(self) -> tuple[Camera, ...]:
         """The cameras by index. Raises DatasetError for a data set from another source, whose views have cameras of their own."""
         if self.has_store:
-            return read_cameras(self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants)
+            return trajectory.read_cameras(
+                self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants
+            )
         from synpick_warp.scenes.cameras import make_cameras
 
         return make_cameras(self.config.rig)
@@ -358,7 +350,7 @@ class DataSet(Mapping[int, Episode]):
     @property
     def has_store(self) -> bool:
         """Whether there is a trajectory store."""
-        return (self._store / EPISODES / GROUP_FILE).is_file()
+        return (self._store / EPISODES / trajectory.GROUP_FILE).is_file()
 
     def require_store(self) -> None:
         """Raise DatasetError unless there is a trajectory store."""
@@ -411,7 +403,7 @@ class DataSet(Mapping[int, Episode]):
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in any format."""
-        paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, *(self.folder / part.file(index) for part in self._parts)]
+        paths = [self._store / EPISODES / f"{index:06d}" / trajectory.GROUP_FILE, *(self.folder / part.file(index) for part in self._parts)]
         return any(path.exists() for path in paths) or (self._scenes is not None and self._scenes.has(index))
 
     def _names(self) -> Iterator[int]:

@@ -11,26 +11,15 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Ending, Outcome, Phase
+from synpick_warp.environment import settings as env_settings
 from synpick_warp.environment.episodes import Episodes, check_mask, choose_environments, choose_indices, host_array, make_seeds
-from synpick_warp.environment.settings import (
-    MOVE,
-    NEXT_STEP,
-    NUMPY,
-    OBSERVATIONS,
-    PIXEL,
-    POINT,
-    SAME_STEP,
-    TARGET,
-    TORCH,
-    EnvironmentChoice,
-)
 from synpick_warp.errors import ActionError, StateError
 from synpick_warp.stages.environment.worlds import EnvironmentWorlds
 from synpick_warp.stages.sim.states import State, check_array
 
 TWIST_SPEED, TWIST_RATE = 0.25, 1.0
 """Velocity [m/s] and angular rates [rad/s] that a twist of 1 commands; whole picks descend the last 5 cm at 0.1 m/s."""
-ACTION_SIZES = {PIXEL: 2, POINT: 6}
+ACTION_SIZES = {env_settings.PIXEL: 2, env_settings.POINT: 6}
 """Values of an action of a whole pick."""
 COMMAND = 6
 """Values of a twist."""
@@ -59,7 +48,7 @@ class PickingEnvironment:
 
     `bounds` are the lowest and highest point that an action may name, each (3) float32 [m]."""
 
-    def __init__(self, choice: EnvironmentChoice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+    def __init__(self, choice: env_settings.EnvironmentChoice, worlds: EnvironmentWorlds, bounds: tuple[np.ndarray, np.ndarray]) -> None:
         self.choice, self.worlds, self.bounds = choice, worlds, bounds
         self.count = choice.num_envs
         self.exporter = ArrayExporter(choice.backend, worlds.device)
@@ -101,13 +90,13 @@ class PickingEnvironment:
         self._judge(~over)
         terminated, truncated = episodes.terminated.copy(), episodes.truncated.copy()
         info = self._describe(results)
-        if autoreset == NEXT_STEP:
+        if autoreset == env_settings.NEXT_STEP:
             terminated[over] = truncated[over] = False
             if over.any():
                 self._begin(np.flatnonzero(over))
                 info = self._describe(results)
         obs = self.observe()
-        if autoreset == SAME_STEP and episodes.over.any():
+        if autoreset == env_settings.SAME_STEP and episodes.over.any():
             ended = episodes.over.copy()
             final, info = info, {}
             self._begin(np.flatnonzero(ended))
@@ -122,7 +111,7 @@ class PickingEnvironment:
     def observe(self) -> dict[str, Any]:
         """Render the observation of all environments: arrays (environment, ...) by name."""
         arrays = self.worlds.sight.observe(self.worlds.simulation.record.snapshot)
-        return {name: self.exporter.from_device(getattr(arrays, OBSERVATIONS[name]), self.count) for name in self.choice.obs}
+        return {name: self.exporter.from_device(getattr(arrays, env_settings.OBSERVATIONS[name]), self.count) for name in self.choice.obs}
 
     def get_state(self) -> EnvironmentState:
         """Save a checkpoint of all environments, from which they continue bit by bit; raises StateError if memory is too short."""
@@ -171,11 +160,11 @@ class PickingEnvironment:
             finite = np.isfinite(given.astype(np.float64)).all(axis=1)
         if wrong := np.flatnonzero(~finite).tolist():
             raise ActionError(f"the action of environment {wrong[0]} is not finite: {given[wrong[0]].tolist()}")
-        if action == PIXEL:
+        if action == env_settings.PIXEL:
             if wrong := np.flatnonzero((given != np.floor(given)).any(axis=1)).tolist():
                 raise ActionError(f"the action of environment {wrong[0]} is no pixel: {given[wrong[0]].tolist()}; allowed: column and row")
             self._check_within(given, np.zeros(2, int), np.array(self.choice.resolution) - 1, active, "image")
-        if action == POINT:
+        if action == env_settings.POINT:
             self._check_within(given[:, :3], *self.bounds, active, "space about the bin")
             given = np.concatenate([given[:, :3], _scaled(given[:, 3:])], axis=1)
         return given
@@ -189,18 +178,18 @@ class PickingEnvironment:
 
     def _act(self, active: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Carry out checked actions in active environments; returns the results by name."""
-        if self.choice.action == PIXEL:
+        if self.choice.action == env_settings.PIXEL:
             return self.worlds.attempt_pixels(active, actions.astype(np.int32))
-        if self.choice.action == POINT:
+        if self.choice.action == env_settings.POINT:
             return self.worlds.attempt_points(active, actions[:, :3], actions[:, 3:])
         scale = np.array([TWIST_SPEED] * 3 + [TWIST_RATE] * 2 + [1.0])
         return self.worlds.tick(active, np.clip(actions, -1.0, 1.0) * scale)
 
     def _reward(self, results: Mapping[str, np.ndarray]) -> np.ndarray:
         """Reward of the task (environment), see the README."""
-        if self.choice.task == MOVE:
+        if self.choice.task == env_settings.MOVE:
             return results["moved"]
-        if self.choice.task == TARGET:
+        if self.choice.task == env_settings.TARGET:
             return results["outcome"] == Outcome.TARGET_PICKED
         return np.isin(results["outcome"], (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED))
 
@@ -261,20 +250,20 @@ class ArrayExporter:
 
     def from_device(self, array: wp.array, count: int) -> Any:
         """Copy the first `count` rows of a device array; components of vectors become the last dimension."""
-        if self.backend == NUMPY:
+        if self.backend == env_settings.NUMPY:
             return array[:count].numpy().copy()
         rows: Any = array[:count]
         return self._export(wp.clone(_flatten_vectors(rows) if array.dtype in VECTORS else rows))
 
     def from_host(self, values: np.ndarray) -> Any:
         """Convert an array of the host: to the device, or for backend "numpy" as it is."""
-        if self.backend == NUMPY:
+        if self.backend == env_settings.NUMPY:
             return values
         return self._export(wp.array(np.ascontiguousarray(values), dtype=_scalar(values.dtype), device=self.device))
 
     def _export(self, array: wp.array) -> Any:
         """Convert a device array that nothing else refers to; for PyTorch on a GPU, its content is complete on all streams."""
-        if self.backend == TORCH:
+        if self.backend == env_settings.TORCH:
             if self.device.is_cuda:
                 wp.synchronize_device(self.device)
             return wp.to_torch(array)

@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator, Mapping
 from rich.console import Console
 
 from synpick_warp.cli.commands.doctor import describe_machine
-from synpick_warp.cli.main import parse_resolution
+from synpick_warp.cli.options import parse_resolution
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.system.hardware.device import pick_device
+from tools import options as command_line
 from tools.bench.bakes import measure_steady, measure_trajectories
 from tools.bench.online import measure_environment
 from tools.bench.peers import PEERS, check_installed, measure_peers
@@ -29,22 +30,10 @@ from tools.bench.run import Bench
 from tools.bench.scaling import measure_growth, measure_heaps, measure_patches
 from tools.bench.worlds import measure_worlds
 from tools.figures import describe_run, write_run
-from tools.options import (
-    INTERRUPTED,
-    MeasuredRow,
-    configure,
-    counts,
-    fail,
-    make_names_parser,
-    make_parser,
-    number_in,
-    of_part,
-    positive_count,
-)
 
 SHARED_PARTS = ("physics", "perception", "render", "encode", "stream")
 """Parts in the same worlds."""
-OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[MeasuredRow]]] = {
+OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[command_line.MeasuredRow]]] = {
     "pictures": measure_pictures,
     "steady": measure_steady,
     "trajectories": measure_trajectories,
@@ -66,7 +55,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command line; returns the exit code. Rows measured before an interruption are written."""
     options = _parse(arguments)
     console = Console(highlight=False)
-    rows: list[MeasuredRow] = []
+    rows: list[command_line.MeasuredRow] = []
     machine: dict[str, str] = {}
     code = 0
     try:
@@ -85,32 +74,32 @@ def main(arguments: list[str] | None = None) -> int:
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
     except SynpickError as error:
-        return fail("bench", error)
+        return command_line.fail("bench", error)
     except KeyboardInterrupt:
         print("bench: interrupted", file=sys.stderr)
-        code = INTERRUPTED
+        code = command_line.INTERRUPTED
     if rows:
         write_run(options.json, describe_run("tools.bench", machine.items(), rows))
     return code
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "config", "device", "models", "lights", "set", "json")
+    parser = command_line.make_parser(__doc__, "config", "device", "models", "lights", "set", "json")
     worlds_help = f"worlds simulated in parallel (default: {WORLDS})"
-    parser.add_argument("--worlds", type=positive_count, default=WORLDS, help=worlds_help)
+    parser.add_argument("--worlds", type=command_line.positive_count, default=WORLDS, help=worlds_help)
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
-    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), help=parts_help)
+    parser.add_argument("--parts", type=command_line.make_names_parser(PARTS, "part"), help=parts_help)
     peers_help = f"peers to measure beside ours, comma-separated, of {', '.join(PEERS)}; then no parts unless --parts names some"
-    parser.add_argument("--compare", type=make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
+    parser.add_argument("--compare", type=command_line.make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
     after_help = "ticks simulated before the part pictures, in which little moves just after the drop (default: 0)"
-    parser.add_argument("--after", type=positive_count, default=0, metavar="TICKS", help=after_help)
+    parser.add_argument("--after", type=command_line.positive_count, default=0, metavar="TICKS", help=after_help)
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
     instances_help = "numbers of like parts, of which the part growth measures physics alone: 10,32,64,128,251"
-    parser.add_argument("--instances", type=counts, default=(), metavar="NUMBERS", help=instances_help)
-    parser.add_argument("--seconds", type=number_in(0.0), default=2.0, help="minimum time of a measurement [s] (default: 2)")
+    parser.add_argument("--instances", type=command_line.counts, default=(), metavar="NUMBERS", help=instances_help)
+    parser.add_argument("--seconds", type=command_line.number_in(0.0), default=2.0, help="minimum time of a measurement [s] (default: 2)")
     options = parser.parse_args(arguments)
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
@@ -125,13 +114,13 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def _config(options: argparse.Namespace) -> Config:
     worlds, resolution = options.worlds, parse_resolution(options.resolution)
-    return configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
+    return command_line.configure(options, {"bake.worlds": worlds, "bake.episodes": worlds, "cameras.resolution": resolution})
 
 
-def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[MeasuredRow]:
+def measure(bench: Bench, parts: tuple[str, ...], peers: tuple[str, ...] = ()) -> Iterator[command_line.MeasuredRow]:
     """Measure the parts, which may be in any order, then the peers; rows come as they are measured."""
-    runs: list[Iterator[MeasuredRow]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
-    runs += [of_part(part, make(bench)) for part, make in OWN_PARTS.items() if part in parts]
+    runs: list[Iterator[command_line.MeasuredRow]] = [measure_worlds(bench, parts)] if set(parts) & set(SHARED_PARTS) else []
+    runs += [command_line.of_part(part, make(bench)) for part, make in OWN_PARTS.items() if part in parts]
     runs += [measure_peers(bench, peers)] if peers else []
     return itertools.chain.from_iterable(runs)
 

@@ -22,7 +22,7 @@ except ModuleNotFoundError as missing:
     raise SystemExit(f"train_online: {missing.name} is not installed; pip install torch") from None
 
 import synpick_warp
-from synpick_warp.cli.main import parse_resolution
+from synpick_warp.cli.options import parse_resolution
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import FIELDS, StreamDataset
 from synpick_warp.system.hardware.device import pick_device

@@ -10,20 +10,11 @@ from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Bop
 from synpick_warp.exporters.base import ExportContext, StoredScene, view_bytes
+from synpick_warp.exporters.bop import view as bop_view
 from synpick_warp.exporters.bop.graph import FrameSupport, find_supports
 from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.shared.models import MODEL_FOLDERS, describe_dataset, write_models
 from synpick_warp.exporters.bop.shared.toolkit import PARAMS_FILE, format_dataset_params
-from synpick_warp.exporters.bop.view import (
-    ViewSettings,
-    WriteLayer,
-    WriteView,
-    make_camera_constants,
-    make_view_task,
-    write_rendered_layer,
-    write_rendered_view,
-    write_stored_views,
-)
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import CAMERA_FILE, NOTES_FILE, camera_files, write_cameras
@@ -50,8 +41,8 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
 
     needs_views = True
     writes_depth = True
-    write_view: ClassVar[WriteView]
-    write_layer: ClassVar[WriteLayer | None] = None
+    write_view: ClassVar[bop_view.WriteView]
+    write_layer: ClassVar[bop_view.WriteLayer | None] = None
     """None: the format has no layers (further images of a view, as normals or flow)."""
     has_graph: ClassVar[bool] = False
     """Whether the format has scene graphs."""
@@ -70,13 +61,13 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
         self._views = tuple(
-            ViewSettings(
+            bop_view.ViewSettings(
                 color_suffix=self._suffix,
                 jpeg_quality=bop.jpeg_quality,
                 effects=settings.effects,
                 masks=bop.masks and settings.rig.writes(index, MASKS),
                 coco=bop.coco and settings.rig.writes(index, MASKS) and settings.rig.writes(index, COLOR),
-                camera=make_camera_constants(camera, bop.depth_scale),
+                camera=bop_view.make_camera_constants(camera, bop.depth_scale),
                 resolution=camera.resolution,
                 color=settings.rig.writes(index, COLOR),
                 depth=self.writes_depth and settings.rig.writes(index, DEPTH),
@@ -107,7 +98,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         """Folder of the split that a scene belongs to."""
         return self._out / self.folder_name(self._context.layout.folder(scene_id // len(self._cameras)))
 
-    def _stage_scene(self, scene: Path, settings: ViewSettings) -> None:
+    def _stage_scene(self, scene: Path, settings: bop_view.ViewSettings) -> None:
         """Create the staging folder of a scene, and its subfolders."""
         scene.mkdir()
 
@@ -162,19 +153,21 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             index, camera = int(batch.episode[view]), int(batch.camera[view])
             episode = self._staged(index, partial(self._create_scenes, index))
             scene = episode.content[camera]
-            images, truth = make_view_task(batch, view, self.scene_ids(index)[camera], self._views[camera])
+            images, truth = bop_view.make_view_task(batch, view, self.scene_ids(index)[camera], self._views[camera])
             place = self._folder(truth.scene) / scene.name
             arguments = (type(self).write_view, scene, self._views[camera], truth)
-            yield self._task((episode,), write_rendered_view, images, arguments, place, affinity=truth.scene)
+            yield self._task((episode,), bop_view.write_rendered_view, images, arguments, place, affinity=truth.scene)
             for name in self._views[camera].layers:
                 arguments = (type(self).write_layer, scene, truth.scene, name, truth.frame)
-                yield self._task((episode,), write_rendered_layer, (batch.layers[name][view],), arguments, place)
+                yield self._task((episode,), bop_view.write_rendered_layer, (batch.layers[name][view],), arguments, place)
 
     def write_stored(self, episode: int, scenes: Sequence[StoredScene]) -> None:
         staged = self._staged(episode, partial(self._create_scenes, episode))
         for stored, scene, settings in zip(scenes, staged.content, self._views, strict=True):
             arguments = (stored, type(self).write_view, type(self).write_layer, settings.layers, scene, settings)
-            self._pool.submit_all((self._task((staged,), write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),))
+            self._pool.submit_all(
+                (self._task((staged,), bop_view.write_stored_views, (), arguments, self._folder(int(scene.name)) / scene.name),)
+            )
 
     def scene_ids(self, episode: int) -> range:
         """BOP scene_id of an episode as seen by each camera."""

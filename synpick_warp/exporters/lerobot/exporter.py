@@ -11,23 +11,9 @@ import numpy as np
 from synpick_warp.codes import Task
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
+from synpick_warp.exporters.lerobot import layout as lerobot
 from synpick_warp.exporters.lerobot.episode import TICK, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
-from synpick_warp.exporters.lerobot.layout import (
-    CARD,
-    DATA,
-    EPISODES,
-    FOLDER,
-    INFO,
-    META,
-    PARTS,
-    STATS,
-    TASKS,
-    part_path,
-    video_folders,
-    video_path,
-    video_rate,
-)
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
 from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
@@ -62,11 +48,11 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
     needs_physics = True
     needs_views = True
     needs_images = True
-    staging = FOLDER.name
+    staging = lerobot.FOLDER.name
 
     def __init__(self, context: ExportContext) -> None:
         super().__init__(context)
-        self._rig, self._rate, self._names = context.settings.rig, video_rate(context.settings.physics), context.names
+        self._rig, self._rate, self._names = context.settings.rig, lerobot.video_rate(context.settings.physics), context.names
 
     @staticmethod
     def slot_bytes(settings: ExportSettings) -> int:
@@ -75,13 +61,17 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
 
     @staticmethod
     def shared_files(layout: DataLayout) -> SharedFiles:
-        videos = video_folders(layout.names)
-        between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
-        return SharedFiles(note_files(layout), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
+        videos = lerobot.video_folders(layout.names)
+        between = (lerobot.EPISODES.parent, lerobot.EPISODES.parent.parent, lerobot.META, lerobot.DATA.parent, lerobot.DATA.parent.parent)
+        return SharedFiles(
+            note_files(layout),
+            (lerobot.INFO, lerobot.STATS, lerobot.TASKS, lerobot.EPISODES, lerobot.DATA, lerobot.CARD),
+            (lerobot.PARTS, *videos, *between, lerobot.FOLDER),
+        )
 
     @staticmethod
     def finalize(out: Path, settings: ExportSettings, pool: WriterPool, episodes: Sequence[int]) -> list[Path]:
-        with output_errors(out / FOLDER):
+        with output_errors(out / lerobot.FOLDER):
             return write_indices(out, settings, episodes)
 
     def write_constants(self) -> list[Path]:
@@ -116,7 +106,7 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
         return self._staged(index, lambda _: _LerobotContent())
 
     def places(self, episode: int) -> list[Path]:
-        return [part_path(episode), *(video_path(camera, episode) for camera in self._rig.names)]
+        return [lerobot.part_path(episode), *(lerobot.video_path(camera, episode) for camera in self._rig.names)]
 
     def _finish(self, episode: _Staged, end: EpisodeEnd) -> None:
         for camera, group in list(episode.content.spooled):
@@ -145,7 +135,7 @@ class LerobotExporter(EpisodeExporter[_LerobotContent]):
             raise ValueError(f"episode {end.episode} ended, but views of {groups} groups of pictures are missing")
         out = self._context.out
         arguments = (episode.folder, end, bytes(episode.content.ticks), self._names, out, self._context.settings)
-        return WriteTask(commit_episode, (), arguments, out / part_path(end.episode))
+        return WriteTask(commit_episode, (), arguments, out / lerobot.part_path(end.episode))
 
 
 def make_ticks(batch: TickBatch) -> np.ndarray:

@@ -21,26 +21,8 @@ from synpick_warp.codes import Outcome, names
 from synpick_warp.configs.cell.rig import Size
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.lerobot import layout as lerobot
 from synpick_warp.exporters.lerobot.episode import LerobotPart, make_folders
-from synpick_warp.exporters.lerobot.layout import (
-    CARD,
-    CHUNK,
-    DATA,
-    EPISODES,
-    FRAME_FEATURES,
-    INFO,
-    PARTS,
-    ROW,
-    STATS,
-    TASKS,
-    VERSION,
-    Feature,
-    camera_key,
-    frame_rate,
-    make_info,
-    part_path,
-    split_name,
-)
 from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
 from synpick_warp.exporters.writing.notes import describe_lenses
 from synpick_warp.system.inputs.files import path_inside, read_json
@@ -72,26 +54,28 @@ class _Totals:
 def write_indices(out: Path, settings: ExportSettings, episodes: Iterable[int]) -> list[Path]:
     """Write the tables over the committed episodes, sorted; returns them, relative to the data set. Raises DatasetError if a part is
     damaged, and OSError if a file cannot be written."""
-    rig, rate, totals = settings.rig, frame_rate(settings.physics), _Totals()
+    rig, rate, totals = settings.rig, lerobot.frame_rate(settings.physics), _Totals()
     totals.levels = {name: np.zeros((3, 256), np.int64) for name in rig.names}
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
         for batch in _batch_tables(_read_tables(out, totals, rig.sizes, rate, settings.layout, episodes)):
             writer.write_table(batch)
-    _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
+    _place(out, lerobot.DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
-        out, EPISODES, lambda path: pq.write_table(pa.Table.from_pylist(totals.rows, _episode_schema(rig.names)), path, compression="zstd")
+        out,
+        lerobot.EPISODES,
+        lambda path: pq.write_table(pa.Table.from_pylist(totals.rows, _episode_schema(rig.names)), path, compression="zstd"),
     )
-    _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
-    videos = {camera_key(name): describe_levels(levels, totals.frames) for name, levels in totals.levels.items() if levels.any()}
+    _place(out, lerobot.TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
+    videos = {lerobot.camera_key(name): describe_levels(levels, totals.frames) for name, levels in totals.levels.items() if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
     splits = [row["source/split"] for row in totals.rows]
-    info = make_info(rig, rate, splits, totals.frames, len(totals.tasks))
+    info = lerobot.make_info(rig, rate, splits, totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(names(Outcome))}
-    for place, content in ((STATS, statistics), (INFO, info)):
+    for place, content in ((lerobot.STATS, statistics), (lerobot.INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
         _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
-    _place(out, CARD, lambda path: path.write_text(_make_card(settings, totals), encoding="utf-8"))
-    return [INFO, STATS, TASKS, EPISODES, DATA, CARD]
+    _place(out, lerobot.CARD, lambda path: path.write_text(_make_card(settings, totals), encoding="utf-8"))
+    return [lerobot.INFO, lerobot.STATS, lerobot.TASKS, lerobot.EPISODES, lerobot.DATA, lerobot.CARD]
 
 
 def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
@@ -111,9 +95,9 @@ def _read_tables(
 ) -> Iterator[pa.Table]:
     """Yield the tables of the episodes' frames, in order, and add them to the totals; episodes that were given up have no part."""
     period = 1.0 / rate
-    for source in (episode for episode in episodes if os.path.lexists(out / part_path(episode))):
-        name = part_path(source)
-        part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), LerobotPart, DatasetError, _ADVICE)
+    for source in (episode for episode in episodes if os.path.lexists(out / lerobot.part_path(episode))):
+        name = lerobot.part_path(source)
+        part = read_json(path_inside(out, str(name), out / lerobot.PARTS, DatasetError), LerobotPart, DatasetError, _ADVICE)
         if len(part.levels) != len(totals.levels):
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
         for levels, pixels in zip(part.levels, (part.frames * math.prod(size) for size in sizes), strict=True):
@@ -121,13 +105,13 @@ def _read_tables(
                 raise DatasetError(f"{out / name} has a histogram of no pixel a frame, or of more than {pixels:,} pixels; {_ADVICE}")
         columns = _make_columns(part, totals, period)
         _add_episode(source, part, columns, totals, period)
-        totals.rows[-1]["source/split"] = split_name(layout, source)
-        yield pa.table({name: _to_array(columns[name], feature) for name, feature in FRAME_FEATURES.items()}, _data_schema())
+        totals.rows[-1]["source/split"] = lerobot.split_name(layout, source)
+        yield pa.table({name: _to_array(columns[name], feature) for name, feature in lerobot.FRAME_FEATURES.items()}, _data_schema())
 
 
 def _make_columns(part: LerobotPart, totals: _Totals, period: float) -> dict[str, np.ndarray]:
     """Columns of an episode's frames, with their indices in the whole data set."""
-    rows = np.frombuffer(part.rows, ROW)
+    rows = np.frombuffer(part.rows, lerobot.ROW)
     frames = np.arange(part.frames)
     tasks = np.array([totals.tasks.setdefault(sentence, len(totals.tasks)) for sentence in part.sentences])
     columns = {
@@ -144,14 +128,14 @@ def _make_columns(part: LerobotPart, totals: _Totals, period: float) -> dict[str
         "index": totals.frames + frames,
         "task_index": tasks[rows["task"]],
     }
-    return {name: columns[name].astype(feature.dtype) for name, feature in FRAME_FEATURES.items()}
+    return {name: columns[name].astype(feature.dtype) for name, feature in lerobot.FRAME_FEATURES.items()}
 
 
 def _add_episode(source: int, part: LerobotPart, columns: dict[str, np.ndarray], totals: _Totals, period: float) -> None:
     """Add a row of the table of episodes, and the episode's statistics."""
     numbers = {name: describe_numbers(values.reshape(part.frames, -1)) for name, values in columns.items()}
     levels = {name: np.array(own) for name, own in zip(totals.levels, part.levels, strict=True)}
-    statistics = numbers | {camera_key(name): describe_levels(own, part.frames) for name, own in levels.items()}
+    statistics = numbers | {lerobot.camera_key(name): describe_levels(own, part.frames) for name, own in levels.items()}
     row: dict[str, Any] = {
         "episode_index": len(totals.rows),
         "tasks": part.sentences,
@@ -166,8 +150,8 @@ def _add_episode(source: int, part: LerobotPart, columns: dict[str, np.ndarray],
         "source/picked": part.picked,
     }
     for camera, own in levels.items():
-        place = f"videos/{camera_key(camera)}"
-        row |= {f"{place}/chunk_index": source // CHUNK, f"{place}/file_index": source % CHUNK}
+        place = f"videos/{lerobot.camera_key(camera)}"
+        row |= {f"{place}/chunk_index": source // lerobot.CHUNK, f"{place}/file_index": source % lerobot.CHUNK}
         row |= {f"{place}/from_timestamp": 0.0, f"{place}/to_timestamp": part.frames * period}
         totals.levels[camera] += own
     for name, values in statistics.items():
@@ -241,7 +225,7 @@ def _batch_tables(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
         yield pa.concat_tables(waiting).combine_chunks()
 
 
-def _to_array(values: np.ndarray, feature: Feature) -> pa.Array:
+def _to_array(values: np.ndarray, feature: lerobot.Feature) -> pa.Array:
     """Arrow array of a feature's column: scalars, or fixed-size lists for vectors."""
     flat = pa.array(np.ascontiguousarray(values).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, len(feature.names)) if feature.names else flat
@@ -250,7 +234,7 @@ def _to_array(values: np.ndarray, feature: Feature) -> pa.Array:
 def _data_schema() -> pa.Schema:
     """Arrow schema of the table of frames."""
     fields = []
-    for name, feature in FRAME_FEATURES.items():
+    for name, feature in lerobot.FRAME_FEATURES.items():
         kind = pa.from_numpy_dtype(np.dtype(feature.dtype))
         fields.append((name, pa.list_(kind, len(feature.names)) if feature.names else kind))
     return pa.schema(fields)
@@ -264,12 +248,12 @@ def _episode_schema(cameras: Sequence[str]) -> pa.Schema:
     fields |= dict.fromkeys(("source/episode", "source/attempts", "source/picked"), pa.int64())
     fields |= dict.fromkeys(("source/mode", "source/ending", "source/split"), pa.string())
     numbers = pa.list_(pa.float64())
-    kinds = dict.fromkeys(FRAME_FEATURES, numbers)
+    kinds = dict.fromkeys(lerobot.FRAME_FEATURES, numbers)
     for camera in cameras:
-        place = f"videos/{camera_key(camera)}"
+        place = f"videos/{lerobot.camera_key(camera)}"
         fields |= dict.fromkeys((f"{place}/chunk_index", f"{place}/file_index"), pa.int64())
         fields |= dict.fromkeys((f"{place}/from_timestamp", f"{place}/to_timestamp"), pa.float64())
-        kinds[camera_key(camera)] = pa.list_(pa.list_(numbers))
+        kinds[lerobot.camera_key(camera)] = pa.list_(pa.list_(numbers))
     keys = tuple(describe_numbers(np.zeros((1, 1))))
     fields |= {f"stats/{name}/{key}": pa.list_(pa.int64()) if key == "count" else kind for name, kind in kinds.items() for key in keys}
     return pa.schema(list(fields.items()))
@@ -311,7 +295,7 @@ configs:
 ---
 # Bin picking with a suction gripper
 {describe_lenses(settings)}
-{len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {VERSION}.
+{len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {lerobot.VERSION}.
 State: cup pose in the tote's frame (x, y, z [m], quaternion x, y, z, w), whether the suction is on, whether an object hangs on the cup.
 Action: setpoint of the wrist [m] and suction command. Tasks name the object that each attempt picks.
 {splits}"""

@@ -17,31 +17,10 @@ from synpick_warp.codes import LookPart
 from synpick_warp.configs.schema import Physics, Render
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.usd.parts import (
-    add_body,
-    add_collider,
-    add_friction,
-    add_mesh,
-    add_property,
-    add_surface,
-    make_collider,
-    new_asset,
-    save_layer,
-    write_texture,
-)
+from synpick_warp.exporters.usd import parts
 from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset
+from synpick_warp.scenes import environment
 from synpick_warp.scenes.bins import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE, make_bins
-from synpick_warp.scenes.environment import (
-    BACKGROUND_ROWS,
-    LUMINANCE,
-    MAX_SUN_TANGENT,
-    WHITE_VALUE,
-    draw_sun_disc,
-    map_directions,
-    replace_sun,
-    resize_map,
-    sun_fraction,
-)
 from synpick_warp.scenes.grippers import finger_collider, finger_fixture, make_head, rod_inertia
 from synpick_warp.scenes.modelling import project_from_box
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
@@ -67,44 +46,44 @@ def write_library(library: Path, context: ExportContext) -> None:
             _save(library, name, _make_fixture(library, physics, name, replace(one.fixture, mesh=mesh), one.pieces))
     finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
-    add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
+    parts.add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
     _save(library, "finger", finger)
     head = make_head(gripper)
     cup = _make_fixture(library, physics, "cup", head.fixture, head.pieces)
     center = np.array([0.0, 0.0, -gripper.cup_length / 2])
-    add_body(cup.GetDefaultPrim(), gripper.cup_mass, center, np.diag(head.inertia), kinematic=True)
+    parts.add_body(cup.GetDefaultPrim(), gripper.cup_mass, center, np.diag(head.inertia), kinematic=True)
     _save(library, "cup", cup)
     textures = {} if looks is None else looks.textures
     if textures.get(LookPart.BACKGROUND):
         _write_floor(library, table - FLOOR_DROP)
     for part, images in textures.items():
         for index, texture in enumerate(images):
-            write_texture(library, drawn_texture(part, index), texture)
+            parts.write_texture(library, drawn_texture(part, index), texture)
     _write_table(library, physics, table, settings.render, bool(textures.get(LookPart.TABLE)))
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
     """Save a stage as an asset of the library, NAME.usdc."""
-    save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
+    parts.save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
 
 
 def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     """Write an object's asset: mesh, material, collision shapes and mass properties, as a dynamic rigid body."""
     name = object_asset(entry.obj_id)
-    stage = new_asset(name, entry.name if entry.obj_id >= 0 else "")
+    stage = parts.new_asset(name, entry.name if entry.obj_id >= 0 else "")
     root = stage.GetDefaultPrim()
     root.SetDisplayName(entry.name)
     if entry.obj_id >= 0:
-        add_property(root, "obj_id", entry.obj_id)
-    _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material.texture), entry.pieces)
-    add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
+        parts.add_property(root, "obj_id", entry.obj_id)
+    _add_shapes(stage, physics, entry.mesh, entry.material, parts.write_texture(library, name, entry.material.texture), entry.pieces)
+    parts.add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
     _save(library, name, stage)
 
 
 def _make_fixture(library: Path, physics: Physics, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
     """Stage of a fixture's asset: mesh, material and collision shapes; not saved."""
-    stage = new_asset(name, name)
-    _add_shapes(stage, physics, fixture.mesh, fixture.material, write_texture(library, name, fixture.material.texture), pieces)
+    stage = parts.new_asset(name, name)
+    _add_shapes(stage, physics, fixture.mesh, fixture.material, parts.write_texture(library, name, fixture.material.texture), pieces)
     return stage
 
 
@@ -113,37 +92,37 @@ def _add_shapes(
 ) -> None:
     """Add an asset's visible mesh with its material, and its collision shapes."""
     root, friction = _add_contact_material(stage, physics)
-    add_mesh(stage, f"{root}/Visual", mesh, add_surface(stage, f"{root}/Materials/Surface", material, texture))
+    parts.add_mesh(stage, f"{root}/Visual", mesh, parts.add_surface(stage, f"{root}/Materials/Surface", material, texture))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     for index, piece in enumerate(pieces):
-        add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, physics.gap)
+        parts.add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, physics.gap)
 
 
 def _write_table(library: Path, physics: Physics, height: float, render: Render, has_textures: bool) -> None:
     """Write the table under the bins: a collision box, and a visible top side at this height [m], whose texture coordinates are metres if
     it has textures; else they span the table."""
-    stage = new_asset("table", "table")
+    stage = parts.new_asset("table", "table")
     root, friction = _add_contact_material(stage, physics)
     if render.table:
         sides = [0.5 * size or most for size, most in zip(render.table_size, TABLE_SIZE[:2], strict=True)]
         quad = _make_quad(sides, height, has_textures)
         material = Material(render.table_color, None, 0.0, TABLE_ROUGHNESS)
-        add_mesh(stage, f"{root}/Visual", quad, add_surface(stage, f"{root}/Materials/Surface", material, None))
+        parts.add_mesh(stage, f"{root}/Visual", quad, parts.add_surface(stage, f"{root}/Materials/Surface", material, None))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     box = UsdGeom.Cube.Define(stage, f"{root}/Collision/box")
     box.CreateSizeAttr(2.0)
     box.CreateExtentAttr([Gf.Vec3f(-1.0), Gf.Vec3f(1.0)])
     box.AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, height - TABLE_SIZE[2]))
     box.AddScaleOp().Set(Gf.Vec3f(*TABLE_SIZE))
-    make_collider(box, friction, physics.gap)
+    parts.make_collider(box, friction, physics.gap)
     _save(library, "table", stage)
 
 
 def _write_floor(library: Path, height: float) -> None:
     """Write the floor at this height [m], which is seen beyond the edge of the table: a visible side without collision shape."""
-    stage = new_asset("floor", "floor")
-    surface = add_surface(stage, "/floor/Materials/Surface", FLOOR, None)
-    add_mesh(stage, "/floor/Visual", _make_quad(TABLE_SIZE[:2], height, True), surface)
+    stage = parts.new_asset("floor", "floor")
+    surface = parts.add_surface(stage, "/floor/Materials/Surface", FLOOR, None)
+    parts.add_mesh(stage, "/floor/Visual", _make_quad(TABLE_SIZE[:2], height, True), surface)
     _save(library, "floor", stage)
 
 
@@ -158,7 +137,7 @@ def _add_contact_material(stage: Usd.Stage, physics: Physics) -> tuple[str, UsdS
     """Add the physics material of the asset's collision shapes; returns the path of the asset's root and the material."""
     root = str(stage.GetDefaultPrim().GetPath())
     UsdGeom.Scope.Define(stage, f"{root}/Materials")
-    return root, add_friction(stage, f"{root}/Materials/Contact", physics.friction)
+    return root, parts.add_friction(stage, f"{root}/Materials/Contact", physics.friction)
 
 
 def light_file(index: int) -> str:
@@ -170,7 +149,7 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
     """Describe an environment map, by its index in the bake, as lights of a stage; the intensity reproduces the renderer's automatic
     exposure times `exposure`."""
     radiance, irradiance, radius_tangent = separate_sun(light)
-    directions, solid = map_directions(len(radiance))
+    directions, solid = environment.map_directions(len(radiance))
     upward = np.maximum(directions[..., 2], 0.0) * solid
     white = np.einsum("ij,ijc->c", upward, radiance)
     azimuth = polar = 0.0
@@ -180,7 +159,7 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
         azimuth, polar = np.degrees(np.arctan2(y, x)), np.degrees(np.arccos(np.clip(z, -1.0, 1.0)))
         white = white + max(z, 0.0) * irradiance
         sun = (float(irradiance[0]), float(irradiance[1]), float(irradiance[2]))
-    factor = exposure * WHITE_VALUE * np.pi / max(float(dot(white, LUMINANCE)), 1e-9)
+    factor = exposure * environment.WHITE_VALUE * np.pi / max(float(dot(white, environment.LUMINANCE)), 1e-9)
     angle = float(2.0 * np.degrees(np.arctan(radius_tangent)))
     return StageLight(light.name, light_file(index), float(factor), float(azimuth), float(polar), sun, angle)
 
@@ -211,14 +190,14 @@ def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
     if sun is None:
         return light.radiance, np.zeros(3), 0.0
     radiance = light.radiance.astype(np.float64)
-    coarse = resize_map(radiance, BACKGROUND_ROWS)
-    _, direction, irradiance, radius_tangent = replace_sun(coarse, sun)
+    coarse = environment.resize_map(radiance, environment.BACKGROUND_ROWS)
+    _, direction, irradiance, radius_tangent = environment.replace_sun(coarse, sun)
     # The fraction of a coarse texel applies to all fine texels within it, so that the same light is removed.
-    fraction = sun_fraction(coarse, direction).astype(np.float32)
+    fraction = environment.sun_fraction(coarse, direction).astype(np.float32)
     rows = len(radiance)
-    method = cv2.INTER_AREA if rows <= BACKGROUND_ROWS else cv2.INTER_NEAREST
+    method = cv2.INTER_AREA if rows <= environment.BACKGROUND_ROWS else cv2.INTER_NEAREST
     fine = cv2.resize(fraction, (2 * rows, rows), interpolation=method).astype(np.float64)
     rest = radiance * (1.0 - fine)[..., None]
-    if radius_tangent > MAX_SUN_TANGENT:
-        return rest + draw_sun_disc(fine > 0.0, direction, irradiance, radius_tangent), np.zeros(3), radius_tangent
+    if radius_tangent > environment.MAX_SUN_TANGENT:
+        return rest + environment.draw_sun_disc(fine > 0.0, direction, irradiance, radius_tangent), np.zeros(3), radius_tangent
     return rest, irradiance, radius_tangent

@@ -13,17 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from synpick_warp.configs.episodes.objects import UNITS
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError, ConfigError, SynpickError
-from synpick_warp.scenes.assets.appearance import (
-    UV_TOLERANCE,
-    WHITE,
-    FileMaterial,
-    as_color,
-    bake_vertex_colors,
-    join_textures,
-    linear_to_srgb,
-    srgb_to_linear,
-    tile_texture,
-)
+from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS, Notes, ignore, quiet_decoding
 from synpick_warp.scenes.assets.cad import STEP_SUFFIXES, read_step, read_stl
 from synpick_warp.scenes.assets.gltf.parts import read_gltf
@@ -74,7 +64,7 @@ class MeshFile(NamedTuple):
     """Mesh [m] and material of a mesh file, and by what the mesh was moved to be centred (3) [m]."""
 
     mesh: TriangleMesh
-    material: FileMaterial
+    material: appearance.FileMaterial
     moved: np.ndarray
 
 
@@ -259,13 +249,13 @@ def _bake_colors(part: MeshPart) -> MeshPart:
     """Multiply vertex colours into the base colour factor, if they are uniform, or into a baked texture."""
     if part.colors is None:
         return part
-    factor = srgb_to_linear(part.material.color)
+    factor = appearance.srgb_to_linear(part.material.color)
     if (part.colors == part.colors[0]).all():
-        color = as_color(linear_to_srgb(factor * srgb_to_linear(part.colors[0])))
+        color = appearance.as_color(appearance.linear_to_srgb(factor * appearance.srgb_to_linear(part.colors[0])))
         return replace(part, colors=None, material=replace(part.material, color=color))
     skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture)
-    uv, texture = bake_vertex_colors(part.faces, part.colors, factor, skin)
-    material = replace(part.material, color=WHITE, texture=texture)
+    uv, texture = appearance.bake_vertex_colors(part.faces, part.colors, factor, skin)
+    material = replace(part.material, color=appearance.WHITE, texture=texture)
     return part.take(part.faces.reshape(-1), np.arange(part.faces.size).reshape(-1, 3), uv=uv, colors=None, material=material)
 
 
@@ -276,9 +266,9 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
     first = parts[0].material
     if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
         parts = [_unroll(part, notes) for part in parts]
-        moved, texture = join_textures([(part.uv, part.material) for part in parts], str(path), notes.said)
+        moved, texture = appearance.join_textures([(part.uv, part.material) for part in parts], str(path), notes.said)
         parts = [replace(part, uv=np.broadcast_to(uv, (len(part.vertices), 2))) for uv, part in zip(moved, parts, strict=True)]
-        first = replace(first, color=WHITE, texture=texture)
+        first = replace(first, color=appearance.WHITE, texture=texture)
     mean = {}
     for name in ("metallic", "roughness"):
         known = [(value, _area(part)) for part in parts if (value := getattr(part.material, name)) is not None]
@@ -301,16 +291,16 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
 def _unroll(part: MeshPart, notes: Notes) -> MeshPart:
     """Replace a texture that repeats by an image of its tiles, with each triangle moved by whole repetitions."""
     texture = part.material.texture
-    if texture is None or part.uv is None or (part.uv.min() >= -UV_TOLERANCE and part.uv.max() <= 1.0 + UV_TOLERANCE):
+    if texture is None or part.uv is None or (part.uv.min() >= -appearance.UV_TOLERANCE and part.uv.max() <= 1.0 + appearance.UV_TOLERANCE):
         return part
     corners = part.uv[part.faces]
     # A shift of a whole triangle: its coordinates begin in the first tile.
-    shift = np.repeat(np.floor(corners.min(axis=1) + UV_TOLERANCE), 3, axis=0)
+    shift = np.repeat(np.floor(corners.min(axis=1) + appearance.UV_TOLERANCE), 3, axis=0)
     rows, index = np.unique(np.column_stack([part.faces.reshape(-1), shift]), axis=0, return_inverse=True)
     source = rows[:, 0].astype(np.int64)
     uv = part.uv[source] - rows[:, 1:]
-    tiles = np.maximum(np.ceil(uv.max(axis=0) - UV_TOLERANCE), 1.0).astype(int)
-    image = tile_texture(texture, (int(tiles[0]), int(tiles[1])), notes.said)
+    tiles = np.maximum(np.ceil(uv.max(axis=0) - appearance.UV_TOLERANCE), 1.0).astype(int)
+    image = appearance.tile_texture(texture, (int(tiles[0]), int(tiles[1])), notes.said)
     return part.take(source, index.reshape(-1, 3), uv=uv / tiles, material=replace(part.material, texture=image))
 
 

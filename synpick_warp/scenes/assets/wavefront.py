@@ -19,18 +19,7 @@ from trimesh.exchange.obj import load_obj
 from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import (
-    GREY,
-    MAX_TEXTURE_FILE,
-    NO_MATERIAL,
-    UV_TOLERANCE,
-    WHITE,
-    FileMaterial,
-    ImageCache,
-    as_color,
-    clamp_texture,
-    plain_color,
-)
+from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.asset_files import (
     MAX_PARTS,
     MAX_ROWS,
@@ -99,7 +88,12 @@ def _load(text: str, used: dict[str, None]) -> list[dict[str, Any]]:
 
 
 def _part(
-    mesh: dict[str, Any], used: dict[str, None], known: dict[str, MtlMaterial], materials: dict[str, FileMaterial], path: Path, notes: Notes
+    mesh: dict[str, Any],
+    used: dict[str, None],
+    known: dict[str, MtlMaterial],
+    materials: dict[str, appearance.FileMaterial],
+    path: Path,
+    notes: Notes,
 ) -> MeshPart:
     """Convert one of trimesh's meshes to a part, with its material."""
     vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
@@ -108,13 +102,13 @@ def _part(
         raise CatalogError(f"{path}: vertices, normals or triangles with other than three numbers each; repair the mesh")
     # Without a material the reader invents one of some name.
     name, uv = getattr(getattr(visual, "material", None), "name", ""), getattr(visual, "uv", None)
-    material = materials.get(name, NO_MATERIAL)
+    material = materials.get(name, appearance.NO_MATERIAL)
     if material.texture is not None:
         if uv is None or len(uv) != len(vertices):
             raise CatalogError(f"{path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
         uv = np.asarray(uv, np.float64)[:, :2] * known[name].scale + known[name].offset
-        if known[name].clamp and len(uv) and (uv.min() < -UV_TOLERANCE or uv.max() > 1.0 + UV_TOLERANCE):
-            image, uv = clamp_texture(material.texture, uv, (True, True), notes.ignored)
+        if known[name].clamp and len(uv) and (uv.min() < -appearance.UV_TOLERANCE or uv.max() > 1.0 + appearance.UV_TOLERANCE):
+            image, uv = appearance.clamp_texture(material.texture, uv, (True, True), notes.ignored)
             material = replace(material, texture=image)
     if colors is not None:
         if len(colors) != len(vertices):
@@ -129,7 +123,7 @@ def _part(
             notes.said.append(f"{what}, the default is used")
         notes.ignored += ["texture coordinates without a texture"] if uv is not None else []
     if colors is not None:
-        material = replace(NO_MATERIAL, color=WHITE)
+        material = replace(appearance.NO_MATERIAL, color=appearance.WHITE)
     return MeshPart(vertices, faces, normals, None if material.texture is None else uv, colors, material)
 
 
@@ -260,7 +254,7 @@ class MtlMaterial:
         return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
-class TexturePixels(ImageCache):
+class TexturePixels(appearance.ImageCache):
     """Image cache of one OBJ file."""
 
     def read(self, name: str, library: Path, linear: bool) -> np.ndarray:
@@ -268,7 +262,7 @@ class TexturePixels(ImageCache):
         Raises CatalogError: it is missing or damaged, or all images together have too many pixels."""
         plain = name.partition(" #")[0].strip()
         name = plain if plain and is_missing(library.parent, name, library) else name
-        path, data = read_referred(library.parent, name, library, MAX_TEXTURE_FILE)
+        path, data = read_referred(library.parent, name, library, appearance.MAX_TEXTURE_FILE)
         return self.decode((path, linear and path.suffix.lower() == ".exr"), data, str(path), linear)
 
 
@@ -373,10 +367,10 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
     color = np.array((values if len(values) >= 3 else values[:1] * 3)[:3])
     if color.max() > 1.0 + _TOLERANCE:
         material.ignored.append(f"Kd beyond 1 ({' '.join(f'{value:g}' for value in color)})")
-    return as_color(np.clip(color, 0.0, 1.0))
+    return appearance.as_color(np.clip(color, 0.0, 1.0))
 
 
-def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> FileMaterial:
+def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> appearance.FileMaterial:
     """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps. Raises
     CatalogError: an image is damaged, or missing and not replaced."""
     notes.ignored += material.ignored
@@ -388,6 +382,6 @@ def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) ->
     factors |= {key[4:]: float(image.mean() / 255.0) for key, image in images.items() if key != "map_kd" and image is not None}
     texture = images.get("map_kd")
     # With an image Kd is ignored: exporters leave 0.64, or 0, there.
-    plain = plain_color(material.color) if "map_kd" in material.maps else material.color or GREY
-    color = WHITE if texture is not None else plain
-    return FileMaterial(color, texture, factors.get("pm"), factors.get("pr"))
+    plain = appearance.plain_color(material.color) if "map_kd" in material.maps else material.color or appearance.GREY
+    color = appearance.WHITE if texture is not None else plain
+    return appearance.FileMaterial(color, texture, factors.get("pm"), factors.get("pr"))

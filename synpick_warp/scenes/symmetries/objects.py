@@ -9,15 +9,7 @@ from synpick_warp.configs.episodes.objects import DETECT, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import MeshFile
 from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh
-from synpick_warp.scenes.symmetries.detection import (
-    MAX_ELEMENTS,
-    Symmetries,
-    Turn,
-    close_transforms,
-    find_axes,
-    find_symmetries,
-    turn_matrix,
-)
+from synpick_warp.scenes.symmetries import detection
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from synpick_warp.system.linear_algebra import dot, norm
 
@@ -37,7 +29,7 @@ def add_symmetries(
     if objects.symmetries != DETECT or info.symmetries_discrete or info.symmetries_continuous:
         return info, []
     tolerance = objects.symmetry_tolerance * diameter
-    symmetries = find_symmetries(found.mesh.vertices, found.mesh.faces, diameter, tolerance)
+    symmetries = detection.find_symmetries(found.mesh.vertices, found.mesh.faces, diameter, tolerance)
     return _with(info, symmetries.discrete, [(turn.axis, turn.point) for turn in symmetries.continuous]), [
         f"{origin}: {describe_symmetries(symmetries, tolerance)}"
     ]
@@ -54,17 +46,17 @@ def _declared(
     line = f"{origin}: its row of the object table gives {'; '.join(said)}"
     if said and strict:
         raise CatalogError(line)
-    closed = close_transforms(matrices)
+    closed = detection.close_transforms(matrices)
     if closed is None:
         advice = "a symmetry about an axis by any angle belongs into symmetries_continuous"
-        raise CatalogError(f"{origin}: the discrete symmetries in its row generate more than {MAX_ELEMENTS}; {advice}")
+        raise CatalogError(f"{origin}: the discrete symmetries in its row generate more than {detection.MAX_ELEMENTS}; {advice}")
     return _with(info, closed, axes), [line] if said else []
 
 
 def _matrix(values: Sequence[float], moved: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Rigid 4 x 4 matrix of a declared discrete symmetry, in the frame of the moved mesh."""
     if len(values) != 16:
-        return turn_matrix(*_axis(values, values[4:], moved, center), 2.0 * np.pi / values[3])
+        return detection.turn_matrix(*_axis(values, values[4:], moved, center), 2.0 * np.pi / values[3])
     matrix = np.reshape(values, (4, 4))
     matrix[:3, 3] += moved - dot(matrix[:3, :3], moved)
     return matrix
@@ -97,10 +89,10 @@ def _rounded(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-def describe_symmetries(symmetries: Symmetries, tolerance: float) -> str:
+def describe_symmetries(symmetries: detection.Symmetries, tolerance: float) -> str:
     """Line on detected symmetries with their distances, or on the nearest miss; `tolerance`: that of the detection [m]."""
     parts = [f"continuous about {_shown(turn.axis)}" for turn in symmetries.continuous]
-    axes = find_axes(symmetries.discrete)
+    axes = detection.find_axes(symmetries.discrete)
     parts += [f"{turn.fold}-fold about {_shown(turn.axis)}" for turn in axes[:_MAX_SHOWN]]
     parts += [f"{len(axes) - _MAX_SHOWN} more axes"] if len(axes) > _MAX_SHOWN else []
     allowed = f"{1e3 * tolerance:.3g} mm allowed"
@@ -113,7 +105,7 @@ def describe_symmetries(symmetries: Symmetries, tolerance: float) -> str:
     return f"no symmetries detected, {allowed}{missed}"
 
 
-def _named(turn: Turn) -> str:
+def _named(turn: detection.Turn) -> str:
     """Words for a rotation."""
     return f"{'a half turn' if turn.fold == 2 else f'1/{turn.fold} turn'} about {_shown(turn.axis)}"
 

@@ -9,43 +9,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.encoding.dct import (
-    BLOCK,
-    BLOCK_SIZE,
-    BLOCKS_PER_MCU,
-    MCU,
-    JpegData,
-    convert_colors_kernel,
-    transform_blocks_kernel,
-)
-from synpick_warp.kernels.encoding.huffman import (
-    CODE_BITS,
-    HuffmanTables,
-    measure_blocks_kernel,
-    place_blocks_kernel,
-    write_blocks_kernel,
-)
-from synpick_warp.kernels.encoding.stuffing import (
-    MARKER_BYTES,
-    WORD_BYTES,
-    JpegFiles,
-    count_stuffing_kernel,
-    join_intervals_kernel,
-    place_intervals_kernel,
-)
+from synpick_warp.kernels.encoding import dct, huffman, stuffing
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import JPEG_THREADS
 from synpick_warp.stages.arrays import allocate_struct, array_group, struct_arrays
 from synpick_warp.stages.buffers import ViewBuffers
-from synpick_warp.system.codecs.jpeg import (
-    DIVISOR_SCALE,
-    QUALITIES,
-    RESTART_INTERVAL,
-    huffman_codes,
-    make_header,
-    quantization,
-    reciprocals,
-)
+from synpick_warp.system.codecs import jpeg
 
 SLOT_BYTES_PER_PIXEL = 1.0
 """Capacity of a restart interval: nearly four times the mean at quality 95 (568 kB for a full-HD view of a tote)."""
@@ -55,14 +24,14 @@ MIN_FILE_BYTES = 1024
 """Capacity for header and markers [B]."""
 LANES = 32
 """Lanes: threads that count and copy the bytes of an interval, a warp."""
-INTERVAL_BLOCKS = RESTART_INTERVAL * int(BLOCKS_PER_MCU)
+INTERVAL_BLOCKS = jpeg.RESTART_INTERVAL * int(dct.BLOCKS_PER_MCU)
 """Blocks of a restart interval."""
 QUAD = 4
 """Coefficients of 16 bits in an element of 64."""
-HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
+HUFFMAN = struct_arrays(huffman.HuffmanTables, "component", "symbol")
 
 
-class JpegBuffers(array_group(JpegFiles, "view", jpeg=("view", "byte"))):
+class JpegBuffers(array_group(stuffing.JpegFiles, "view", jpeg=("view", "byte"))):
     """JPEG files of one batch of views, and their sizes."""
 
 
@@ -71,18 +40,18 @@ _INTERVALS = {"slot": ("view", "interval", "slot_word"), "stuffing": ("view", "i
 _SAMPLES = {"sample": ("view", "sample_row", "sample_block")}
 
 
-class JpegScratch(array_group(JpegData, "view", "interval", **_SAMPLES, **_BLOCKS, **_INTERVALS)):
+class JpegScratch(array_group(dct.JpegData, "view", "interval", **_SAMPLES, **_BLOCKS, **_INTERVALS)):
     """Scratch of the encoder for one batch."""
 
 
 def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions of `JpegBuffers` and `JpegScratch`, for `views` images [px]."""
-    across, down = -(-width // int(MCU)), -(-height // int(MCU))
+    across, down = -(-width // int(dct.MCU)), -(-height // int(dct.MCU))
     mcus = across * down
-    slot_bytes = int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)
-    sizes = {"view": views, "block": mcus * int(BLOCKS_PER_MCU), "quad": int(BLOCK_SIZE) // QUAD}
-    sizes |= {"sample_row": down * int(MCU + BLOCK), "sample_block": across * int(MCU // BLOCK)}
-    sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "lane": LANES, "slot_word": slot_bytes // int(WORD_BYTES)}
+    slot_bytes = int(SLOT_BYTES_PER_PIXEL * dct.MCU**2 * jpeg.RESTART_INTERVAL)
+    sizes = {"view": views, "block": mcus * int(dct.BLOCKS_PER_MCU), "quad": int(dct.BLOCK_SIZE) // QUAD}
+    sizes |= {"sample_row": down * int(dct.MCU + dct.BLOCK), "sample_block": across * int(dct.MCU // dct.BLOCK)}
+    sizes |= {"interval": -(-mcus // jpeg.RESTART_INTERVAL), "lane": LANES, "slot_word": slot_bytes // int(stuffing.WORD_BYTES)}
     return sizes | {"byte": MIN_FILE_BYTES + int(FILE_BYTES_PER_PIXEL * width * height)}
 
 
@@ -99,12 +68,12 @@ class JpegEncoder:
         self.scratch, self.device = scratch, scratch.sample.device
         device = self.device
         self.tables = upload_huffman(device)
-        divisor = np.stack([quantization(quality) for quality in range(QUALITIES)]) * DIVISOR_SCALE
-        self.reciprocal = wp.array(reciprocals(divisor), dtype=wp.uint32, device=device)
-        header = [np.frombuffer(make_header(width, height, quality), np.uint8) for quality in range(QUALITIES)]
+        divisor = np.stack([jpeg.quantization(quality) for quality in range(jpeg.QUALITIES)]) * jpeg.DIVISOR_SCALE
+        self.reciprocal = wp.array(jpeg.reciprocals(divisor), dtype=wp.uint32, device=device)
+        header = [np.frombuffer(jpeg.make_header(width, height, quality), np.uint8) for quality in range(jpeg.QUALITIES)]
         self.header = wp.array(np.stack(header), dtype=wp.uint8, device=device)
         rows = self.scratch.sample
-        shape = (*rows.shape[:2], rows.shape[2] * int(BLOCK))
+        shape = (*rows.shape[:2], rows.shape[2] * int(dct.BLOCK))
         self._samples = wp.array(ptr=rows.ptr, dtype=wp.uint8, shape=shape, device=device)
 
     def encode(self, image: wp.array, quality: wp.array, count: int, out: JpegBuffers) -> None:
@@ -120,14 +89,14 @@ class JpegEncoder:
         blocks, intervals, lanes = ((count, *array.shape[1:]) for array in (scratch.nonzero, scratch.coded, scratch.stuffing))
         _, rows, columns = self._samples.shape
         # A third of the rows are chroma: a row for each pair of rows of Y.
-        self._launch(convert_colors_kernel, (count, rows // 3, columns // 2), [image], [self._samples])
-        self._launch(transform_blocks_kernel, blocks, [*image.shape[1:3], quality, self.reciprocal], [data])
-        self._launch(measure_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
-        self._launch(place_blocks_kernel, intervals, [INTERVAL_BLOCKS, int(MARKER_BYTES)], [data])
-        self._launch(write_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
-        self._launch(count_stuffing_kernel, lanes, [], [data])
-        self._launch(place_intervals_kernel, count, [self.header.shape[1]], [data, out.bundle])
-        self._launch(join_intervals_kernel, lanes, [data, quality, self.header], [out.bundle])
+        self._launch(dct.convert_colors_kernel, (count, rows // 3, columns // 2), [image], [self._samples])
+        self._launch(dct.transform_blocks_kernel, blocks, [*image.shape[1:3], quality, self.reciprocal], [data])
+        self._launch(huffman.measure_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
+        self._launch(huffman.place_blocks_kernel, intervals, [INTERVAL_BLOCKS, int(stuffing.MARKER_BYTES)], [data])
+        self._launch(huffman.write_blocks_kernel, blocks, [self.tables, INTERVAL_BLOCKS], [data])
+        self._launch(stuffing.count_stuffing_kernel, lanes, [], [data])
+        self._launch(stuffing.place_intervals_kernel, count, [self.header.shape[1]], [data, out.bundle])
+        self._launch(stuffing.join_intervals_kernel, lanes, [data, quality, self.header], [out.bundle])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with the block size of the encoder."""
@@ -157,6 +126,6 @@ class Compressor:
 def upload_huffman(device: wp.Device) -> Any:
     """Upload the standard Huffman tables (T.81, annex K) as the struct `HuffmanTables`."""
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
-    for kind, (codes, lengths) in huffman_codes().items():
-        getattr(tables, kind).assign(codes | lengths.astype(np.uint32) << np.uint32(CODE_BITS))
+    for kind, (codes, lengths) in jpeg.huffman_codes().items():
+        getattr(tables, kind).assign(codes | lengths.astype(np.uint32) << np.uint32(huffman.CODE_BITS))
     return tables

@@ -10,18 +10,11 @@ import warp as wp
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.episodes.manipulation import FLAT
+from synpick_warp.kernels.perception import occlusion_votes
 from synpick_warp.kernels.perception.clutter_graph import LANES, Cycles, break_cycles_kernel, close_clutter_kernel, link_clutter_kernel
 from synpick_warp.kernels.perception.cup_alignment import align_cups_kernel
 from synpick_warp.kernels.perception.flat_points import choose_flat_points_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
-from synpick_warp.kernels.perception.occlusion_votes import (
-    CONTOUR_LANES,
-    NOWHERE,
-    Voting,
-    bound_contours_kernel,
-    count_votes_kernel,
-    weigh_votes_kernel,
-)
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
 from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, count_words, struct_arrays
@@ -34,7 +27,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 _KINDS = {"count": ("view", "instance", "instance", "kind")}
 
 
-class VoteArrays(array_group(Voting, "view", "instance", units={"extent": "px", "reach": "px"}, **_KINDS)):
+class VoteArrays(array_group(occlusion_votes.Voting, "view", "instance", units={"extent": "px", "reach": "px"}, **_KINDS)):
     """Scratch of the occlusion votes."""
 
 
@@ -73,7 +66,7 @@ class GraspPlanner:
         self.views, self.instances = arrays.largest.shape
         self.voting, self.cycles = allocate_votes(settings, self.instances, self.views, self.device)
         self._sources = (images, images.scene, arrays, self.voting)
-        self._contours = (self.views, self.instances, int(CONTOUR_LANES))
+        self._contours = (self.views, self.instances, int(occlusion_votes.CONTOUR_LANES))
 
     def plan(self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int) -> None:
         """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.
@@ -98,17 +91,17 @@ class GraspPlanner:
 
     def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
-        self.voting.extent.fill_(int(NOWHERE))
-        launch(bound_contours_kernel, self._contours, scene, state, observation, *self._sources)
+        self.voting.extent.fill_(int(occlusion_votes.NOWHERE))
+        launch(occlusion_votes.bound_contours_kernel, self._contours, scene, state, observation, *self._sources)
 
     def count_votes(self, scene: SceneData, observation: Observation) -> None:
         """Count, along every contour, the votes that another instance lies above the enclosed one, by kind."""
         self.voting.count.zero_()
-        launch(count_votes_kernel, self._contours, scene, observation, *self._sources)
+        launch(occlusion_votes.count_votes_kernel, self._contours, scene, observation, *self._sources)
 
     def weigh_votes(self, scene: SceneData, observation: Observation) -> None:
         """Sum full and deep votes, deep ones times their weight."""
-        launch(weigh_votes_kernel, (self.views, self.instances, self.instances), scene, observation, *self._sources)
+        launch(occlusion_votes.weigh_votes_kernel, (self.views, self.instances, self.instances), scene, observation, *self._sources)
 
     def order_clutter(self, scene: SceneData, observation: Observation) -> None:
         """Build the clutter graph from the votes, make it acyclic (minimum feedback arc set), and compute its transitive closure."""

@@ -17,13 +17,9 @@ from synpick_warp.kernels.render.images.antialias import (
     find_footprints_kernel,
     resolve_footprints_kernel,
 )
+from synpick_warp.kernels.render.lighting import denoise as denoising
+from synpick_warp.kernels.render.lighting import shadow_edges
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.denoise import (
-    choose_widths_kernel,
-    filter_blocks_kernel,
-    plan_stages_kernel,
-    smooth_ratios_kernel,
-)
 from synpick_warp.kernels.render.lighting.dirty_tiles import mark_dirty_tiles_kernel, plan_passes_kernel
 from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, advance_history_kernel
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
@@ -35,14 +31,6 @@ from synpick_warp.kernels.render.lighting.paths.queues import PATH_RECORDS, QUEU
 from synpick_warp.kernels.render.lighting.paths.reuse import reuse_histories_kernel, schedule_paths_kernel
 from synpick_warp.kernels.render.lighting.shading import DenoisedLight, shade_kernel, shade_samples_kernel
 from synpick_warp.kernels.render.lighting.shadow_edges import CHUNK_TILES as EDGE_CHUNK_TILES
-from synpick_warp.kernels.render.lighting.shadow_edges import (
-    MAX_CHUNK_PIXELS,
-    EdgeLists,
-    filter_shadow_edges_kernel,
-    list_edge_cells_kernel,
-    list_edge_pixels_kernel,
-    trace_shadow_edges_kernel,
-)
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filter_shadows_kernel, measure_steepness_kernel
 from synpick_warp.kernels.render.lighting.shadows import ShadowRays, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.tile_flags import ALL_STAGES, TileFlags
@@ -102,7 +90,7 @@ GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
 LAMP_SHADOWS = struct_arrays(LampShadows, "view", "shadow_row", "shadow_column", edge=("view", "row", "column"))
 EDGE_LISTS = struct_arrays(
-    EdgeLists,
+    shadow_edges.EdgeLists,
     "view",
     "edge_chunk",
     cell=("view", "edge_chunk", "chunk_cell"),
@@ -157,7 +145,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     size = coarse_size(render, width, histories)
     shadow = shadow_size(size)
     tile_pixels = int(TILE_PIXELS) * shadow**2
-    edge_tiles = min(int(EDGE_CHUNK_TILES), MAX_CHUNK_PIXELS // tile_pixels)
+    edge_tiles = min(int(EDGE_CHUNK_TILES), shadow_edges.MAX_CHUNK_PIXELS // tile_pixels)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
     columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
     return {
@@ -337,7 +325,7 @@ class DenoisedRenderer:
             inputs, outputs = [scene.paths, self.coarse, shot, self.moving], [self.history, self.path_lists, self.flags]
             launch_views(schedule_paths_kernel, views.count, threads, inputs, outputs, scene.device)
             dim, inputs = (views.count, self.coarse.grid.tiles), [self.coarse.grid]
-            wp.launch(plan_stages_kernel, dim=dim, inputs=inputs, outputs=[self.flags], device=scene.device)
+            wp.launch(denoising.plan_stages_kernel, dim=dim, inputs=inputs, outputs=[self.flags], device=scene.device)
             inputs, outputs = (
                 [scene.paths, self.coarse, shot, self.path_lists, self.flags],
                 [self.history, self.guide, self.coarse_light],
@@ -367,11 +355,13 @@ class DenoisedRenderer:
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""
         shared = [self.coarse, self.guide]
-        self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views, self.flags], [self.blocks])
+        self._launch(
+            denoising.filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views, self.flags], [self.blocks]
+        )
         inputs = [*shared, self.blocks, views, self.flags, self.variance_scale]
-        self._launch(choose_widths_kernel, self.coarse.grid, views, inputs, [self.chosen])
+        self._launch(denoising.choose_widths_kernel, self.coarse.grid, views, inputs, [self.chosen])
         inputs = [*shared, self.chosen, views, self.flags]
-        self._launch(smooth_ratios_kernel, self.coarse.grid, views, inputs, [self.ratios])
+        self._launch(denoising.smooth_ratios_kernel, self.coarse.grid, views, inputs, [self.ratios])
 
     def trace_shadows(self, shot: Any, image: Any) -> None:
         """Visibility of the lamps: shadow rays and filter on the shadow grid, rays from pixels at steep edges; see `trace_shadow_edges`."""
@@ -405,15 +395,17 @@ class DenoisedRenderer:
         lists.count.zero_()
         self.shadows.edge.zero_()
         outputs = [self.shadows, lists]
-        launch_views(list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device)
+        launch_views(
+            shadow_edges.list_edge_cells_kernel, views.count, coarse.grid.tiles * int(TILE_PIXELS), [coarse, views], outputs, device
+        )
         threads = EDGE_THREADS if device.is_cuda else CPU_EDGE_THREADS
         sharing = lists.count.shape[1] * threads
         inputs = [scene.meshes, coarse, scene.lights, shot, self.moving, threads]
-        launch_views(list_edge_pixels_kernel, views.count, sharing, inputs, [*outputs, self.flags], device)
+        launch_views(shadow_edges.list_edge_pixels_kernel, views.count, sharing, inputs, [*outputs, self.flags], device)
         self.plan_passes(shot, image)
         inputs = [scene.plain, coarse, shot, lists]
-        launch_pixels(trace_shadow_edges_kernel, views.count * sharing, [*inputs, image, threads], [self.shadows], device)
-        launch_pixels(filter_shadow_edges_kernel, views.count * sharing, [*inputs, self.shadows, threads], [image], device)
+        launch_pixels(shadow_edges.trace_shadow_edges_kernel, views.count * sharing, [*inputs, image, threads], [self.shadows], device)
+        launch_pixels(shadow_edges.filter_shadow_edges_kernel, views.count * sharing, [*inputs, self.shadows, threads], [image], device)
 
     def shade_pixels(self, shot: Any, image: Any) -> None:
         """Deferred shading: radiance of each pixel."""

@@ -8,19 +8,9 @@ import warp as wp
 
 from synpick_warp.configs.cell.sensors import DepthSensor
 from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.render.images import layers
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.images.depth_sensor import render_depth_sensor_kernel
-from synpick_warp.kernels.render.images.layers import (
-    BodyMotions,
-    LayerScene,
-    compute_motions_kernel,
-    render_albedo_kernel,
-    render_classes_kernel,
-    render_flow_kernel,
-    render_nocs_kernel,
-    render_normals_kernel,
-    render_scene_flow_kernel,
-)
 from synpick_warp.kernels.render.images.suction_map import render_suction_seal_kernel, render_suction_wrench_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -37,18 +27,18 @@ MAX_CLASS = 65535
 MOTION_LAYERS = {"flow", "scene_flow"}
 """Layers computed from the motions of bodies."""
 KERNELS = {
-    "normals": render_normals_kernel,
-    "albedo": render_albedo_kernel,
-    "nocs": render_nocs_kernel,
-    "classes": render_classes_kernel,
-    "flow": render_flow_kernel,
-    "scene_flow": render_scene_flow_kernel,
+    "normals": layers.render_normals_kernel,
+    "albedo": layers.render_albedo_kernel,
+    "nocs": layers.render_nocs_kernel,
+    "classes": layers.render_classes_kernel,
+    "flow": layers.render_flow_kernel,
+    "scene_flow": layers.render_scene_flow_kernel,
     "depth_sensor": render_depth_sensor_kernel,
     "suction_seal": render_suction_seal_kernel,
     "suction_wrench": render_suction_wrench_kernel,
 }
 """Kernel of each layer of ours but those of `STEREO_LAYERS`."""
-BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
+BODY_MOTIONS = struct_arrays(layers.BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
 
 
 def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> Any:
@@ -71,7 +61,7 @@ def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> A
 
 def layer_scene(scene: RenderScene) -> Any:
     """The struct `LayerScene` without sensor and motions."""
-    layer = LayerScene()
+    layer = layers.LayerScene()
     layer.obj_id, layer.suction = scene.obj_id, scene.suction_maps
     return layer
 
@@ -119,7 +109,9 @@ class LayerRenderer:
             layer.motions = self.motions
             inputs = [snapshot.bundle, views, last.rotation, last.center]
             dim = (views.count, layer.motions.known.shape[1])
-            wp.launch(kernel_for(compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[layer.motions], device=scene.device)
+            wp.launch(
+                kernel_for(layers.compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[layer.motions], device=scene.device
+            )
         for name in self.names:
             if name not in STEREO_LAYERS:
                 pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)

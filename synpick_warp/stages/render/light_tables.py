@@ -12,19 +12,7 @@ from synpick_warp.kernels.render.lighting.brdf import ALBEDO_COLUMNS, ALBEDO_ROW
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, PREFILTER_LEVELS
 from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
-from synpick_warp.scenes.environment import (
-    BACKGROUND_ROWS,
-    LUMINANCE,
-    MAX_SUN_TANGENT,
-    WHITE_VALUE,
-    Lamp,
-    draw_sun_disc,
-    extract_lamps,
-    map_directions,
-    replace_sun,
-    resize_map,
-    sample_disc,
-)
+from synpick_warp.scenes import environment
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.system.linear_algebra import dot, matmul
 from synpick_warp.system.processes.threads import map_in_threads
@@ -55,7 +43,7 @@ class EnvironmentTables:
     """(PREFILTER_LEVELS, PREFILTER_ROWS, 2 PREFILTER_ROWS, 3) float32: the map without its lamps, convolved with GGX lobes."""
     irradiance: np.ndarray
     """(9, 3) float32: coefficients of spherical harmonics."""
-    lamps: list[Lamp]
+    lamps: list[environment.Lamp]
     """The sun of its sIBL set, if it is narrow, then others, the strongest first; see `scenes.environment`."""
     exposure: float
     """Factor that brings the map's radiance to display range."""
@@ -90,7 +78,7 @@ def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
         (PREFILTER_LEVELS, rows, 2 rows, 3), for growing roughness.
     """
     rows = radiance.shape[0]
-    directions, solid_angles = map_directions(rows)
+    directions, solid_angles = environment.map_directions(rows)
     incoming = directions.reshape(-1, 3)
     levels = []
     for level in range(int(PREFILTER_LEVELS)):
@@ -106,7 +94,7 @@ def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
     return np.maximum(np.stack(levels), 0.0)
 
 
-def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, np.ndarray, list[Lamp]]:
+def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, np.ndarray, list[environment.Lamp]]:
     """Split an environment map into its lamps and the rest.
 
     A sun that its sIBL set names is the first lamp, with the set's direction; a wide one is treated as any other light of the map.
@@ -114,15 +102,15 @@ def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, n
     Returns:
         The whole map (BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3), with the set's sun drawn as a disc; the map without its lamps; the lamps.
     """
-    radiance = resize_map(light.radiance, BACKGROUND_ROWS)
+    radiance = environment.resize_map(light.radiance, environment.BACKGROUND_ROWS)
     if light.sun is None:
-        return radiance, *extract_lamps(radiance, max_lamps, int(LAMP_POINTS))
-    rest, direction, irradiance, radius = replace_sun(radiance, light.sun)
-    disc = draw_sun_disc((rest < radiance).any(axis=2), direction, irradiance, radius)
-    if radius > MAX_SUN_TANGENT or max_lamps == 0:
-        return rest + disc, *extract_lamps(rest + disc, max_lamps, int(LAMP_POINTS))
-    lampless, others = extract_lamps(rest, max_lamps - 1, int(LAMP_POINTS), rest + disc)
-    sun = Lamp(direction, irradiance, radius, sample_disc(direction, radius, int(LAMP_POINTS)))
+        return radiance, *environment.extract_lamps(radiance, max_lamps, int(LAMP_POINTS))
+    rest, direction, irradiance, radius = environment.replace_sun(radiance, light.sun)
+    disc = environment.draw_sun_disc((rest < radiance).any(axis=2), direction, irradiance, radius)
+    if radius > environment.MAX_SUN_TANGENT or max_lamps == 0:
+        return rest + disc, *environment.extract_lamps(rest + disc, max_lamps, int(LAMP_POINTS))
+    lampless, others = environment.extract_lamps(rest, max_lamps - 1, int(LAMP_POINTS), rest + disc)
+    sun = environment.Lamp(direction, irradiance, radius, environment.sample_disc(direction, radius, int(LAMP_POINTS)))
     return rest + disc, lampless, [sun, *others]
 
 
@@ -135,20 +123,20 @@ def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None, max
         max_lamps: Maximum number of lamps.
     """
     radiance, lampless, lamps = separate_lamps(light, max_lamps)
-    directions, solid_angles = map_directions(BACKGROUND_ROWS)
+    directions, solid_angles = environment.map_directions(environment.BACKGROUND_ROWS)
     upward = np.maximum(directions[..., 2], 0.0) * solid_angles
     upward_irradiance = (radiance * upward[..., None]).sum(axis=(0, 1))
     # What unoccluded surfaces face: the table hides the map below the horizon.
     unoccluded = lampless if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, lampless)
     coefficients = np.einsum("ijk,ijc->kc", sh_basis(directions) * solid_angles[..., None], unoccluded) * COSINE_LOBE[:, None]
-    white = max(float(dot(upward_irradiance, LUMINANCE)) / np.pi, 1e-9)
+    white = max(float(dot(upward_irradiance, environment.LUMINANCE)) / np.pi, 1e-9)
     return EnvironmentTables(
         radiance=radiance.astype(np.float32),
         lampless=lampless.astype(np.float32),
-        prefiltered=prefilter_specular(resize_map(unoccluded, PREFILTER_ROWS)).astype(np.float32),
+        prefiltered=prefilter_specular(environment.resize_map(unoccluded, PREFILTER_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
         lamps=lamps,
-        exposure=WHITE_VALUE / white,
+        exposure=environment.WHITE_VALUE / white,
     )
 
 
@@ -169,13 +157,13 @@ def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarr
         Marginal (rows + 1) and conditional (rows, 2 rows + 1), both float32.
     """
     rows, columns = radiance.shape[:2]
-    directions, solid_angles = map_directions(rows)
+    directions, solid_angles = environment.map_directions(rows)
     height = directions[..., 2]
     importance = np.where(height > 0.0, height, 0.0) + HORIZON_WEIGHT
     if table:
         # The texels next to the horizon reach below it.
         importance[height < -np.pi / rows] = 0.0
-    luminance = dot(radiance.astype(np.float64), LUMINANCE)
+    luminance = dot(radiance.astype(np.float64), environment.LUMINANCE)
     # Mean of the linear interpolation over a texel: 1/8, 3/4, 1/8.
     luminance = 0.75 * luminance + 0.125 * (np.roll(luminance, 1, axis=1) + np.roll(luminance, -1, axis=1))
     padded = np.pad(luminance, ((1, 1), (0, 0)), mode="edge")

@@ -2,14 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.images.mask_runs import (
-    Boundaries,
-    BoundaryCounts,
-    count_boundaries_kernel,
-    count_runs_kernel,
-    list_boundaries_kernel,
-    list_runs_kernel,
-)
+from synpick_warp.kernels.render.images import mask_runs
 from synpick_warp.kernels.tuning import RUN_LANES
 from synpick_warp.stages.arrays import array_group
 from synpick_warp.stages.buffers import ViewBuffers, masks_of
@@ -25,11 +18,11 @@ FIELDS = 2
 _LISTS = {"boundaries": ("view", "field", "boundary"), "runs": ("view", "run")}
 
 
-class BoundaryBuffers(array_group(Boundaries, boundary_count=("view",), run_count=("view", "instance"), **_LISTS)):
+class BoundaryBuffers(array_group(mask_runs.Boundaries, boundary_count=("view",), run_count=("view", "instance"), **_LISTS)):
     """Run boundaries of the ids and amodal masks of a batch of views."""
 
 
-class BoundaryScratch(array_group(BoundaryCounts, column_count=("view", "column"), lane_count=("view", "instance", "lane"))):
+class BoundaryScratch(array_group(mask_runs.BoundaryCounts, column_count=("view", "column"), lane_count=("view", "instance", "lane"))):
     """Scratch between the two passes over images and masks."""
 
 
@@ -54,9 +47,9 @@ def list_boundaries(scratch: BoundaryScratch, count: int, images: ViewBuffers, o
     instance, masks, device = images.instance, masks_of(images), scratch.column_count.device
     counts, runs = scratch.bundle, out.bundle
     dim = (count, scratch.column_count.shape[1])
-    wp.launch(count_boundaries_kernel, dim=dim, inputs=[instance], outputs=[counts], device=device)
-    wp.launch(list_boundaries_kernel, dim=dim, inputs=[instance, counts], outputs=[runs], device=device)
+    wp.launch(mask_runs.count_boundaries_kernel, dim=dim, inputs=[instance], outputs=[counts], device=device)
+    wp.launch(mask_runs.list_boundaries_kernel, dim=dim, inputs=[instance, counts], outputs=[runs], device=device)
     out.run_count.zero_()
     dim = (count, *scratch.lane_count.shape[1:])
-    wp.launch(count_runs_kernel, dim=dim, inputs=[masks], outputs=[counts, runs], device=device)
-    wp.launch(list_runs_kernel, dim=dim, inputs=[masks, instance.shape[1], counts], outputs=[runs], device=device)
+    wp.launch(mask_runs.count_runs_kernel, dim=dim, inputs=[masks], outputs=[counts, runs], device=device)
+    wp.launch(mask_runs.list_runs_kernel, dim=dim, inputs=[masks, instance.shape[1], counts], outputs=[runs], device=device)

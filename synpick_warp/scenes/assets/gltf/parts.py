@@ -9,43 +9,9 @@ from PIL import Image as PillowImage
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import (
-    MAX_TEXTURE_FILE,
-    NO_MATERIAL,
-    WHITE,
-    FileMaterial,
-    ImageCache,
-    as_color,
-    clamp_texture,
-    linear_to_srgb,
-    plain_color,
-    srgb_to_linear,
-)
+from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
-from synpick_warp.scenes.assets.gltf.document import (
-    COMPONENTS,
-    COMPRESSED,
-    FAN,
-    GLOSSINESS,
-    QUANTIZATION,
-    STRIP,
-    TRIANGLES,
-    WEBP,
-    WIDTHS,
-    Accessor,
-    BufferView,
-    Glossiness,
-    Gltf,
-    GltfMaterial,
-    Node,
-    Pbr,
-    Primitive,
-    Skin,
-    TextureInfo,
-    item_at,
-    read_document,
-    read_uri,
-)
+from synpick_warp.scenes.assets.gltf import document as schema
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
@@ -61,7 +27,7 @@ _RIGID = 1e-6
 def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshPart]:
     """Read a .glb or .gltf file: one part for each primitive of each node of the default scene. `data`: content to decode in place of the
     file's. Raises CatalogError: the file or one that it refers to cannot be used."""
-    document, buffers = read_document(path, notes, data)
+    document, buffers = schema.read_document(path, notes, data)
     with reading_as(path.suffix[1:].upper(), path):  # Values may be valid one by one, and not fit together.
         return _Reader(path, document, buffers, notes).parts()
 
@@ -69,12 +35,12 @@ def read_gltf(path: Path, notes: Notes, data: bytes | None = None) -> list[MeshP
 class _Reader:
     """Decodes one document; materials and images are decoded once, so that parts share them."""
 
-    def __init__(self, path: Path, gltf: Gltf, buffers: list[bytes], notes: Notes) -> None:
+    def __init__(self, path: Path, gltf: schema.Gltf, buffers: list[bytes], notes: Notes) -> None:
         self.path, self.gltf, self.buffers, self.notes = path, gltf, buffers, notes
-        self.images = ImageCache(self.path)
+        self.images = appearance.ImageCache(self.path)
         self.files: dict[int, bytes] = {}
         self.tiles: dict[tuple[int, bool, bool], np.ndarray] = {}
-        self.materials: dict[int, tuple[FileMaterial, TextureInfo | None]] = {}
+        self.materials: dict[int, tuple[appearance.FileMaterial, schema.TextureInfo | None]] = {}
 
     def parts(self) -> list[MeshPart]:
         """Mesh parts of the default scene, depth first; without scenes, of all nodes.
@@ -84,22 +50,22 @@ class _Reader:
         nodes, scenes = self.gltf.nodes, self.gltf.scenes
         children = {child for node in nodes for child in node.children}
         roots = [number for number in range(len(nodes)) if number not in children]
-        drawn = self.placed(item_at(scenes, self.gltf.scene, "scene", self.path).nodes if scenes else roots)
+        drawn = self.placed(schema.item_at(scenes, self.gltf.scene, "scene", self.path).nodes if scenes else roots)
         # Joints may lie outside of the scene.
         placed = self.placed(roots) if self.gltf.skins else drawn
         parts: list[MeshPart] = []
         rows = 0
         for number, transform in drawn.items():
             skin, mesh = nodes[number].skin, nodes[number].mesh
-            for each in () if mesh is None else item_at(self.gltf.meshes, mesh, "mesh", self.path).primitives:
-                if each.mode not in (TRIANGLES, STRIP, FAN):
+            for each in () if mesh is None else schema.item_at(self.gltf.meshes, mesh, "mesh", self.path).primitives:
+                if each.mode not in (schema.TRIANGLES, schema.STRIP, schema.FAN):
                     continue
                 part = self.part(each)
                 rows += max(len(part.vertices), len(part.faces))
                 if rows > MAX_ROWS or len(parts) >= MAX_PARTS:
                     raise CatalogError(f"{self.path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
                 if skin is not None:
-                    part = self.skinned(part, each, item_at(self.gltf.skins, skin, "skin", self.path), placed)
+                    part = self.skinned(part, each, schema.item_at(self.gltf.skins, skin, "skin", self.path), placed)
                 parts.append(part if skin is not None else _transform(part, transform))
         return parts
 
@@ -113,16 +79,16 @@ class _Reader:
                 raise CatalogError(f"{self.path}: node {number} has two parents, or is a root and a child; export it again")
             if len(placed) == MAX_PARTS:
                 raise CatalogError(f"{self.path}: more than {MAX_PARTS} nodes; merge the meshes' parts")
-            node = item_at(self.gltf.nodes, number, "node", self.path)
+            node = schema.item_at(self.gltf.nodes, number, "node", self.path)
             placed[number] = matmul(parent, _node_matrix(node))
             stack += [(child, placed[number]) for child in reversed(dict.fromkeys(node.children))]
         return placed
 
-    def skinned(self, part: MeshPart, primitive: Primitive, skin: Skin, placed: dict[int, np.ndarray]) -> MeshPart:
+    def skinned(self, part: MeshPart, primitive: schema.Primitive, skin: schema.Skin, placed: dict[int, np.ndarray]) -> MeshPart:
         """Linear blend skinning in the pose of the file: vertices by the weighted mean of the transforms of their joints."""
         count, names = len(part.vertices), primitive.attributes
         for joint in skin.joints:
-            item_at(self.gltf.nodes, joint, "node", self.path)
+            schema.item_at(self.gltf.nodes, joint, "node", self.path)
         sets = [number for number in range(len(names)) if f"JOINTS_{number}" in names and f"WEIGHTS_{number}" in names]
         if not sets:
             return part
@@ -148,7 +114,7 @@ class _Reader:
         moved = np.einsum("vab,vb->va", blend[:, :3, :3], part.vertices) + blend[:, :3, 3]
         return replace(part, vertices=moved, normals=None)
 
-    def part(self, primitive: Primitive) -> MeshPart:
+    def part(self, primitive: schema.Primitive) -> MeshPart:
         """Geometry and material of a primitive as a mesh part."""
         attributes = primitive.attributes
         if "POSITION" not in attributes:
@@ -160,7 +126,7 @@ class _Reader:
             corners = self.values(primitive.indices, "indices", (1,))[:, 0].astype(np.int64)
         normals = self.attribute(attributes.get("NORMAL"), "NORMAL", (3,), count)
         colors = self.attribute(attributes.get("COLOR_0"), "COLOR_0", (3, 4), count)
-        material, info = (NO_MATERIAL, None) if primitive.material is None else self.material(primitive.material)
+        material, info = (appearance.NO_MATERIAL, None) if primitive.material is None else self.material(primitive.material)
         uv = None
         if info is not None:
             coordinates = (
@@ -174,8 +140,8 @@ class _Reader:
         if primitive.targets:
             self.notes.ignored.append("morph targets")
         if colors is not None:
-            material = replace(material, color=WHITE) if primitive.material is None else material
-            colors = linear_to_srgb(colors[:, :3])
+            material = replace(material, color=appearance.WHITE) if primitive.material is None else material
+            colors = appearance.linear_to_srgb(colors[:, :3])
         return MeshPart(vertices, _triangles(corners, primitive.mode), normals, uv, colors, material)
 
     def attribute(self, index: int | None, name: str, widths: tuple[int, ...], count: int) -> np.ndarray | None:
@@ -192,23 +158,23 @@ class _Reader:
 
         Integers in colours and normals are normalized in any case, and those in texture coordinates unless KHR_mesh_quantization is used.
         """
-        accessor = item_at(self.gltf.accessors, index, "accessor", self.path)
-        if WIDTHS[accessor.type] not in widths:
-            allowed = " or ".join(kind for kind, width in WIDTHS.items() if width in widths and kind[:3] != "MAT")
+        accessor = schema.item_at(self.gltf.accessors, index, "accessor", self.path)
+        if schema.WIDTHS[accessor.type] not in widths:
+            allowed = " or ".join(kind for kind, width in schema.WIDTHS.items() if width in widths and kind[:3] != "MAT")
             raise CatalogError(f"{self.path}: {name} is of type {accessor.type}; needed: {allowed}; export it again")
         values = self.raw(accessor, name)
-        always = name in ("NORMAL", "COLOR_0") or (name[0] == "T" and QUANTIZATION not in self.gltf.extensionsUsed)
+        always = name in ("NORMAL", "COLOR_0") or (name[0] == "T" and schema.QUANTIZATION not in self.gltf.extensionsUsed)
         kind = values.dtype
         values = values.astype(np.float64)
         if kind.kind == "f" or name == "indices" or not (accessor.normalized or always):
             return values
         return np.maximum(values / np.iinfo(kind).max, -1.0)
 
-    def raw(self, accessor: Accessor, name: str) -> np.ndarray:
+    def raw(self, accessor: schema.Accessor, name: str) -> np.ndarray:
         """Stored numbers of an accessor (count, width), with its sparse values in their places."""
-        kind, width, sparse = np.dtype(COMPONENTS[accessor.componentType]), WIDTHS[accessor.type], accessor.sparse
+        kind, width, sparse = np.dtype(schema.COMPONENTS[accessor.componentType]), schema.WIDTHS[accessor.type], accessor.sparse
         if accessor.bufferView is None and sparse is None and accessor.count:
-            used = ", ".join(sorted(set(self.gltf.extensionsUsed) & set(COMPRESSED))) or "compressed geometry"
+            used = ", ".join(sorted(set(self.gltf.extensionsUsed) & set(schema.COMPRESSED))) or "compressed geometry"
             raise CatalogError(f"{self.path}: {name} without data, as in files with {used}; export it without compression")
         if accessor.count > 3 * MAX_ROWS:  # Corners of as many triangles.
             raise CatalogError(f"{self.path}: {name} has {accessor.count} values, more than {MAX_ROWS} triangles have; decimate the mesh")
@@ -216,7 +182,7 @@ class _Reader:
         if accessor.bufferView is not None:
             values = self.rows(accessor.bufferView, accessor.byteOffset, accessor.count, width, kind)
         if sparse is not None:
-            index_kind = np.dtype(COMPONENTS[sparse.indices.componentType])
+            index_kind = np.dtype(schema.COMPONENTS[sparse.indices.componentType])
             places = self.rows(sparse.indices.bufferView, sparse.indices.byteOffset, sparse.count, 1, index_kind)
             if places.size and places.max() >= accessor.count:
                 raise CatalogError(f"{self.path}: a sparse accessor refers to row {places.max()} of {accessor.count}; export it again")
@@ -226,7 +192,7 @@ class _Reader:
 
     def rows(self, view_index: int, offset: int, count: int, width: int, kind: np.dtype) -> np.ndarray:
         """Rows of a buffer view, a view of its bytes."""
-        view: BufferView = item_at(self.gltf.bufferViews, view_index, "buffer view", self.path)
+        view: schema.BufferView = schema.item_at(self.gltf.bufferViews, view_index, "buffer view", self.path)
         size = kind.itemsize * width
         stride = view.byteStride or size
         if count and offset + stride * (count - 1) + size > view.byteLength:
@@ -235,16 +201,16 @@ class _Reader:
             return np.zeros((0, width), kind)
         return np.ndarray((count, width), kind, self.buffers[view.buffer], view.byteOffset + offset, (stride, kind.itemsize))
 
-    def material(self, index: int) -> tuple[FileMaterial, TextureInfo | None]:
+    def material(self, index: int) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
         """Material of a primitive, and the reference to its base colour texture (None: it has none)."""
         if index not in self.materials:
-            material = item_at(self.gltf.materials, index, "material", self.path)
+            material = schema.item_at(self.gltf.materials, index, "material", self.path)
             self.note_ignored(material)
             gloss = material.extensions.glossiness if material.extensions else None
-            self.materials[index] = self.gloss(gloss) if gloss else self.pbr(material.pbrMetallicRoughness or Pbr())
+            self.materials[index] = self.gloss(gloss) if gloss else self.pbr(material.pbrMetallicRoughness or schema.Pbr())
         return self.materials[index]
 
-    def note_ignored(self, material: GltfMaterial) -> None:
+    def note_ignored(self, material: schema.GltfMaterial) -> None:
         """Note the features of a material beyond base colour, metallic and roughness, which are not used."""
         self.notes.ignored += [name for name in ("normalTexture", "occlusionTexture") if getattr(material, name) is not None]
         if material.emissiveTexture is not None or any(material.emissiveFactor):
@@ -252,7 +218,7 @@ class _Reader:
         if material.alphaMode != "OPAQUE":
             self.notes.ignored.append("transparency")
 
-    def pbr(self, pbr: Pbr) -> tuple[FileMaterial, TextureInfo | None]:
+    def pbr(self, pbr: schema.Pbr) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
         """Convert a metallic-roughness material: (material, base colour texture); of the metallic-roughness texture, the mean is used."""
         for name, value in (("metallicFactor", pbr.metallicFactor), ("roughnessFactor", pbr.roughnessFactor)):
             if not -_FACTOR_TOLERANCE <= value <= 1.0 + _FACTOR_TOLERANCE:
@@ -267,83 +233,89 @@ class _Reader:
                 metallic = roughness = None
         return self.base(pbr.baseColorFactor[:3], pbr.baseColorTexture, metallic, roughness, "baseColorFactor")
 
-    def gloss(self, gloss: Glossiness) -> tuple[FileMaterial, TextureInfo | None]:
+    def gloss(self, gloss: schema.Glossiness) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
         """Convert specular-glossiness by its means: a metal has its specular colour, all else its diffuse colour."""
         specular, alpha = np.asarray(gloss.specularFactor), 1.0
         if gloss.specularGlossinessTexture is not None:
             image = self.texture(gloss.specularGlossinessTexture)
             if image is not None:
-                specular = specular * srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
+                specular = specular * appearance.srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
                 alpha = _mean_alpha(self.files[self.source(gloss.specularGlossinessTexture)])
         roughness = float(np.clip(1.0 - gloss.glossinessFactor * alpha, 0.0, 1.0))
         diffuse = np.asarray(gloss.diffuseFactor[:3])
         image = None if gloss.diffuseTexture is None else self.texture(gloss.diffuseTexture)
         if image is not None:
-            diffuse = diffuse * srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
+            diffuse = diffuse * appearance.srgb_to_linear(image.reshape(-1, 3).mean(axis=0) / 255.0)
         # The quadratic equation of KHR_materials_pbrSpecularGlossiness, appendix "Best practices".
         bright, shiny = (float(np.sqrt(dot(color**2, np.array((0.299, 0.587, 0.114))))) for color in (diffuse, specular))
         linear = bright * (1.0 - float(specular.max())) / (1.0 - _DIELECTRIC) + shiny - 2.0 * _DIELECTRIC
         root = np.sqrt(max(linear**2 - 4.0 * _DIELECTRIC * (_DIELECTRIC - shiny), 0.0))
         metallic = 0.0 if shiny < _DIELECTRIC else float(np.clip((root - linear) / (2.0 * _DIELECTRIC), 0.0, 1.0))
         if metallic > 0.5:
-            return self.base(specular, gloss.specularGlossinessTexture, metallic, roughness, GLOSSINESS)
-        return self.base(gloss.diffuseFactor[:3], gloss.diffuseTexture, metallic, roughness, GLOSSINESS)
+            return self.base(specular, gloss.specularGlossinessTexture, metallic, roughness, schema.GLOSSINESS)
+        return self.base(gloss.diffuseFactor[:3], gloss.diffuseTexture, metallic, roughness, schema.GLOSSINESS)
 
     def base(
-        self, factor: object, info: TextureInfo | None, metallic: float | None, roughness: float | None, name: str
-    ) -> tuple[FileMaterial, TextureInfo | None]:
+        self, factor: object, info: schema.TextureInfo | None, metallic: float | None, roughness: float | None, name: str
+    ) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
         """Material of a linear base colour factor and a texture, and the reference to the texture unless its image is missing."""
         linear = np.asarray(factor, dtype=np.float64)
         if linear.min() < -_FACTOR_TOLERANCE or linear.max() > 1.0 + _FACTOR_TOLERANCE:
             self.notes.said.append(f"{name} {' '.join(f'{value:g}' for value in linear)} is cut to 0..1")
-        texture, color = None if info is None else self.texture(info), as_color(linear_to_srgb(linear))
+        texture, color = None if info is None else self.texture(info), appearance.as_color(appearance.linear_to_srgb(linear))
         missing = info is not None and texture is None
-        return FileMaterial(plain_color(color) if missing else color, texture, metallic, roughness), None if missing else info
+        return appearance.FileMaterial(
+            appearance.plain_color(color) if missing else color, texture, metallic, roughness
+        ), None if missing else info
 
-    def source(self, info: TextureInfo) -> int:
+    def source(self, info: schema.TextureInfo) -> int:
         """Index of the image of a texture; raises CatalogError for image formats that cannot be read."""
-        texture = item_at(self.gltf.textures, info.index, "texture", self.path)
-        webp = texture.extensions.get(WEBP)
+        texture = schema.item_at(self.gltf.textures, info.index, "texture", self.path)
+        webp = texture.extensions.get(schema.WEBP)
         source = webp.get("source") if isinstance(webp, dict) else texture.source
         if not isinstance(source, int) or source < 0:
             known = f" ({', '.join(sorted(texture.extensions))[:80]})" if texture.extensions else ""
             raise CatalogError(f"{self.path}: texture {info.index} is of a format that cannot be read{ascii(known)[1:-1]}; use PNG or JPEG")
         return source
 
-    def texture(self, info: TextureInfo) -> np.ndarray | None:
+    def texture(self, info: schema.TextureInfo) -> np.ndarray | None:
         """Decode the image of a texture (H, W, 3) uint8; None: it is missing, and replaced by a colour."""
         source = self.source(info)
         if source not in self.files:
-            image = item_at(self.gltf.images, source, "image", self.path)
+            image = schema.item_at(self.gltf.images, source, "image", self.path)
             if image.uri is not None:
                 uri = image.uri
-                data = self.notes.image(lambda: read_uri(uri, MAX_TEXTURE_FILE, self.path))
+                data = self.notes.image(lambda: schema.read_uri(uri, appearance.MAX_TEXTURE_FILE, self.path))
                 if data is None:
                     return None
             else:
                 index = len(self.gltf.bufferViews) if image.bufferView is None else image.bufferView
-                view = item_at(self.gltf.bufferViews, index, "buffer view", self.path)
+                view = schema.item_at(self.gltf.bufferViews, index, "buffer view", self.path)
                 data = self.buffers[view.buffer][view.byteOffset : view.byteOffset + view.byteLength]
             self.files[source] = data
         return self.images.decode(source, self.files[source], f"{self.path}: image {source}")
 
-    def wrapped(self, material: FileMaterial, uv: np.ndarray, info: TextureInfo) -> tuple[FileMaterial, np.ndarray]:
+    def wrapped(
+        self, material: appearance.FileMaterial, uv: np.ndarray, info: schema.TextureInfo
+    ) -> tuple[appearance.FileMaterial, np.ndarray]:
         """Material and coordinates with a sampler's wrap modes applied where coordinates leave 0..1: mirrored repetition as an image twice
         the size that repeats, clamping as a margin around the image."""
         texture = self.gltf.textures[info.index]
         if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
             return material, uv
-        sampler = item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
+        sampler = schema.item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
         mirror = sampler.wrapS == _MIRROR, sampler.wrapT == _MIRROR
         if any(mirror):
             material, uv = self.mirrored(material, uv, (self.source(info), *mirror))
         clamp = sampler.wrapS == _CLAMP, sampler.wrapT == _CLAMP
         if any(clamp):
-            image, uv = clamp_texture(material.texture, uv, clamp, self.notes.ignored)
+            image, uv = appearance.clamp_texture(material.texture, uv, clamp, self.notes.ignored)
             material = replace(material, texture=image)
         return material, uv
 
-    def mirrored(self, material: FileMaterial, uv: np.ndarray, key: tuple[int, bool, bool]) -> tuple[FileMaterial, np.ndarray]:
+    def mirrored(
+        self, material: appearance.FileMaterial, uv: np.ndarray, key: tuple[int, bool, bool]
+    ) -> tuple[appearance.FileMaterial, np.ndarray]:
         """Extend an image by its mirror image to the right, upwards, or both; `key`: its index and the two."""
         mirror = key[1:]
         if key not in self.tiles:
@@ -363,19 +335,19 @@ def _mean_alpha(data: bytes) -> float:
 
 def _triangles(corners: np.ndarray, mode: int) -> np.ndarray:
     """Triangles (F, 3) of a list, strip or fan of corners."""
-    if mode == TRIANGLES:
+    if mode == schema.TRIANGLES:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     if len(corners) < 3:
         return np.zeros((0, 3), np.int64)
     first = np.arange(len(corners) - 2)
-    if mode == FAN:
+    if mode == schema.FAN:
         return np.stack([corners[1:-1], corners[2:], np.broadcast_to(corners[0], len(first))], axis=1)
-    assert mode == STRIP
+    assert mode == schema.STRIP
     odd = first % 2
     return np.stack([corners[first], corners[first + 1 + odd], corners[first + 2 - odd]], axis=1)
 
 
-def _transform_uv(uv: np.ndarray, info: TextureInfo) -> np.ndarray:
+def _transform_uv(uv: np.ndarray, info: schema.TextureInfo) -> np.ndarray:
     """Texture coordinates after KHR_texture_transform, with v turned up."""
     transform = info.extensions.transform if info.extensions else None
     if transform is not None:
@@ -384,7 +356,7 @@ def _transform_uv(uv: np.ndarray, info: TextureInfo) -> np.ndarray:
     return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
 
 
-def _node_matrix(node: Node) -> np.ndarray:
+def _node_matrix(node: schema.Node) -> np.ndarray:
     """Local transform of a node (4, 4): its matrix, or translation, rotation and scale."""
     if node.matrix is not None:
         return np.asarray(node.matrix).reshape(4, 4).T
