@@ -3,8 +3,10 @@
 import gc
 import itertools
 import os
+import shutil
 import signal
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +21,9 @@ from tests.harness.environment import VARIABLE
 ROOT = Path(__file__).resolve().parent.parent
 REAL_DATA = ROOT.parent / "shared" / "data"
 """Real objects and lights, where somebody has put them beside the checkout; tests that want them are skipped elsewhere."""
+
+MEMORY, ROOM = Path("/dev/shm"), 4 << 30
+"""Folder in memory, and the free space there [B] from which tests write there: on a disk, calls for files take five times as long."""
 
 # Examples follow from the test's name, so that two runs do the same; compiling a kernel may take any time.
 settings.register_profile("house", deadline=None, derandomize=True, max_examples=50)
@@ -45,6 +50,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ[VARIABLE] = devices(config)[0]
+    if MEMORY.is_dir() and shutil.disk_usage(MEMORY).free > ROOM:
+        tempfile.tempdir = os.environ["TMPDIR"] = str(MEMORY)
     # USD starts a thread a core, of which some wait by polling for the rest of the run. Without the second it reports the first.
     os.environ.update({"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"})
     if config.getoption("--check-bounds"):

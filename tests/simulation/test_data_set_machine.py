@@ -41,8 +41,6 @@ FOLDERS = ("a", "b", "c")
 FORMATS = ("shards", "bop")
 CRASH = st.one_of(st.just(0), st.integers(1, 90))
 """Number of the modification at which a bake, merge or conversion is killed; 0: it is not."""
-MEMORY = Path("/dev/shm")
-"""Folder in memory, where there is one: files on a disk take most of the time."""
 
 
 @functools.cache
@@ -97,7 +95,7 @@ class DataSets(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.base = Path(tempfile.mkdtemp(dir=MEMORY if MEMORY.is_dir() else None))
+        self.base = Path(tempfile.mkdtemp())
         self.known: dict[str, Known] = {}
         self.changed: set[str] = set()
         """Folders that the last rule may have changed."""
