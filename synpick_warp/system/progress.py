@@ -22,17 +22,14 @@ class Progress(Protocol):
 
     def stage(self, text: str) -> None:
         """A new stage starts, such as "building worlds"."""
-        ...
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
         """Report counts, at any rate. `seconds_left` is None while there is no estimate."""
-        ...
 
     def note(self, text: str) -> None:
         """Report an event in one line, such as a resampled arrangement."""
-        ...
 
 
 class SilentProgress:

@@ -4,22 +4,18 @@ ROC AUC: Fawcett, An introduction to ROC analysis, 2006; expected calibration er
 Welsh, 2007. Samples have weights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from synpick_warp.codes import Outcome, Share
 from synpick_warp.dataset.bop.models import names_of
+from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.tables import Table, parse_columns
-
-if TYPE_CHECKING:
-    from synpick_warp.dataset.reading import DataSet
 
 BINS = 10
 """Bins of a calibration curve, of equal width from 0 to 1."""
@@ -60,7 +56,7 @@ class Scored:
         values, rank = np.unique(self.score, return_inverse=True)
         return len(values), rank
 
-    def select(self, kept: np.ndarray) -> Scored:
+    def select(self, kept: np.ndarray) -> "Scored":
         """Subset by a mask (sample) bool; clusters keep their indices."""
         return Scored(self.score[kept], self.outcome[kept], self.weight[kept], self.cluster[kept])
 

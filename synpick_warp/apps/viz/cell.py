@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, blank, check_picture_name, put_text, stacked, with_text, write_picture
-from synpick_warp.apps.viz.frusta import Canvas, draw_axes, draw_camera, project, rays
+from synpick_warp.apps.viz.frusta import Canvas, Picture, draw_axes, draw_camera, project, rays
 from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cell.bins import Bins, BinSizes
 from synpick_warp.configs.cell.cameras import WORLD
@@ -41,17 +41,6 @@ _MOST = 32
 _SKY = "overcast"
 _PIXELS = 640
 """Longest side of a camera's picture; larger images are scaled down [px]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A rendered view."""
-
-    camera: Camera
-    color: np.ndarray
-    """(H, W, 3) uint8, blue first."""
-    depth: np.ndarray
-    """Planar depth (H, W) float32 [m]; 1e30: nothing is hit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,8 @@
 """Cameras of a cell: projection, poses to start from, and a wireframe overlay on a rendered view with a depth test: camera frusta to scale,
 their footprints and axes; hidden lines are faint."""
 
-from __future__ import annotations
-
 import math
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,9 +15,6 @@ from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.scenes.cameras import is_in_way, make_cameras
 from synpick_warp.scenes.types import Camera
-
-if TYPE_CHECKING:
-    from synpick_warp.apps.viz.cell import Picture
 
 _STEP = 4.0
 """Length of the line segments whose visibility is tested [px]."""
@@ -111,6 +105,17 @@ def _nearest(row: CameraRow, azimuth: float, elevation: float, up: tuple[float, 
         fits = (depth > 0.0).all() and (pixels >= border).all() and (pixels <= camera.resolution - border).all()
         near, far = (near, middle) if fits else (middle, far)
     return pose(far)
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered view."""
+
+    camera: Camera
+    color: np.ndarray
+    """(H, W, 3) uint8, blue first."""
+    depth: np.ndarray
+    """Planar depth (H, W) float32 [m]; 1e30: nothing is hit."""
 
 
 class Canvas:

@@ -1,11 +1,9 @@
 """Pictures of simulated picks: heat maps of success and of the analytic score over visible objects, and one trial explained."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,12 +14,9 @@ from synpick_warp.apps.viz.explain import GREEN, LINE, TEXT, wrapped
 from synpick_warp.apps.viz.explain_record import disc, fixed
 from synpick_warp.codes import Ending, Outcome, Share
 from synpick_warp.dataset.bop.models import names_of
-from synpick_warp.dataset.view import mean_by_candidate
+from synpick_warp.dataset.reading import DataSet, Episode
+from synpick_warp.dataset.view import View, mean_by_candidate
 from synpick_warp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from synpick_warp.dataset.reading import DataSet, Episode
-    from synpick_warp.dataset.view import View
 
 NEIGHBOURS = 4
 """Number of nearest tried points of the same instance from which a pixel of a heat map is interpolated."""

@@ -242,7 +242,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         key = (id(texture), material.color)
         if key not in places:
             places[key] = len(blocks)
-            blocks.append(_tint(np.full((4, 4, 3), 255, np.uint8) if texture is None else texture, material.color))
+            blocks.append(tint(np.full((4, 4, 3), 255, np.uint8) if texture is None else texture, material.color))
         index.append(places[key])
     blocks = _fit_blocks(blocks, owner, said)
     width, height = max(block.shape[1] for block in blocks), sum(block.shape[0] for block in blocks)
@@ -260,8 +260,8 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
     return uvs, atlas
 
 
-def _tint(texture: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
-    """Multiply a texture by a base colour factor in linear light."""
+def tint(texture: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
+    """Multiply a texture by a base colour factor, sRGB, in linear light; by white it stays as it is."""
     # A table of the 256 levels, since whole images in 64-bit floats take eight times the room.
     levels = srgb_to_linear(np.arange(256) / 255.0)[:, None] * srgb_to_linear(color)
     table = np.rint(linear_to_srgb(levels) * 255.0).astype(np.uint8)

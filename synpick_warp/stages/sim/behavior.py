@@ -25,15 +25,12 @@ class Hold(Protocol):
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Attach objects where task PRESS is complete. Runs at the end of a tick."""
-        ...
 
     def apply_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Add the hold's wrenches to the joint forces of objects and gripper, and release what exceeds its strength. Runs before a step."""
-        ...
 
     def ignore_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Disable the contacts that the hold replaces. Runs between collision detection and solver."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,12 @@ class SetpointLaw(Protocol):
 
     def begin(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
         """Place gripper and setpoint where task APPROACH begins. Runs after perception."""
-        ...
 
     def advance(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
         """Advance the setpoints by a step of physics, in mode MOVE, too, up to task PRESS. Runs before the step."""
-        ...
 
     def end_tick(self, scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan) -> None:
         """Begin task LIFT, and after it judge the attempt and begin LOOK. Runs at the end of a tick, after the hold has engaged."""
-        ...
 
 
 class TwoSpeedLaw:

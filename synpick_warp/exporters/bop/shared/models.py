@@ -13,11 +13,11 @@ from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.notes import describe_lenses, describe_sizes
 from synpick_warp.exporters.writing.png import encode_png
-from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.assets.appearance import decode_texture, tint
 from synpick_warp.scenes.assets.asset_files import MissingFileError
 from synpick_warp.scenes.assets.models_info import corrected_entry, read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
-from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry
 from synpick_warp.system.inputs.files import make_folder, path_inside
 from synpick_warp.system.inputs.image_files import TEXTURE_KINDS
 from synpick_warp.views.layer_codec import layer_notes
@@ -42,7 +42,7 @@ def write_models(folder: Path, catalog: Catalog, mechanics: bool = False) -> Non
         if entry.source is None:
             path.write_bytes(encode_model(entry))
             if entry.material.texture is not None:
-                path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
+                path.with_suffix(".png").write_bytes(encode_png(tint(entry.material.texture, entry.material.color)))
         else:
             _copy_model(entry, entry.source, path)
         known = read_entries(entry.source.parent / "models_info.json") if entry.source else None
@@ -142,16 +142,6 @@ def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
         make_folder(target.parent)
         target.write_bytes(image)
     path.write_bytes(data)
-
-
-def _tint_texture(material: Material) -> np.ndarray:
-    """Multiply the texture by the base colour in linear light, as BOP's models have no base colour besides a texture."""
-    assert material.texture is not None
-    if all(value == 1.0 for value in material.color):
-        return material.texture
-    levels = srgb_to_linear(np.arange(256) / 255)[:, None] * srgb_to_linear(np.asarray(material.color))
-    table = np.rint(255 * linear_to_srgb(levels)).astype(np.uint8)
-    return np.stack([table[material.texture[..., channel], channel] for channel in range(3)], axis=-1)
 
 
 def describe_dataset(settings: ExportSettings, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
