@@ -53,7 +53,9 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
 KEPT_PICTURES = "pictures kept over frames"
-"""Name of the term of `render.reuse`."""
+"""Name of the term of `render.reuse` ..."""
+KEPT_ARRAYS = (KeptColors.__name__, "VisibilityBuffer", "KeptMasks", "BorderCounts")
+"""... and the declarations of its arrays."""
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 ROW_BYTES = 12
@@ -257,7 +259,7 @@ def _images(
             copied = [array for batch in ring for array in batch.copied(host.on_demand).values()]
     history, background = ([array for array in arrays if name in array.spec.shape] for name in ("world_camera", "camera"))
     others = [array for array in arrays if not {"world_camera", "camera"}.intersection(array.spec.shape)]
-    kept = [array for array in history if array.name.startswith(KeptColors.__name__)]
+    kept = [array for array in history if array.name.startswith(KEPT_ARRAYS)]
     if history:
         yield _term("light averaged over frames", (array for array in history if array not in kept), _HISTORY)
     # Kernels index these by image, row and column.

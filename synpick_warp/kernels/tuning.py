@@ -41,8 +41,9 @@ BLOCK_THREADS = 16384
 """Threads that share a view's blocks of large triangles in the rasterizer (0.015 ms of a view)."""
 RUN_LANES = 32
 """Lanes that share the columns of an amodal mask when its runs are listed: a warp."""
-CLEAR_THREADS = 4096
-"""Threads that clear the words in use of a view's amodal masks: some 30,000 in a full-HD view of a tote."""
+RESTORE_THREADS, KEEP_THREADS = 256, 4096
+"""Threads that copy the words of a mask from the previous frame, or clear them, some 3,000; and that keep those of all masks of a view,
+some 30,000 in a full-HD view of a tote."""
 COUNT_THREADS = 1024
 """Threads that share the pixels of one instance in counts and boxes: enough to hide the latency of reads, few enough that their atomics do
 not contend."""

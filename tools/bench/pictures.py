@@ -39,6 +39,10 @@ ROUNDS = 5
 """Passes of each renderer; the renderers alternate, so that changes of the device's clock affect both."""
 
 
+_KEPT = ("nearest",), ("first", "words", "length"), ("pixels", "boxes")
+"""Arrays of visibility, masks and counts beyond the image that are kept from frame to frame."""
+
+
 class KeptTick(NamedTuple):
     """Copy of a tick's snapshot and batches of views, which stays valid while the simulation goes on."""
 
@@ -59,6 +63,9 @@ def _history_arrays(renderer: Renderer) -> dict[str, wp.array]:
     if history is None or not isinstance(shading, DenoisedRenderer):
         return {}
     kept = {"ratios": shading.ratios.record, "bodies": shading.flags.bodies, "color": renderer.postprocessor.kept}
+    if renderer.damage is not renderer.rasterizer.whole:
+        owners = renderer.rasterizer.visibility, renderer.rasterizer.kept_masks, renderer.annotator.border
+        kept |= {f"{name} {index}": getattr(owner, name) for index, owner in enumerate(owners) for name in _KEPT[index]}
     return {name: getattr(history, name) for name in LIGHT_HISTORY.specs} | {name: array for name, array in kept.items() if array.size}
 
 

@@ -12,44 +12,49 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.render.scene import RenderScene
 
 BORDER_BOXES = struct_arrays(boxes_counts.BorderBoxes, "view_instance", length=("one",))
+BORDER_COUNTS = struct_arrays(boxes_counts.BorderCounts, "view", "instance", boxes=("view", "instance", "one", "side"))
+KEPT_COUNTS = struct_arrays(boxes_counts.BorderCounts, "world_camera", "instance", boxes=("world_camera", "instance", "one", "side"))
 
 
 class Annotator:
     """Counts the instances' pixels and bounds them by boxes. Owns its scratch; `annotate` only launches."""
 
-    def __init__(self, scene: RenderScene, instances: int, views: int) -> None:
+    def __init__(self, scene: RenderScene, instances: int, views: int, kept: int = 0) -> None:
         """Allocate scratch.
 
         Args:
             scene: Constant data.
             instances: Instance capacity of a world.
             views: Maximum number of views of a batch.
+            kept: Number of views whose counts beyond the image are kept from frame to frame.
         """
         self.scene = scene
         self.border_boxes: Any = allocate_struct(BORDER_BOXES, {"view_instance": views * instances, "one": 1}, scene.device)
+        sizes = {"view": views, "world_camera": kept, "instance": instances, "one": 1, "side": 4}
+        self.border: Any = allocate_struct(KEPT_COUNTS if kept else BORDER_COUNTS, sizes, scene.device)
 
-    def annotate(self, shot: Any, out: ViewBuffers) -> None:
+    def annotate(self, shot: Any, damage: Any, out: ViewBuffers) -> None:
         """Compute `out.pixels` and `out.boxes` of the views of the struct `ShotData` from their images and, beyond the image border, by
-        rays."""
+        rays, where the struct `Damage` says that bodies moved."""
         scene, instances, views = self.scene, out.pixels.shape[1], shot.views
         threads = COUNT_THREADS if scene.device.is_cuda else 1
         images = {"instance_image": out.instance, "depth_image": out.depth, "masks": masks_of(out)}
         launch(boxes_counts.clear_boxes_counts_kernel, (views.count, instances), out)
         launch(boxes_counts.count_image_pixels_kernel, (views.count, instances, threads), out, threads=threads, **images)
-        self._count_border_pixels(shot, out)
-        launch(boxes_counts.reset_empty_boxes_kernel, (views.count, instances, 2), out)
+        self._count_border_pixels(shot, damage, instances)
+        launch(boxes_counts.finish_boxes_counts_kernel, (views.count, instances, 2), self, out, damage=damage)
 
-    def _count_border_pixels(self, shot: Any, out: ViewBuffers) -> None:
+    def _count_border_pixels(self, shot: Any, damage: Any, instances: int) -> None:
         """List the boxes that reach beyond the image, and count the pixels there by rays."""
-        scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
+        scene, device = self.scene, self.scene.device
         groups, threads = (BORDER_GROUPS, BORDER_THREADS) if device.is_cuda else (1, 1)
         self.border_boxes.length.zero_()
         wp.launch(
             boxes_counts.list_border_boxes_kernel,
             dim=(shot.views.count, instances),
-            inputs=[scene.grid, shot.bodies, instances, BORDER_CHUNK],
-            outputs=[self.border_boxes],
+            inputs=[scene.grid, damage, shot.bodies, instances, BORDER_CHUNK],
+            outputs=[self.border_boxes, self.border],
             device=device,
         )
-        given = {"shot": shot, "groups": groups, "threads": threads, "chunk": BORDER_CHUNK}
-        launch(boxes_counts.count_border_pixels_kernel, (groups, threads), self, scene, out, block_dim=BORDER_THREADS, **given)
+        given = {"shot": shot, "damage": damage, "groups": groups, "threads": threads, "chunk": BORDER_CHUNK}
+        launch(boxes_counts.count_border_pixels_kernel, (groups, threads), self, scene, block_dim=BORDER_THREADS, **given)

@@ -20,7 +20,7 @@ from synpick_warp.kernels.render.images.antialias import (
 from synpick_warp.kernels.render.lighting import denoise as denoising
 from synpick_warp.kernels.render.lighting import shadow_edges
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.dirty_tiles import mark_dirty_tiles_kernel, plan_passes_kernel
+from synpick_warp.kernels.render.lighting.dirty_tiles import mark_damaged_tiles_kernel, mark_relit_tiles_kernel, plan_passes_kernel
 from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, advance_history_kernel
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.paths.bounces import extend_queued_paths_kernel
@@ -36,6 +36,7 @@ from synpick_warp.kernels.render.lighting.shadows import ShadowRays, trace_shado
 from synpick_warp.kernels.render.lighting.tile_flags import ALL_STAGES, TileFlags
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.damage import Damage
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS, EDGE_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.arrays import allocate_struct, bundle, struct_arrays
@@ -78,13 +79,6 @@ for their longest path on a nearly idle GPU, and queues gain nothing."""
 MAX_QUEUE_FRACTION = 1 / 96
 """Maximum size of path queues as a fraction of the device's memory. At full HD, 42 views fit into that of an H100, and 6 into that of a GPU
 of 12 GiB, which is better used for worlds."""
-
-MAX_KEPT_FRACTION, KEPT_BYTES = 1 / 8, 3
-"""Maximum size of the images that are kept from frame to frame, as a fraction of the device's memory, and size of a pixel [bytes]. Those
-of 512 worlds with three full-HD cameras fit into a GPU of 80 GB; on one of 24 GB their pictures are shaded whole."""
-
-MAX_KEPT_HOST = 1 << 30
-"""The same on a CPU [bytes]: images of 170 cameras in full HD."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -277,7 +271,7 @@ class DenoisedRenderer:
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
-        """Render the radiance of a batch of views.
+        """Render the radiance of a batch of views, for which `find_damage` was called.
 
         Args:
             snapshot: The worlds.
@@ -287,7 +281,6 @@ class DenoisedRenderer:
         device = self.scene.device
         if self.traces_paths:
             with scope("trace coarse paths", device):
-                self.find_moving_bodies(snapshot, shot.views)
                 self.trace_coarse_paths(shot)
             with scope("denoise", device):
                 self.denoise(shot.views)
@@ -299,19 +292,25 @@ class DenoisedRenderer:
             with scope("anti-alias", device):
                 self.resolve_footprints(shot, image)
 
-    def find_moving_bodies(self, snapshot: Snapshot, views: Any) -> None:
-        """Find the bodies that moved since the previous frame, where the light history contains that frame; sets the history's frame to
-        this one.
+    def find_damage(self, snapshot: Snapshot, bodies: Any, views: Any) -> Any:
+        """Find the bodies that moved since the previous frame, where the light history contains that frame, and their tiles; sets the
+        history's frame to this one.
 
-        Writes `moving` and the frame indices of `history`; nothing without temporal accumulation.
+        Writes `moving`, `flags.dirty` and the frame indices of `history`; nothing without temporal accumulation. Returns the struct
+        `Damage`; None without reuse.
         """
         if self.history.max_paths == 0:
-            return
+            return None
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.frames, views]
         wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving, self.flags], **options)
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
+        if not self.reuses:
+            return None
+        dim, outputs = (views.count, self.scene.grid.tiles), [self.moving, self.flags]
+        wp.launch(mark_damaged_tiles_kernel, dim=dim, inputs=[bodies], outputs=outputs, device=self.scene.device, block_dim=PIXEL_BLOCK)
+        return bundle(Damage, self.flags, self.moving)
 
     def trace_coarse_paths(self, shot: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels, traced or taken from the history (temporal accumulation).
@@ -371,15 +370,15 @@ class DenoisedRenderer:
         self._launch(trace_shadow_rays_kernel, coarse.grid, views, [*inputs, self.moving], outputs)
         for kernel in (filter_shadows_kernel, measure_steepness_kernel):
             self._launch(kernel, coarse.grid, views, [*inputs, self.shadow_rays], [self.shadows])
-        self.mark_dirty_tiles(shot)
+        self.mark_relit_tiles(shot)
         self.trace_shadow_edges(shot, image)
 
-    def mark_dirty_tiles(self, shot: Any) -> None:
-        """Mark the tiles that may differ from the frame before, by bodies, light and shadows; nothing without reuse."""
+    def mark_relit_tiles(self, shot: Any) -> None:
+        """Mark the tiles that differ from the frame before in light and shadows; nothing without reuse."""
         if self.reuses:
-            inputs = [self.coarse, self.shadow_grid, shot, self.moving]
+            inputs = [self.coarse, self.shadow_grid, shot]
             dim = (shot.views.count, shot.grid.tiles)
-            kernel = kernel_for(mark_dirty_tiles_kernel, *inputs)
+            kernel = kernel_for(mark_relit_tiles_kernel, *inputs)
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.flags], device=self.scene.device, block_dim=PIXEL_BLOCK)
 
     def plan_passes(self, shot: Any, image: Any) -> None:

@@ -6,7 +6,7 @@ import warp as wp
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.render.visibility.masks import clear_masks_kernel, lay_out_masks_kernel
+from synpick_warp.kernels.render.visibility.masks import KeptMasks, keep_masks_kernel, lay_out_masks_kernel, restore_masks_kernel
 from synpick_warp.kernels.render.visibility.raster import (
     MAX_TRIANGLES,
     VisibilityBuffer,
@@ -15,19 +15,26 @@ from synpick_warp.kernels.render.visibility.raster import (
     rasterize_triangles_kernel,
     resolve_visibility_kernel,
 )
-from synpick_warp.kernels.tuning import BLOCK_THREADS, CLEAR_THREADS, TRIANGLE_THREADS
+from synpick_warp.kernels.tuning import BLOCK_THREADS, KEEP_THREADS, RESTORE_THREADS, TRIANGLE_THREADS
 from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers, masks_of
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views
+from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views, whole_damage
+from synpick_warp.views.frames import most_words
 
 BLOCKS, INSTANCE_BLOCKS = 32768, 512
 """Capacity for pixel blocks of large triangles per view, at least, and for each instance. A full-HD view filled by thirteen low-polygon
 objects (hundreds to thousands of triangles each, such as the embedded ones) needs 14,000 blocks, dense meshes a tenth of that; each of 128
 or 251 brackets needs 320. If the capacity is exceeded, the remaining triangles are rasterized by one thread each, which is slow."""
 
-VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", block=("view", "block"), blocks=("view",))
+KEPT_WORDS = 2
+"""Room for the masks that are kept of a view, in full-image masks: those of a tote take a half. Larger ones are drawn anew."""
+
+_BLOCKS: dict[str, tuple[str, ...]] = {"block": ("view", "block"), "blocks": ("view",)}
+VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", **_BLOCKS)
+KEPT_VISIBILITY = struct_arrays(VisibilityBuffer, "world_camera", "row", "column", **_BLOCKS)
+KEPT_MASKS = struct_arrays(KeptMasks, "world_camera", "instance", words=("world_camera", "kept_word"), length=("world_camera",))
 
 
 class Rasterizer:
@@ -37,7 +44,9 @@ class Rasterizer:
         background: Cached static background: the struct `GBuffer`, one view a camera, of the tote at its usual pose and the table.
     """
 
-    def __init__(self, scene: RenderScene, counts_per_meter: float, views: int, instances: int = 0, background: Any = None) -> None:
+    def __init__(
+        self, scene: RenderScene, counts_per_meter: float, views: int, instances: int = 0, background: Any = None, kept: int = 0
+    ) -> None:
         """Allocate scratch.
 
         Args:
@@ -46,6 +55,7 @@ class Rasterizer:
             views: Maximum number of views of a batch.
             instances: Instance capacity of a world.
             background: As the attribute; None: it is rendered.
+            kept: Number of views whose visibility and masks are kept from frame to frame.
 
         Raises:
             CatalogError: A mesh has more triangles than a visibility key can hold.
@@ -55,14 +65,17 @@ class Rasterizer:
             raise CatalogError(f"a mesh has {most} triangles; at most {MAX_TRIANGLES} can be rendered")
         self.scene = scene
         self.counts_per_meter = counts_per_meter
-        self.visibility = allocate_visibility(views, scene.width, scene.height, instances, scene.device)
+        self.visibility = allocate_visibility(views, scene.width, scene.height, instances, scene.device, kept)
+        words = KEPT_WORDS * most_words(scene.width, scene.height)
+        self.kept_masks = allocate_struct(KEPT_MASKS, {"world_camera": kept, "instance": instances, "kept_word": words}, scene.device)
+        self.whole = whole_damage(views, scene.device)
         self.background = background
         if background is None:
             self.background = allocate_background(scene.camera_count, scene.width, scene.height, scene.device)
             if scene.keep:
                 render_background(scene, self.background)
 
-    def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers | None = None) -> None:
+    def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers | None = None, damage: Any = None) -> None:
         """Render the G-buffer of a batch of views.
 
         Args:
@@ -70,21 +83,27 @@ class Rasterizer:
             views: The struct `Views`.
             gbuffer: The struct `GBuffer`; written.
             out: `instance`, `depth` and the amodal masks are written; None: only the G-buffer is needed.
+            damage: The struct `Damage`, if visibility and masks are kept; None: all is damaged.
         """
         scene, visibility, device, masks = self.scene, self.visibility, self.scene.device, masks_of(out)
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         instance, depth = (None, None) if out is None else (out.instance, out.depth)
-        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, views], [visibility], device)
+        damage, kept = self.whole if damage is None else damage, self.kept_masks
+        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, damage, views], [visibility], device)
         if out is not None:
             dim = (views.count, out.mask_first.shape[1])
             wp.launch(lay_out_masks_kernel, dim=dim, inputs=[scene.grid, bodies], outputs=[masks], device=device)
-            wp.launch(clear_masks_kernel, dim=(views.count, CLEAR_THREADS), inputs=[CLEAR_THREADS], outputs=[masks], device=device)
-        inputs = [scene.meshes, scene.grid, bodies, views]
+            inputs, dim = [damage, kept, RESTORE_THREADS], (*dim, RESTORE_THREADS)
+            wp.launch(restore_masks_kernel, dim=dim, inputs=inputs, outputs=[masks], device=device)
+        inputs = [scene.meshes, scene.grid, bodies, views, damage, kept]
         per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
         threads = bodies.mesh.shape[1] * per_body
         launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, masks], device)
         launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, masks], device)
-        inputs = [scene.meshes, scene.table, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
+        if out is not None and kept.length.size:
+            inputs, dim = [damage, masks, KEEP_THREADS], (views.count, KEEP_THREADS)
+            wp.launch(keep_masks_kernel, dim=dim, inputs=inputs, outputs=[kept], device=device)
+        inputs = [scene.meshes, scene.table, scene.grid, self.background, bodies, visibility, damage, views, self.counts_per_meter]
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 
 
@@ -103,10 +122,10 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
     Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer)
 
 
-def allocate_visibility(views: int, width: int, height: int, instances: int, device: wp.Device) -> Any:
-    """Allocate the struct `VisibilityBuffer`."""
-    sizes = {"view": views, "row": height, "column": width, "block": max(BLOCKS, INSTANCE_BLOCKS * instances)}
-    return allocate_struct(VISIBILITY_BUFFER, sizes, device)
+def allocate_visibility(views: int, width: int, height: int, instances: int, device: wp.Device, kept: int = 0) -> Any:
+    """Allocate the struct `VisibilityBuffer`; `kept`: as of `Rasterizer`."""
+    sizes = {"view": views, "world_camera": kept, "row": height, "column": width, "block": max(BLOCKS, INSTANCE_BLOCKS * instances)}
+    return allocate_struct(KEPT_VISIBILITY if kept else VISIBILITY_BUFFER, sizes, device)
 
 
 def allocate_background(cameras: int, width: int, height: int, device: wp.Device) -> Any:

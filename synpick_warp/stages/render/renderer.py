@@ -76,22 +76,24 @@ class Renderer:
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.shading: DenoisedRenderer | ReferenceRenderer | None = None
+        kept = 0
         if colors:
             self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
             self.image.passes.fill_(ALL_PASSES)
             if has_effects(effects):
                 settings = replace(settings, reuse=False)
-            kept, history_row = 0, None
+            history_row = None
             if settings.mode == schema.REFERENCE:
                 self.shading = ReferenceRenderer(settings, seed, scene)
             else:
                 self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
                 kept, history_row = histories if self.shading.reuses else 0, self.shading.flags.history_row
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
-        self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances)
+        self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
-        self.annotator = Annotator(scene, instances, views)
+        self.annotator = Annotator(scene, instances, views, kept)
+        self.damage = self.rasterizer.whole
 
     def render(
         self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: tuple[Any, Any] | None = None
@@ -124,7 +126,7 @@ class Renderer:
             with scope("post-process", device):
                 self.postprocessor.process(shot, self.image, out)
         with scope("annotate", device):
-            self.annotator.annotate(shot, out)
+            self.annotator.annotate(shot, self.damage, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
         """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the views with their cameras."""
@@ -133,6 +135,9 @@ class Renderer:
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
             if self.dresser:
                 self.dresser.dress(snapshot, views, self.bodies)
+        self.damage = self.rasterizer.whole
+        if isinstance(self.shading, DenoisedRenderer):
+            self.damage = self.shading.find_damage(snapshot, self.bodies, views) or self.damage
         with scope("rasterize", scene.device):
-            self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)
+            self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out, self.damage)
         return views

@@ -6,11 +6,12 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import LensCameras, LensViews, Views
+from synpick_warp.kernels.render.visibility.damage import Damage
 from synpick_warp.kernels.render.visibility.gbuffer import MASK_BITS, GBuffer, LensShot, ShotData, ViewBodies
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.render.visibility.view_setup import aim_cameras_kernel, bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
-from synpick_warp.stages.arrays import struct_arrays
+from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.cameras import allocate_view_cameras
 from synpick_warp.stages.render.scene import RenderScene, build_grid
@@ -26,6 +27,7 @@ VIEW_BODIES = struct_arrays(
     units={"start": "m", "near": "m", "box": "px", "position": "m", "sphere": "m, m²"},
 )
 VIEWS = struct_arrays(Views, "view")
+DAMAGE = struct_arrays(Damage, "view", moved=("view", "none"), touched=("view", "none"), dirty=("view", "none"))
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
 BACKGROUND = struct_arrays(GBuffer, "camera", "row", "column", units={"depth": "m"})
 
@@ -60,6 +62,13 @@ def with_cameras(views: Any, cameras: Any) -> Any:
         return make_views(views.world, views.camera, views.count, views.instances, cameras, views.slot)
     views.cameras = cameras
     return views
+
+
+def whole_damage(views: int, device: wp.Device) -> Any:
+    """The struct `Damage` of views without a previous frame: all is damaged."""
+    damage = allocate_struct(DAMAGE, {"view": views, "none": 0}, device)
+    damage.history_row.assign(np.arange(views))
+    return damage
 
 
 def make_shot(scene: RenderScene, frames: Any, bodies: Any, gbuffer: Any, views: Any) -> Any:

@@ -10,7 +10,7 @@ import warp as wp
 
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS
-from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from tests.render.lighting.test_history import LIGHT, link
@@ -50,9 +50,18 @@ def scripts(seed: int) -> list[ToyScene]:
     return frames  # type: ignore[return-value]
 
 
-def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[list[np.ndarray], list[float]]:
-    """Render the views of all frames, in random order and batches: colours (world, camera, row, column, 3) of each, and the share of tiles
-    that were shaded."""
+def labels_of(out: ViewBuffers, view: int) -> dict[str, np.ndarray]:
+    """Images, masks, counts and boxes of a view."""
+    arrays = {name: getattr(out, name).numpy()[view] for name in ("color", "depth", "instance", "pixels", "boxes")}
+    box, first, words = (getattr(out, name).numpy()[view] for name in ("mask_box", "mask_first", "mask_words"))
+    used = int(out.mask_length.numpy()[view])
+    assert 0 < used <= len(words)
+    return arrays | {"mask_box": box, "mask_first": first, "mask_words": np.pad(words[:used], (0, len(words) - used))}
+
+
+def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[list[dict[str, np.ndarray]], list[float]]:
+    """Render the views of all frames, in random order and batches: what is told of each view by its world and camera (view, ...), frame by
+    frame, and the share of tiles that were shaded."""
     random, device = np.random.default_rng(seed), renderer.scene.device
     before: Snapshot | None = None
     pictures, shares = [], []
@@ -60,15 +69,16 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
         state = snapshot(replace(toy, placed=placed), device)
         state.frame.fill_(frame)
         link(state, before or state)
-        picture = np.zeros((2, 2, 61, 90, 3), np.uint8)
+        views = [{} for _ in range(4)]
         order = random.permutation(4)
         for part in np.split(order, np.flatnonzero(random.random(3) < 0.4) + 1):
             world, which = (wp.array(values.astype(np.int32), dtype=wp.int32, device=device) for values in (part // 2, part % 2))
             out = allocate_view_buffers(len(part), 90, 61, ROOM, device)
             renderer.render(state, make_views(world, which, len(part), ROOM), out)
-            picture[part // 2, part % 2] = out.color.numpy()
+            for place, view in enumerate(part):
+                views[view] = labels_of(out, place)
             shares.append(((renderer.image.passes.numpy()[: len(part)] & int(SHADE_PASS)) != 0).mean())
-        pictures.append(picture)
+        pictures.append({name: np.stack([view[name] for view in views]) for name in views[0]})
         before = state
     return pictures, shares
 
@@ -84,7 +94,8 @@ def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights):
         renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
         pictures[reuse], shares[reuse] = play(renderer, frames, toy, seed=int(reuse))
     for frame, (kept, whole) in enumerate(zip(pictures[True], pictures[False], strict=True)):
-        np.testing.assert_array_equal(kept, whole, err_msg=f"frame {frame}")
+        for name in whole:
+            np.testing.assert_array_equal(kept[name], whole[name], err_msg=f"{name} of frame {frame}")
     assert np.mean(shares[True]) < 0.9
     assert np.mean(shares[False]) == 1.0
 

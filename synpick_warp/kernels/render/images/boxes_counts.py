@@ -4,6 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, border_ray, in_image
+from synpick_warp.kernels.render.visibility.damage import Damage, has_moved
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.masks import ROWS, InstanceMasks, count_words, read_mask
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -34,6 +35,25 @@ class BoxesCounts:
     """(view, instance, box, side)."""
 
 
+@wp.struct
+class BorderCounts:
+    """Amodal pixels of every instance beyond the image, and their boxes, kept from frame to frame."""
+
+    pixels: wp.array2d[int]
+    """(kept, instance); `kept` is the view's `Damage.history_row`."""
+    boxes: wp.array4d[int]
+    """(kept, instance, one, side)."""
+
+
+@wp.func
+def set_empty(boxes: wp.array4d[int], view: int, instance: int, which: int):
+    """Set a stored box to an inverted one, which holds no pixel."""
+    boxes[view, instance, which, 0] = UNSET
+    boxes[view, instance, which, 1] = UNSET
+    boxes[view, instance, which, 2] = -UNSET
+    boxes[view, instance, which, 3] = -UNSET
+
+
 @wp.kernel
 def clear_boxes_counts_kernel(counts_out: BoxesCounts):
     """Set pixel counts to 0 and boxes to inverted ones, which hold no pixel. Launched over view, instance."""
@@ -41,10 +61,7 @@ def clear_boxes_counts_kernel(counts_out: BoxesCounts):
     for i in range(3):
         counts_out.pixels[view, instance, i] = 0
     for i in range(2):
-        counts_out.boxes[view, instance, i, 0] = UNSET
-        counts_out.boxes[view, instance, i, 1] = UNSET
-        counts_out.boxes[view, instance, i, 2] = -UNSET
-        counts_out.boxes[view, instance, i, 3] = -UNSET
+        set_empty(counts_out.boxes, view, instance, i)
 
 
 @wp.func
@@ -140,12 +157,26 @@ def box_pixels(box: wp.vec4i) -> int:
 
 
 @wp.kernel
-def list_border_boxes_kernel(grid: ImageGrid, bodies: ViewBodies, instances: int, chunk: int, boxes_inout: BorderBoxes):
-    """List the instances whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk. `length` starts at 0.
+def list_border_boxes_kernel(
+    grid: ImageGrid,
+    damage: Damage,
+    bodies: ViewBodies,
+    instances: int,
+    chunk: int,
+    boxes_inout: BorderBoxes,
+    border_inout: BorderCounts,
+):
+    """List the instances that moved and whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk, and clear their
+    counts there. `length` starts at 0.
 
     Launched over view, instance.
     """
     view, instance = wp.tid()
+    if not has_moved(damage, view, instance):
+        return
+    row = damage.history_row[view]
+    border_inout.pixels[row, instance] = 0
+    set_empty(border_inout.boxes, row, instance, AMODAL_BOX)
     box = bodies.box[view, instance]
     if is_inside(grid, box):
         return
@@ -172,12 +203,19 @@ def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
 
 @kernel_of_views
 def count_border_pixels_kernel(
-    meshes: Meshes, shot: AnyShot, border_boxes: BorderBoxes, groups: int, threads: int, chunk: int, counts_inout: BoxesCounts
+    meshes: Meshes,
+    shot: AnyShot,
+    damage: Damage,
+    border_boxes: BorderBoxes,
+    groups: int,
+    threads: int,
+    chunk: int,
+    border_inout: BorderCounts,
 ):
     """Count amodal pixels outside the image, up to one image size beyond each border, by a ray per pixel of the listed boxes.
 
     Groups of `threads` threads stride over the chunks: one object near the camera has more pixels than all others of a batch.
-    `pixels` is increased by the amodal count, `boxes` is extended in its amodal box. Launched over group, thread.
+    Counts are added to, and boxes extend, those of `BorderCounts`. Launched over group, thread.
     """
     views, bodies = shot.views, shot.bodies
     group, thread = wp.tid()
@@ -200,14 +238,23 @@ def count_border_pixels_kernel(
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:
-            wp.atomic_add(counts_inout.pixels, view, instance, ALL, amodal)
-            merge_box(counts_inout.boxes, view, instance, AMODAL_BOX, amodal_box)
+            wp.atomic_add(border_inout.pixels, damage.history_row[view], instance, amodal)
+            merge_box(border_inout.boxes, damage.history_row[view], instance, AMODAL_BOX, amodal_box)
 
 
 @wp.kernel
-def reset_empty_boxes_kernel(counts_inout: BoxesCounts):
-    """Set boxes without pixels to (0, 0, -1, -1). Launched over view, instance, box."""
+def finish_boxes_counts_kernel(damage: Damage, border: BorderCounts, counts_inout: BoxesCounts):
+    """Add what lies beyond the image to the amodal counts and boxes, and set boxes without pixels to (0, 0, -1, -1).
+
+    Launched over view, instance, box.
+    """
     view, instance, box = wp.tid()
+    if box == AMODAL_BOX:
+        row = damage.history_row[view]
+        counts_inout.pixels[view, instance, ALL] += border.pixels[row, instance]
+        sides = border.boxes
+        beyond = wp.vec4i(sides[row, instance, 0, 0], sides[row, instance, 0, 1], sides[row, instance, 0, 2], sides[row, instance, 0, 3])
+        merge_box(counts_inout.boxes, view, instance, AMODAL_BOX, beyond)
     if counts_inout.boxes[view, instance, box, 2] < counts_inout.boxes[view, instance, box, 0]:
         counts_inout.boxes[view, instance, box, 0] = 0
         counts_inout.boxes[view, instance, box, 1] = 0

@@ -26,7 +26,6 @@ from synpick_warp.kernels.render.lighting.tile_flags import (
     LIGHT_STAGE,
     RATIO_STAGE,
     TileFlags,
-    any_flagged,
     skips,
     tile_corner,
 )
@@ -41,6 +40,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     clamp_index,
     tile_pixel,
 )
+from synpick_warp.kernels.render.visibility.damage import any_flagged
 from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS

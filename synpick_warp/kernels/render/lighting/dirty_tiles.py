@@ -10,9 +10,10 @@ from synpick_warp.kernels.bitsets import lowest_bit
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.shadow_filter import FILTER_RADIUS, STEEPNESS_DISTANCE
-from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, any_flagged, tile_corner
+from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, tile_corner
 from synpick_warp.kernels.render.lighting.upsampling import RING
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index
+from synpick_warp.kernels.render.visibility.damage import any_flagged
 from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, EDGE_PASS, MASK_BITS, SHADE_PASS, AnyShot, ShadedImage, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
@@ -57,28 +58,47 @@ def any_near(flags: wp.array2d[wp.uint8], coarse: CoarseGrid, view: int, row: in
     return any_flagged(flags, coarse.grid, view, row // coarse.size - reach, column // coarse.size - reach, bottom, right)
 
 
-@kernel_of_views
-def mark_dirty_tiles_kernel(coarse: CoarseGrid, shadow_grid: CoarseGrid, shot: AnyShot, moving: MovingBodies, flags_inout: TileFlags):
-    """Mark the tiles of an image whose bodies, light or shadows changed since the previous frame; all if the history does not contain
-    that frame. Writes `dirty` and `bodies`. Launched over view, tile.
+@wp.func
+def touch_bodies(moving: MovingBodies, view: int, word: int, members: wp.uint64):
+    """Mark the bodies of word `word` of a bit set as touched."""
+    left = members
+    while left != wp.uint64(0):
+        moving.touched[view, word * MASK_BITS + lowest_bit(left)] = wp.uint8(1)
+        left = left & (left - wp.uint64(1))
+
+
+@wp.kernel
+def mark_damaged_tiles_kernel(bodies: ViewBodies, moving_inout: MovingBodies, flags_inout: TileFlags):
+    """Mark the tiles whose bodies changed since the previous frame, and the bodies in them; all if the history does not contain that frame.
+
+    Writes `dirty`, `bodies` and, where the history contains that frame, `touched`. Launched over view, tile.
     """
     view, tile = wp.tid()
     history = flags_inout.history_row[view]
-    grid = shot.grid
-    row, column = tile_corner(grid, tile)
-    dirty = moving.holds[view] == 0
+    dirty = moving_inout.holds[view] == 0
     for word in range(flags_inout.bodies.shape[2]):
-        members = tile_word(shot.bodies, view, tile, word)
+        members = tile_word(bodies, view, tile, word)
         if members != flags_inout.bodies[history, tile, word]:
             dirty = True
             flags_inout.bodies[history, tile, word] = members
         elif not dirty:
-            dirty = any_moved(moving, view, word, members)
-    if not dirty:
-        dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
-    if not dirty:
-        dirty = any_near(flags_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
+            dirty = any_moved(moving_inout, view, word, members)
     flags_inout.dirty[view, tile] = wp.uint8(dirty)
+    if dirty and moving_inout.holds[view] != 0:
+        for word in range(flags_inout.bodies.shape[2]):
+            touch_bodies(moving_inout, view, word, flags_inout.bodies[history, tile, word])
+
+
+@kernel_of_views
+def mark_relit_tiles_kernel(coarse: CoarseGrid, shadow_grid: CoarseGrid, shot: AnyShot, flags_inout: TileFlags):
+    """Mark the tiles whose light or shadows changed since the previous frame, beside those that are dirty. Launched over view, tile."""
+    view, tile = wp.tid()
+    if flags_inout.dirty[view, tile] == wp.uint8(0):
+        row, column = tile_corner(shot.grid, tile)
+        dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
+        if not dirty:
+            dirty = any_near(flags_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
+        flags_inout.dirty[view, tile] = wp.uint8(dirty)
 
 
 @wp.func

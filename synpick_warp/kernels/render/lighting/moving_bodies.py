@@ -26,6 +26,8 @@ class MovingBodies:
     """(view): 1: the history contains the previous frame of the same episode."""
     moved: wp.array2d[wp.uint8]
     """(view, body): 1: the body moved, appeared or disappeared; 0: its mesh and the bits of its pose are those of the previous frame."""
+    touched: wp.array2d[wp.uint8]
+    """(view, body): 1: rays through a tile can hit the body whose bodies changed; written where `holds` is 1."""
     drift_frames: wp.array2d[int]
     """(view, body): maximum history length on the body itself, MAX_DRIFT over its displacement in a frame."""
     count: wp.array[int]
@@ -142,8 +144,8 @@ def find_moving_bodies_kernel(
     """List the bodies of each view that moved, appeared or disappeared since the previous frame, if the history contains that frame
     (`holds`).
 
-    Writes all members of `MovingBodies` but `holds`. Launched over view. The struct `Views` is not an argument, since its cameras change
-    which products the compiler fuses with sums.
+    Writes all members of `MovingBodies` but `holds`; `touched` starts at 0. Launched over view. The struct `Views` is not an argument, as
+    its cameras change which products the compiler fuses with sums.
     """
     view = wp.tid()
     if moving_inout.holds[view] == 0:
@@ -178,6 +180,7 @@ def find_moving_bodies_kernel(
             drift_frames = int(MAX_DRIFT / wp.max(displacement, MAX_DRIFT / float(MAX_FRAMES)))
         moving_inout.drift_frames[view, body] = drift_frames
         moving_inout.moved[view, body] = wp.uint8(moved)
+        moving_inout.touched[view, body] = wp.uint8(0)
         if moved:
             list_moving_body(meshes, moving_inout, view, count, mesh, last_mesh, now, then, change)
             count += 1

@@ -30,16 +30,6 @@ class TileFlags:
 
 
 @wp.func
-def any_flagged(flags: wp.array2d[wp.uint8], grid: ImageGrid, view: int, top: int, left: int, bottom: int, right: int) -> bool:
-    """Whether any tile of a grid is flagged that overlaps the pixels from (top, left) to (bottom, right), which may exceed the grid."""
-    for row in range(wp.max(top, 0) // TILE_HEIGHT, wp.min(bottom, grid.height - 1) // TILE_HEIGHT + 1):
-        for column in range(wp.max(left, 0) // TILE_WIDTH, wp.min(right, grid.width - 1) // TILE_WIDTH + 1):
-            if flags[view, row * grid.tile_columns + column] != wp.uint8(0):
-                return True
-    return False
-
-
-@wp.func
 def tile_corner(grid: ImageGrid, tile: int) -> tuple[int, int]:
     """Row and column of the first pixel of a tile."""
     return (tile // grid.tile_columns) * TILE_HEIGHT, (tile % grid.tile_columns) * TILE_WIDTH

@@ -9,6 +9,7 @@ import warp as wp
 
 from synpick_warp.codes import MASK_ROWS
 from synpick_warp.kernels.render.visibility.camera import ImageGrid
+from synpick_warp.kernels.render.visibility.damage import Damage, has_moved
 from synpick_warp.kernels.render.visibility.gbuffer import ViewBodies
 
 wp.set_module_options({"enable_backward": False})
@@ -29,6 +30,18 @@ class InstanceMasks:
     """(view, word): word (band, column) of an instance's box, `first + band * columns + column`; bit i is row `y_min + 32 band + i`."""
     length: wp.array[int]
     """(view): words of all masks; more than the pool has: the last masks are empty."""
+
+
+@wp.struct
+class KeptMasks:
+    """Amodal masks of the previous frame of each world and camera, as they lay in their pool."""
+
+    first: wp.array2d[int]
+    """(kept, instance): index of the mask's first word."""
+    words: wp.array2d[wp.uint32]
+    """(kept, word): words of the masks."""
+    length: wp.array[int]
+    """(kept): words of all masks; 0, or more than there is room for: none are kept."""
 
 
 @wp.struct
@@ -60,6 +73,14 @@ def read_mask(masks: InstanceMasks, view: int, body: int) -> Mask:
     if body < masks.first.shape[1]:
         return make_mask(masks.box[view, body], masks.first[view, body])
     return Mask()
+
+
+@wp.func
+def drawn_mask(masks: InstanceMasks, view: int, body: int, kept: bool) -> Mask:
+    """Mask of a body that is drawn anew; without columns if it is `kept`."""
+    if kept:
+        return Mask()
+    return read_mask(masks, view, body)
 
 
 @wp.func
@@ -118,11 +139,38 @@ def lay_out_masks_kernel(grid: ImageGrid, bodies: ViewBodies, masks_out: Instanc
         masks_out.length[view] = past
 
 
+@wp.func
+def is_kept(damage: Damage, kept: KeptMasks, view: int, body: int) -> bool:
+    """Whether a body is at rest and the masks of the previous frame are kept: its mask has the same box and the same words."""
+    if has_moved(damage, view, body):
+        return False
+    length = kept.length[damage.history_row[view]]
+    return length > 0 and length <= kept.words.shape[1]
+
+
 @wp.kernel
-def clear_masks_kernel(threads: int, masks_inout: InstanceMasks):
-    """Clear the words in use. Launched over view, thread: `threads` threads stride over a view's words, whose number the host does not
-    know.
+def restore_masks_kernel(damage: Damage, kept: KeptMasks, threads: int, masks_inout: InstanceMasks):
+    """Copy the masks of instances at rest from the previous frame, and clear all others. Launched over view, instance, thread: `threads`
+    threads stride over an instance's words, whose number the host does not know.
     """
+    view, instance, thread = wp.tid()
+    rests = is_kept(damage, kept, view, instance)
+    mask = read_mask(masks_inout, view, instance)
+    for i in range(thread, count_words(mask), threads):
+        word = wp.uint32(0)
+        if rests:
+            row = damage.history_row[view]
+            word = kept.words[row, kept.first[row, instance] + i]
+        masks_inout.words[view, mask.first + i] = word
+
+
+@wp.kernel
+def keep_masks_kernel(damage: Damage, masks: InstanceMasks, threads: int, kept_inout: KeptMasks):
+    """Keep the masks of a frame for the next one. Launched over view, thread: `threads` threads stride over a view's words."""
     view, thread = wp.tid()
-    for word in range(thread, wp.min(masks_inout.length[view], masks_inout.words.shape[1]), threads):
-        masks_inout.words[view, word] = wp.uint32(0)
+    row, length = damage.history_row[view], masks.length[view]
+    kept_inout.length[row] = wp.where(length <= masks.words.shape[1], length, 0)
+    for instance in range(thread, masks.first.shape[1], threads):
+        kept_inout.first[row, instance] = masks.first[view, instance]
+    for word in range(thread, wp.min(length, kept_inout.words.shape[1]), threads):
+        kept_inout.words[row, word] = masks.words[view, word]

@@ -2,7 +2,8 @@
 
 Passes: clear, rasterize triangles, rasterize blocks of large triangles, resolve to the G-buffer. The result equals that of tracing each
 pixel's ray (`bvh_rays`), and does not depend on the order of threads. The tote and the table, where they always stand, come from a cached
-static background that is rendered once.
+static background that is rendered once. Where nothing moved, the keys of the previous frame stay: only damaged tiles are cleared, and of
+bodies at rest only the triangles in them are drawn again, which elsewhere change no minimum.
 """
 
 import warp as wp
@@ -10,6 +11,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, loop_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.damage import Damage, any_flagged, is_damaged
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
@@ -22,7 +24,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     segment_of,
     store_hit,
 )
-from synpick_warp.kernels.render.visibility.masks import InstanceMasks, Mask, add_pixel, read_mask
+from synpick_warp.kernels.render.visibility.masks import InstanceMasks, KeptMasks, Mask, add_pixel, drawn_mask, is_kept
 from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle, camera_triangle, find_footprint, ray_weights, row_span
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
@@ -52,7 +54,8 @@ class VisibilityBuffer:
     """
 
     nearest: wp.array3d[wp.uint64]
-    """(view, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle."""
+    """(kept, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle; `kept` is the view's
+    `Damage.history_row`."""
     block: wp.array2d[wp.vec4i]
     """(view, block): rank of the body in `ViewBodies.order`, triangle, first row, first column."""
     blocks: wp.array[int]
@@ -64,6 +67,7 @@ def write_sample(
     visibility: VisibilityBuffer,
     masks: InstanceMasks,
     view: int,
+    kept: int,
     row: int,
     column: int,
     triangle: Triangle,
@@ -73,7 +77,7 @@ def write_sample(
 ):
     """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the pixel's bit in the instance's amodal mask.
 
-    `low_half` is the lower half of the key.
+    `kept` is the view's row of the visibility buffer, `low_half` the lower half of the key.
     """
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
@@ -81,7 +85,7 @@ def write_sample(
         if depth > 0.0:
             key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | low_half
             # Reading first, to skip atomics that change nothing, costs more: a thread waits for reads, but not for atomics without result.
-            wp.atomic_min(visibility.nearest, view, row, column, key)
+            wp.atomic_min(visibility.nearest, kept, row, column, key)
             add_pixel(masks, view, mask, row, column)
 
 
@@ -96,31 +100,31 @@ def rasterize_footprint(
     visibility: VisibilityBuffer,
     masks: InstanceMasks,
     cameras: AnyCameras,
-    intrinsics: wp.vec4,
     view: int,
-    pixels: wp.vec4i,
+    kept: int,
     triangle: Triangle,
     footprint: Footprint,
     low_half: wp.uint64,
     mask: Mask,
 ):
-    """Scanline loop: `write_sample` for the pixels of a footprint within the box `pixels` (x_min, y_min, x_max, y_max, inclusive).
+    """Scanline loop: `write_sample` for the pixels of a footprint within its box.
 
     Rows and columns share one loop, so that the threads of a warp stay together: their triangles differ in rows more than in pixels.
     """
-    row = pixels[1] - 1
+    intrinsics = cameras.intrinsics[view]
+    row = footprint.pixels[1] - 1
     column = int(0)
     last = int(-1)
     while True:
-        while column > last and row < pixels[3]:
+        while column > last and row < footprint.pixels[3]:
             row += 1
-            span = row_span(footprint, row, pixels[0], pixels[2])
+            span = row_span(footprint, row)
             column = span[0]
             last = span[1]
         if column > last:
             break
         ray = loop_ray(cameras, intrinsics, view, row, column, wp.vec2(0.0, 0.0))
-        write_sample(visibility, masks, view, row, column, triangle, ray, low_half, mask)
+        write_sample(visibility, masks, view, kept, row, column, triangle, ray, low_half, mask)
         column += 1
 
 
@@ -138,15 +142,16 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
 
 
 @kernel_of_views
-def clear_visibility_kernel(grid: ImageGrid, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
-    """Clear visibility buffer and the work list; unused views (camera -1) keep theirs.
+def clear_visibility_kernel(grid: ImageGrid, damage: Damage, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
+    """Clear damaged tiles of the visibility buffer, and the work list; unused views (camera -1) keep theirs.
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.camera[view] < 0:
         return
-    visibility_out.nearest[view, row, column] = EMPTY
+    if is_damaged(damage, grid, view, row, column):
+        visibility_out.nearest[damage.history_row[view], row, column] = EMPTY
     if row == 0 and column == 0:
         visibility_out.blocks[view] = 0
 
@@ -157,6 +162,8 @@ def rasterize_triangles_kernel(
     grid: ImageGrid,
     bodies: ViewBodies,
     views: AnyViews,
+    damage: Damage,
+    kept_masks: KeptMasks,
     threads: int,
     first: int,
     visibility_inout: VisibilityBuffer,
@@ -164,8 +171,8 @@ def rasterize_triangles_kernel(
 ):
     """Rasterize small triangles into visibility buffer and amodal masks, and list the blocks of large triangles.
 
-    A tote whose pose is that of the static background is skipped. Launched over view, rank, thread (flat, from `first` on): the `threads`
-    threads of a body stride over its triangles.
+    A tote whose pose is that of the static background is skipped, and so are bodies whose masks are kept where no tile is damaged. Launched
+    over view, rank, thread (flat, from `first` on): the `threads` threads of a body stride over its triangles.
     """
     index = wp.tid() + first
     slots = bodies.mesh.shape[1]
@@ -173,30 +180,31 @@ def rasterize_triangles_kernel(
     view = index // (threads * slots)
     if rank >= bodies.present[view]:
         return
-    body = bodies.order[view, rank]
+    body, kept = bodies.order[view, rank], damage.history_row[view]
     if body == views.instances and bodies.uses_background[view] != 0:
+        return
+    rests = is_kept(damage, kept_masks, view, body)
+    if rests and damage.touched[view, body] == wp.uint8(0):
         return
     box = bodies.box[view, body]
     if box[2] < 0 or box[3] < 0 or box[0] >= grid.width or box[1] >= grid.height:
         return
     intrinsics = views.cameras.intrinsics[view]
     mesh = bodies.mesh[view, body]
-    mask = read_mask(masks_inout, view, body)
+    mask = drawn_mask(masks_inout, view, body, rests)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
         footprint = find_footprint(grid, views.cameras, intrinsics, view, triangle)
         pixels = footprint.pixels
         columns = pixels[2] - pixels[0] + 1
         rows = pixels[3] - pixels[1] + 1
-        if columns > 0 and rows > 0:
+        if columns > 0 and rows > 0 and (not rests or any_flagged(damage.dirty, grid, view, pixels[1], pixels[0], pixels[3], pixels[2])):
             listed = False
             if columns * rows > SMALL_PIXELS:
                 listed = list_blocks(visibility_inout, view, rank, k, pixels)
             if not listed:
                 low_half = pack_low_half(body, k)
-                rasterize_footprint(
-                    visibility_inout, masks_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, mask
-                )
+                rasterize_footprint(visibility_inout, masks_inout, views.cameras, view, kept, triangle, footprint, low_half, mask)
 
 
 @kernel_of_views
@@ -205,6 +213,8 @@ def rasterize_blocks_kernel(
     grid: ImageGrid,
     bodies: ViewBodies,
     views: AnyViews,
+    damage: Damage,
+    kept_masks: KeptMasks,
     threads: int,
     first: int,
     visibility_inout: VisibilityBuffer,
@@ -220,7 +230,7 @@ def rasterize_blocks_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
-    intrinsics = views.cameras.intrinsics[view]
+    intrinsics, kept = views.cameras.intrinsics[view], damage.history_row[view]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
@@ -228,11 +238,13 @@ def rasterize_blocks_kernel(
         body = bodies.order[view, block[0]]
         triangle = camera_triangle(meshes, bodies, view, body, block[1])
         footprint = find_footprint(grid, views.cameras, intrinsics, view, triangle)
-        if row <= footprint.pixels[3]:
-            pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
+        last_row, right = footprint.pixels[3], wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2])
+        rests = is_kept(damage, kept_masks, view, body)
+        if row <= last_row and (not rests or any_flagged(damage.dirty, grid, view, row, block[3], row, right)):
+            footprint.pixels = wp.vec4i(block[3], row, right, row)
             low_half = pack_low_half(body, block[1])
-            mask = read_mask(masks_inout, view, body)
-            rasterize_footprint(visibility_inout, masks_inout, views.cameras, intrinsics, view, pixels, triangle, footprint, low_half, mask)
+            mask = drawn_mask(masks_inout, view, body, rests)
+            rasterize_footprint(visibility_inout, masks_inout, views.cameras, view, kept, triangle, footprint, low_half, mask)
 
 
 @wp.func
@@ -259,6 +271,7 @@ def resolve_visibility_kernel(
     # In:
     bodies: ViewBodies,
     visibility: VisibilityBuffer,
+    damage: Damage,
     views: AnyViews,
     counts_per_meter: float,
     first: int,
@@ -283,7 +296,7 @@ def resolve_visibility_kernel(
     hit = Hit()
     hit.segment = Segment.NOTHING
     hit.depth = FAR
-    key = visibility.nearest[view, row, column]
+    key = visibility.nearest[damage.history_row[view], row, column]
     if key != EMPTY:
         hit = resolve_hit(meshes, bodies, view, views.instances, key, ray)
     if bodies.uses_background[view] != 0:

@@ -180,8 +180,9 @@ def cut_span(span: wp.vec2, line: wp.vec3, row: float) -> wp.vec2:
 
 
 @wp.func
-def row_span(footprint: Footprint, row: int, left: int, right: int) -> wp.vec2i:
-    """Scanline span: first and last column of a footprint in a row, within columns `left` to `right`; empty if last < first."""
+def row_span(footprint: Footprint, row: int) -> wp.vec2i:
+    """Scanline span: first and last column of a footprint in a row, within its box; empty if last < first."""
+    left, right = footprint.pixels[0], footprint.pixels[2]
     begin = float(left) - footprint.origin[0]
     end = float(right) - footprint.origin[0]
     down = float(row) - footprint.origin[1]
