@@ -5,6 +5,7 @@ Engines of physics: our solver and MuJoCo Warp by Newton's interface, MuJoCo in 
 
 import importlib
 import importlib.util
+import itertools
 import math
 import time
 import warnings
@@ -114,7 +115,7 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
     """
     name, build = RENDERERS[peer]
     config, table, device = factory.config, float(factory.stream.rings[0].renderer.scene.table.height), bench.device
-    snapshot = tile_snapshot(factory.simulation.record.snapshot, count_worlds, device)
+    snapshot = stand_still(tile_snapshot(factory.simulation.record.snapshot, count_worlds, device))
     count, pixels = count_worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {count_worlds:,} world{'' if count_worlds == 1 else 's'}"
     yield MeasuredRow(f"{size}: views in a batch", count, "")
@@ -123,6 +124,13 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
     renderer, unoccluded = (_make_views_of(factory, mode, cameras, count) for mode in (config.render.mode, UNOCCLUDED))
     out = allocate_view_buffers(count, *cameras[0].resolution, renderer.instances, device)
     views = first_views(count, len(cameras), renderer.instances, device)
+
+    frame = itertools.count()
+
+    def render_next(ours: Renderer) -> None:
+        """Render the next frame, so that histories of light hold, as in an episode."""
+        snapshot.frame.fill_(next(frame))
+        ours.render(snapshot, views, out)
 
     def time_view(*passes: Callable[[], object]) -> float:
         """Time of one view by the fastest of these [s]."""
@@ -140,11 +148,11 @@ def _measure_rendering(bench: Bench, factory: Factory, peer: str, cameras: tuple
         ("depth, ids, amodal masks", ours_hits, "depth, ids", theirs_hits),
         (
             f"color by light maps with indirect light and {rest}",
-            time_view(partial(renderer.render, snapshot, views, out)),
+            time_view(partial(render_next, renderer)),
             colored,
             theirs_color,
         ),
-        (f"{plain} {rest}", time_view(partial(unoccluded.render, snapshot, views, out)), colored, theirs_color),
+        (f"{plain} {rest}", time_view(partial(render_next, unoccluded)), colored, theirs_color),
     ):
         for label, time_of_view in ((f"{size}, ours: {ours}", seconds), (f"{size}, {name}: {outputs}", their_seconds)):
             yield MeasuredRow(f"{label}: views", 1.0 / time_of_view, "1/s")
@@ -157,6 +165,12 @@ def tile_snapshot(snapshot: Snapshot, count: int, device: wp.Device) -> Snapshot
     chosen = np.arange(count) % len(snapshot.live)
     arrays = {field.name: getattr(snapshot, field.name) for field in fields(snapshot)}
     return Snapshot(**{name: wp.array(array.numpy()[chosen], dtype=array.dtype, device=device) for name, array in arrays.items()})
+
+
+def stand_still(snapshot: Snapshot) -> Snapshot:
+    """A snapshot whose previous frame was the same."""
+    last = ("last_pose", "last_catalog_index", "last_fixture_pose", "last_fixture_visible")
+    return replace(snapshot, **{name: getattr(snapshot, name.removeprefix("last_")) for name in last})
 
 
 def _make_views_of(factory: Factory, mode: str, cameras: tuple[Camera, ...], count: int) -> Renderer:

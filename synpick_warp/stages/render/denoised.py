@@ -51,6 +51,7 @@ from synpick_warp.stages.render.sampling_rates import (
     edge_rays,
     first_frame_paths,
     interleaved_threads,
+    keeps_frames,
     paths_per_coarse_pixel,
     shadow_size,
     supersamples,
@@ -189,7 +190,7 @@ def queue_views(views: int, regions: int, memory: int) -> int:
 
 def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:
     """Extents of the dimensions of `LIGHT_HISTORY`, for `histories` worlds times cameras with images of `width` x `height` px."""
-    return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
+    return scratch_sizes(render, width, height, histories) | {"world_camera": histories if keeps_frames(render, histories) else 0}
 
 
 def build_coarse_grid(image: Any, size: int, rays: int = 1) -> Any:
@@ -246,9 +247,9 @@ class DenoisedRenderer:
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
         self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
         self.history.frame.fill_(int(NEVER))
-        averages = accumulates(render, histories)
-        self.reuses = render.reuse and averages
-        sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if averages else 0}
+        keeps = keeps_frames(render, histories)
+        self.reuses = render.reuse and keeps
+        sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if keeps else 0}
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
@@ -256,7 +257,7 @@ class DenoisedRenderer:
         self.queues = allocate_struct(PATH_QUEUES, queues, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen = allocate_struct(RATIO_IMAGES, sizes, scene.device)
-        self.ratios = allocate_struct(KEPT_RATIOS if averages else RATIO_IMAGES, sizes, scene.device)
+        self.ratios = allocate_struct(KEPT_RATIOS if keeps else RATIO_IMAGES, sizes, scene.device)
         self.shadow_rays = allocate_struct(SHADOW_RAYS, sizes, scene.device)
         self.shadows = allocate_struct(LAMP_SHADOWS, sizes, scene.device)
         self.edge_lists = allocate_struct(EDGE_LISTS, sizes, scene.device)
@@ -296,10 +297,10 @@ class DenoisedRenderer:
         """Find the bodies that moved since the previous frame, where the light history contains that frame, and their tiles; sets the
         history's frame to this one.
 
-        Writes `moving`, `flags.dirty` and the frame indices of `history`; nothing without temporal accumulation. Returns the struct
-        `Damage`; None without reuse.
+        Writes `moving`, `flags.dirty` and the frame indices of `history`; nothing if no frame is kept. Returns the struct `Damage`; None
+        without reuse.
         """
-        if self.history.max_paths == 0:
+        if self.history.frame.size == 0:
             return None
         options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
         inputs = [snapshot.frames, views]

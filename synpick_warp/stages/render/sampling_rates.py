@@ -48,9 +48,14 @@ def traces_paths(render: Render) -> bool:
     return render.mode != UNOCCLUDED
 
 
+def keeps_frames(render: Render, histories: int) -> bool:
+    """Whether results of the frame before are kept: light, shadow rays, pictures; `histories` as in `DenoisedRenderer`."""
+    return bool(histories and render.history)
+
+
 def accumulates(render: Render, histories: int) -> bool:
     """Whether light is accumulated over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
-    return bool(histories and render.history) and traces_paths(render)
+    return keeps_frames(render, histories) and traces_paths(render)
 
 
 def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from synpick_warp.configs.schema import FAST, UNOCCLUDED
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
@@ -84,12 +85,12 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
 
 
 @pytest.mark.parametrize("size", [1, 2, 3])
-@pytest.mark.parametrize("lights", [LAMPS, LIGHT], ids=["lamps", "gradient"])
-def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights):
+@pytest.mark.parametrize(("lights", "mode"), [(LAMPS, FAST), (LIGHT, FAST), (LAMPS, UNOCCLUDED)], ids=["lamps", "gradient", "unoccluded"])
+def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode):
     frames = scripts(size)
     pictures, shares = {}, {}
     for reuse in (True, False):
-        config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse)
+        config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse, mode=mode)
         toy = ToyScene(ENTRIES, frames[0], CAMERAS, lights=(lights,), instances=ROOM, config=config)
         renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
         pictures[reuse], shares[reuse] = play(renderer, frames, toy, seed=int(reuse))

@@ -95,7 +95,9 @@ def mark_relit_tiles_kernel(coarse: CoarseGrid, shadow_grid: CoarseGrid, shot: A
     view, tile = wp.tid()
     if flags_inout.dirty[view, tile] == wp.uint8(0):
         row, column = tile_corner(shot.grid, tile)
-        dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
+        dirty = bool(False)
+        if coarse.size > 0:
+            dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
         if not dirty:
             dirty = any_near(flags_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
         flags_inout.dirty[view, tile] = wp.uint8(dirty)

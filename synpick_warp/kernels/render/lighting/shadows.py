@@ -191,7 +191,7 @@ def last_rays(
 
     They may if the history contains that frame, and the pixel showed the same body, which `rests`. `slot`: row of the history.
     """
-    if history.max_paths == 0 or moving.holds[view] == 0:
+    if moving.holds[view] == 0:
         return False, 0
     last = int(history.shadows[slot, row, column])
     if last >> 8 != segment or not rests(moving, view, segment, shot.views.instances):
@@ -265,6 +265,6 @@ def trace_shadow_rays_kernel(
                         free -= bit
     if not known or free != last:
         flags_out.shadowed[view, tile_of(coarse.grid, row, column)] = wp.uint8(1)
-    if history_inout.max_paths > 0:
+    if history_inout.shadows.shape[0] > 0:
         history_inout.shadows[slot, row, column] = pack_last(segment, free)
     rays_out.packed[view, row, column] = pack_rays(free, depth, segment, packed_normal)
