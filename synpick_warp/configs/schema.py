@@ -213,7 +213,8 @@ class Render:
         32, "Mode fast: paths per coarse pixel averaged over frames where nothing moves; 0: each frame by itself."
     )
     reuse: bool = setting(
-        True, "Mode fast, with `history`: keep the tiles of a picture in which nothing changed since the frame before; files are the same."
+        True,
+        "With `history`: keep the tiles of a picture, and the masks, in which nothing changed since the frame before; files are the same.",
     )
     lamps: Annotated[int, "[0, 8]"] = setting(
         8, "Maximum lamps of a map, small bright lights with shadow rays of their own; mode unoccluded: at most 1."

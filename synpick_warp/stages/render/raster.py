@@ -18,7 +18,7 @@ from synpick_warp.kernels.render.visibility.raster import (
 from synpick_warp.kernels.tuning import BLOCK_THREADS, KEEP_THREADS, RESTORE_THREADS, TRIANGLE_THREADS
 from synpick_warp.stages.arrays import allocate, allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers, masks_of
-from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.launch import launch, launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import BACKGROUND, VIEW_BODIES, body_sizes, first_views, set_up_views, whole_damage
 from synpick_warp.views.frames import most_words
@@ -93,16 +93,15 @@ class Rasterizer:
         if out is not None:
             dim = (views.count, out.mask_first.shape[1])
             wp.launch(lay_out_masks_kernel, dim=dim, inputs=[scene.grid, bodies], outputs=[masks], device=device)
-            inputs, dim = [damage, kept, RESTORE_THREADS], (*dim, RESTORE_THREADS)
-            wp.launch(restore_masks_kernel, dim=dim, inputs=inputs, outputs=[masks], device=device)
+            given = {"damage": damage, "kept": kept, "masks": masks}
+            launch(restore_masks_kernel, (*dim, RESTORE_THREADS), threads=RESTORE_THREADS, **given)
         inputs = [scene.meshes, scene.grid, bodies, views, damage, kept]
         per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
         threads = bodies.mesh.shape[1] * per_body
         launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, masks], device)
         launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, masks], device)
         if out is not None and kept.length.size:
-            inputs, dim = [damage, masks, KEEP_THREADS], (views.count, KEEP_THREADS)
-            wp.launch(keep_masks_kernel, dim=dim, inputs=inputs, outputs=[kept], device=device)
+            launch(keep_masks_kernel, (views.count, KEEP_THREADS), threads=KEEP_THREADS, damage=damage, masks=masks, kept=kept)
         inputs = [scene.meshes, scene.table, scene.grid, self.background, bodies, visibility, damage, views, self.counts_per_meter]
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 
