@@ -11,6 +11,7 @@ from uuid import uuid4
 
 import pytest
 
+from synpick_warp.system.processes.threads import SETUP
 from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import CONTROL, open_store
@@ -37,7 +38,8 @@ class Server:
         self._moto = server.DomainDispatcherApplication(server.create_backend_app)
         self._server = serving.make_server("127.0.0.1", 0, self.serve, threaded=True, request_handler=_quiet(serving.WSGIRequestHandler))
         self.address = f"http://127.0.0.1:{self._server.server_port}"
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        # A name of threads that launch no kernels: beside others, the bakes of this process would not capture their physics.
+        self._thread = threading.Thread(target=self._server.serve_forever, name=f"{SETUP}_0", daemon=True)
         self._thread.start()
 
     def serve(self, environ: dict[str, Any], start: Callable[..., Any]) -> Any:

@@ -13,6 +13,7 @@ from newton._src.geometry import narrow_phase
 from synpick_warp.apps.conversion import foreign, run
 from synpick_warp.apps.evaluation import figures
 from synpick_warp.apps.viz import explain
+from synpick_warp.cloud import finish
 from synpick_warp.dataset.commit import merge
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
@@ -59,16 +60,15 @@ def made_once() -> Iterator[None]:
 
 @contextmanager
 def written_here() -> Iterator[None]:
-    """Bakes, conversions and merges with one writer write in their own process, in which charts are rendered, too.
-
-    Another takes longer to start than to write a small set or to render a few charts.
+    """Bakes, also the ends of those into stores, conversions and merges with one writer write in their own process, in which charts are
+    rendered, too: another takes longer to start than to write a small set or to render a few charts.
     """
 
     def pool(processes: int, *arguments: int) -> WriterPool:
         return WriterPool(processes if processes > 1 else 0, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (pipeline, run, foreign, merge):
+        for module in (pipeline, run, foreign, merge, finish):
             patch.setattr(module, "WriterPool", pool)
         for module in (explain, figures):
             patch.setattr(module, "render_charts", render_here)
