@@ -4,6 +4,7 @@ something. A package of others (tests/plugins) adds a format, a gripper and a la
 import ast
 import dataclasses
 import importlib
+import itertools
 import json
 import os
 import shutil
@@ -322,6 +323,7 @@ def boxes(monkeypatch) -> None:
     monkeypatch.setitem(FORMAT_TABLE, "boxes", FORMAT)
 
 
+RUN_COMMANDS = "from synpick_warp.cli.main import main; print([main(line) for line in {}])"
 READ_RANGE = """
 import numpy as np, synpick_warp
 view = synpick_warp.open("DATA")[0].view(0)
@@ -331,51 +333,53 @@ np.testing.assert_allclose(view.layer("range"), 1e3 * view.depth * np.linalg.nor
 """
 
 
-def test_a_package_of_others_bakes_its_format_with_its_gripper_and_layer(tmp_path):
+def run_with(packages: Path, folder: Path, program: str) -> subprocess.CompletedProcess[str]:
+    """Run a Python program in a folder, with the packages of another one installed."""
     environment = checkout_environment()
-    environment["PYTHONPATH"] += f":{PLUGINS}"
+    environment["PYTHONPATH"] += f":{packages}"
+    return subprocess.run([sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, *arguments]
-        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
 
+def test_a_package_of_others_bakes_its_format_with_its_gripper_and_layer(tmp_path):
     settings = PICKING | {"gripper.kind": "triangle", "render.layers": ["range"], "bop.masks": False, "cameras.resolution": [96, 54]}
     options = ("--formats", "boxes,bop,zarr", "--device", "cpu", *assignments(settings))
-    for arguments in (("bake", "--config", "smoke", *options, "--out", "DATA"), ("verify", "DATA")):
-        done = run("-m", "synpick_warp", *arguments)
-        assert done.returncode == 0, done.stderr
-    done = run("-c", READ_RANGE)
+    commands = [["bake", "--config", "smoke", *options, "--out", "DATA"], ["verify", "DATA"]]
+    done = run_with(PLUGINS, tmp_path, f"{RUN_COMMANDS.format(commands)}{READ_RANGE}")
     assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("[0, 0]\n"), done.stderr
     assert len(list((tmp_path / "DATA" / "boxes").glob("*/*.json"))) > 10
     assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
 
 
-@pytest.mark.parametrize(
-    ("group", "module", "said"),
-    [
-        ("formats", None, "cannot be loaded: ModuleNotFoundError"),
-        ("formats", "FORMAT =", "cannot be loaded: SyntaxError"),
-        ("formats", "class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
-        ("layers", "class FORMAT: ...", "is broken_extras:FORMAT, which has no "),
-    ],
-)
-def test_a_package_of_others_that_is_broken_harms_only_what_uses_it(tmp_path, sets, group, module, said):
+BROKEN = {
+    ("formats", "absent"): (None, "cannot be loaded: ModuleNotFoundError"),
+    ("formats", "wrong"): ("FORMAT =", "cannot be loaded: SyntaxError"),
+    ("formats", "hollow"): ("class FORMAT: ...", "is broken_hollow:FORMAT, which has no "),
+    ("layers", "hollow"): ("class FORMAT: ...", "is broken_hollow:FORMAT, which has no "),
+}
+"""Group and name of what a package adds: its module, and what is said of it."""
+
+
+def test_packages_of_others_that_are_broken_harm_only_what_uses_them(tmp_path, sets):
     folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-extras\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text(f"[synpick_warp.{group}]\nbroken = broken_extras:FORMAT\nbop = broken_extras:FORMAT\n")
-    if module is not None:
-        (folder.parent / "broken_extras.py").write_text(module)
-    environment = checkout_environment()
-    environment["PYTHONPATH"] += f":{folder.parent}"
+    lines = {group: [f"[synpick_warp.{group}]", "bop = broken_hollow:FORMAT"] for group, _ in BROKEN}
+    for (group, name), (module, _) in BROKEN.items():
+        lines[group].append(f"{name} = broken_{name}:FORMAT")
+        if module is not None:
+            (folder.parent / f"broken_{name}.py").write_text(module)
+    (folder / "entry_points.txt").write_text("\n".join(itertools.chain.from_iterable(lines.values())))
     bake = ["bake", "--config", "smoke", "--dry-run"]
-    use = ["--formats", "broken"] if group == "formats" else ["--set", 'render.layers=["broken"]']
-    program = (
-        f"from synpick_warp.cli.main import main; print([main(line) for line in {[['verify', str(sets['source'])], bake, bake + use]}])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert done.stdout.endswith("[0, 0, 2]\n"), done.stderr
-    assert said in done.stderr
+    uses = [["--formats", name] if group == "formats" else ["--set", f'render.layers=["{name}"]'] for group, name in BROKEN]
+    commands = [["verify", str(sets["source"])], bake, *(bake + use for use in uses)]
+    done = run_with(folder.parent, tmp_path, RUN_COMMANDS.format(commands))
+    assert done.stdout.endswith("[0, 0, 2, 2, 2, 2]\n"), done.stderr
+    errors = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert len(errors) == len(BROKEN)
+    for (_, name), (_, said), error in zip(BROKEN, BROKEN.values(), errors, strict=True):
+        assert name in error
+        assert said in error
     assert "Traceback" not in done.stderr
 
 
