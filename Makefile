@@ -21,9 +21,6 @@ SLOW_WORKERS := 4
 # Neighbours in one process, which makes what they share once.
 PYTEST = $(BIN)/python -m pytest --dist worksteal
 
-# Processes that tests start need not compile the sources again, whatever the shell says.
-unexport PYTHONDONTWRITEBYTECODE
-
 .PHONY: demo test test-slow checks pytest clean
 .DELETE_ON_ERROR:
 

@@ -32,6 +32,8 @@ from tools.embedded_shapes import modelled_shape
 NAMES = ("soup_tin", "squeeze_bottle", "marker", "gear", "nut", "pipe_tee")
 """Objects of many equal choices: round, and of one cross-section."""
 NOISE = 1e-3
+ONE_EPISODE = {"bake.worlds": 1, "bake.episodes": 1}
+FORMATS = ["bop", "shards", "coco", "usd", "zarr"]
 
 
 def fingerprint(*values: object) -> str:
@@ -71,6 +73,6 @@ if __name__ == "__main__":
     with made_once(), written_here():
         bake_boxes(
             Path(sys.argv[1]),
-            PICKED | {"cameras.resolution": [48, 27], "bop.keypoints": 4, "bake.formats": ["bop", "shards", "coco", "usd", "zarr"]},
+            PICKED | ONE_EPISODE | {"cameras.resolution": [48, 27], "bop.keypoints": 4, "bake.formats": FORMATS},
         )
     print(json.dumps(computed() | digests(Path(sys.argv[1]))))

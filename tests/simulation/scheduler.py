@@ -53,9 +53,9 @@ class _Task:
             return True
         if self.process.frozen > now:
             return False
-        if self.wake is not None and self.wake <= now:
-            return True
-        return self.ready() if self.ready is not None else self.wake is None
+        if self.ready is None:
+            return self.wake is None or self.wake <= now
+        return (self.wake is not None and self.wake <= now) or self.ready()
 
 
 class Simulation:
