@@ -7,23 +7,17 @@ PyTorch is imported when a batch is collated, or by its own DataLoader; without 
 index alone, so the order is that of the sampler. What is pickled for a worker is the folder and the index; files are opened there.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.reading import DataSet, open_data_set
-from synpick_warp.dataset.view import candidates, find_pixels, mean_by_candidate
+from synpick_warp.dataset.reading import DataSet, Episode, open_data_set
+from synpick_warp.dataset.view import View, candidates, find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError, suggest
-
-if TYPE_CHECKING:
-    from synpick_warp.dataset.reading import Episode
-    from synpick_warp.dataset.view import View
 
 Sample = dict[str, Any]
 _OPEN_EPISODES = 8

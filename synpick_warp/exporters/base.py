@@ -3,6 +3,7 @@
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
@@ -62,7 +63,7 @@ class ExportContext:
         """What episodes draw their looks from, with textures; None: nothing."""
         return self._looks
 
-    @property
+    @cached_property
     def names(self) -> dict[int, str]:
         """obj_id -> name of all objects, in this order."""
         return {entry.obj_id: entry.name for entry in self.catalog.entries}

@@ -163,12 +163,8 @@ class _Context(ExportContext):
         super().__init__(out, settings, Catalog(()), make_cameras(settings.rig), (), pool)
         self._data = data
 
-    @property
-    def names(self) -> dict[int, str]:
-        return self._names
-
     @cached_property
-    def _names(self) -> dict[int, str]:
+    def names(self) -> dict[int, str]:
         """Names by obj_id, sorted."""
         folder = self._data.folder
         found = {int(index) for view in self._data.views() for index in view.object_ids} | set(_found(self._data).layout.model_files)

@@ -262,7 +262,7 @@ class StoredContext(ExportContext):
     def looks(self) -> Looks | None:
         return self._assets[2]
 
-    @property
+    @cached_property
     def names(self) -> dict[int, str]:
         """Names by obj_id, sorted: from the zarr store; without one from models and settings, else "obj_NNNNNN"."""
         return dict(sorted(names_of(self._source.data).items()))

@@ -15,8 +15,6 @@ from synpick_warp.views.frames import EpisodeEnd, TickBatch
 
 TICKS = 64
 """Number of ticks that are buffered in memory: about 50 kB per world."""
-_FIELDS = ("frame", "bin", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
-"""Fields of `TickBatch` that are spooled, with its shapes."""
 
 
 class TickSpool:
@@ -42,7 +40,7 @@ class TickSpool:
 
 
 def tick_type(instances: int) -> np.dtype:
-    """Structured type of a row of the file."""
+    """Structured type of a row of the file: fields of `TickBatch`."""
     return np.dtype(
         [
             ("frame", "<i4"),
@@ -61,7 +59,7 @@ def tick_type(instances: int) -> np.dtype:
 def tick_rows(batch: TickBatch) -> np.ndarray:
     """Rows of `tick_type`, as bytes, of all frames of a batch (frame, byte) uint8."""
     rows = np.empty(len(batch), tick_type(batch.object_id.shape[1]))
-    for name in _FIELDS:
+    for name in rows.dtype.names or ():
         rows[name] = getattr(batch, name)
     return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linprog, root_scalar
 from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
+from trimesh import Trimesh
+from trimesh.repair import fix_normals
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece
@@ -371,22 +373,7 @@ def hull_piece(points: np.ndarray) -> ConvexPiece:
     points = points.astype(np.float32).astype(np.float64)
     near = KDTree(points).query_pairs(_WELD * np.abs(points).max(), output_type="ndarray")
     hull = _hull_of(np.delete(points, near[:, 1], axis=0))
-    faces = hull.simplices.copy()
-    corners = hull.points[faces]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    start = int(norm(doubled).argmax())
-    if dot(doubled[start], hull.equations[start, :3]) < 0.0:
-        faces[start] = faces[start, ::-1]
-    oriented, waiting = {start}, [start]
-    while waiting:
-        face = waiting.pop()
-        edges = {(int(faces[face, k]), int(faces[face, (k + 1) % 3])) for k in range(3)}
-        for neighbor in (int(n) for n in hull.neighbors[face]):
-            if neighbor in oriented:
-                continue
-            if any((int(faces[neighbor, k]), int(faces[neighbor, (k + 1) % 3])) in edges for k in range(3)):
-                faces[neighbor] = faces[neighbor, ::-1]
-            oriented.add(neighbor)
-            waiting.append(neighbor)
-    used, index = np.unique(faces, return_inverse=True)
+    mesh = Trimesh(hull.points, hull.simplices, process=False)
+    fix_normals(mesh)
+    used, index = np.unique(mesh.faces, return_inverse=True)
     return ConvexPiece(hull.points[used].astype(np.float32), index.reshape(-1, 3).astype(np.int32))

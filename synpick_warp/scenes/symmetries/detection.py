@@ -4,6 +4,7 @@ The surface is symmetric under a rotation if the Hausdorff distance between it a
 condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, at least 15 mm. Texture does not count.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -313,20 +314,11 @@ def find_element(elements: np.ndarray, rotation: np.ndarray, within: float = _EQ
     return best if np.sqrt(max(1.0 + traces[best], 0.0)) / 2.0 >= np.cos(np.radians(within / 2.0)).round(DECIMALS) else -1
 
 
-def close_transforms(matrices: list[np.ndarray]) -> list[np.ndarray] | None:
+def close_transforms(matrices: Sequence[np.ndarray]) -> np.ndarray | None:
     """The rigid 4 x 4 matrices as they are, and all of their products that have other rotations; without the identity. None if they are
     more than MAX_ELEMENTS."""
-    elements = [np.eye(4), *matrices]
-    at = 1
-    while at < len(elements):
-        for matrix in matrices:
-            product = matmul(elements[at], matrix)
-            if find_element(np.array(elements)[:, :3, :3], product[:3, :3]) < 0:
-                elements.append(product)
-                if len(elements) > MAX_ELEMENTS:
-                    return None
-        at += 1
-    return elements[1:]
+    closed = _add_products(np.array([np.eye(4), *matrices]), matrices, _EQUAL)
+    return None if closed is None else closed[1:]
 
 
 def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
@@ -335,17 +327,23 @@ def close_group(generators: np.ndarray, within: float) -> np.ndarray | None:
     Products within an angle [°] of an element count as it, so that axes which were found with errors of a degree still generate a finite
     group; `make_exact` then removes the errors.
     """
-    elements = np.eye(3)[None]
+    closed = _add_products(np.eye(3)[None], generators, within)
+    return None if closed is None else make_exact(closed, within)
+
+
+def _add_products(elements: np.ndarray, generators: Sequence[np.ndarray] | np.ndarray, within: float) -> np.ndarray | None:
+    """Elements, the identity first, and all of their products with generators whose rotations are none of an element's within an angle [°];
+    None if they are more than MAX_ELEMENTS."""
     at = 0
     while at < len(elements):
         for generator in generators:
             product = matmul(elements[at], generator)
-            if find_element(elements, product, within) < 0:
+            if find_element(elements[:, :3, :3], product[:3, :3], within) < 0:
                 elements = np.concatenate([elements, product[None]])
                 if len(elements) > MAX_ELEMENTS:
                     return None
         at += 1
-    return make_exact(elements, within)
+    return elements
 
 
 def make_exact(elements: np.ndarray, within: float) -> np.ndarray | None:
