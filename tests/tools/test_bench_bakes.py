@@ -72,8 +72,20 @@ def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
     assert table.exists()
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_the_processes_follow_a_growing_data_set_until_one_finds_damage(tmp_path, processes):
+def damage(out: Path, _: Cleaner) -> None:
+    (out / "manifest/000009.json").write_text("{")
+
+
+def kill_one(_: Path, cleaner: Cleaner) -> None:
+    os.kill(cleaner.pids[-1], signal.SIGKILL)
+
+
+@pytest.mark.parametrize(
+    ("processes", "end", "said"),
+    [(1, damage, "000009.json"), (2, kill_one, "a process that verifies episodes was ended by SIGKILL; ")],
+    ids=["damage", "death"],
+)
+def test_the_processes_follow_a_growing_data_set_until_one_finds_damage_or_dies(tmp_path, processes, end, said):
     files = [file for episode in range(5) for file in write_episode(tmp_path, episode)]
     size = sum(file.stat().st_blocks * 512 for file in files)
     with Cleaner(CleanedSet(tmp_path, SHARED), processes) as cleaner:
@@ -84,16 +96,10 @@ def test_the_processes_follow_a_growing_data_set_until_one_finds_damage(tmp_path
         write_episode(tmp_path, 7)
         wait_for(lambda: cleaner.poll().episodes == 6)
         assert not cleaner.poll().problem
-        (tmp_path / "manifest/000009.json").write_text("{")
+        end(tmp_path, cleaner)
         wait_for(lambda: cleaner.poll().problem)
+        assert said in cleaner.poll().problem
         assert cleaner.poll().episodes == 6
-
-
-def test_a_process_that_dies_is_a_problem(tmp_path):
-    with Cleaner(CleanedSet(tmp_path, SHARED), 2) as cleaner:
-        os.kill(cleaner.pids[1], signal.SIGKILL)
-        wait_for(lambda: cleaner.poll().problem)
-        assert cleaner.poll().problem.startswith("a process that verifies episodes was ended by SIGKILL; ")
 
 
 def test_a_file_that_cannot_be_deleted_is_a_problem(tmp_path, monkeypatch):
