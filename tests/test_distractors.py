@@ -359,7 +359,7 @@ def single(tmp_path_factory) -> tuple[Path, dict[str, str]]:
     return place, bake(place, 1)
 
 
-@pytest.mark.parametrize("worlds", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("worlds", [2, pytest.param(4, marks=pytest.mark.slow)])
 def test_bytes_do_not_depend_on_worlds(single, worlds):
     place, expected = single
     found = bake(place.with_name(str(worlds)), worlds)

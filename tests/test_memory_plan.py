@@ -92,7 +92,7 @@ def test_settings_that_exceed_the_memory_are_refused_in_one_line(overrides, larg
 @pytest.mark.parametrize(
     ("overrides", "advice"),
     [
-        ({"render__views_per_batch": 10**9}, "lower render.views_per_batch (1000000000)"),
+        ({"render__views_per_batch": 10**6}, "lower render.views_per_batch (1000000)"),
         ({"physics__contacts_per_world": INT32_MAX, "bake__worlds": 2}, "lower physics.contacts_per_world (2147483647)"),
     ],
 )

@@ -112,6 +112,7 @@ def test_splits_fill_one_folder_in_any_order(server, splits, expected, tmp_path)
         assert {int(key[:6]) for key in json.loads((once / f"{name}_web" / "key_to_shard.json").read_text())} == set(scenes)
 
 
+@pytest.mark.usefixtures("whole")  # Which has loaded the kernels.
 def test_a_data_set_of_splits_grows_at_its_end_only(server, splits, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     settings = {"bake.episodes": 3, "splits.train.episodes": 2, "splits.test.first": 3, "bake.formats": ["zarr"]}
