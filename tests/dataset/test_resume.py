@@ -138,16 +138,6 @@ def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expec
     assert digests(whole) == expected
 
 
-@pytest.mark.slow
-def test_a_data_set_can_grow_with_other_worlds_and_writers(server, expected, tmp_path):
-    out = tmp_path / "set"
-    free = {"bake.worlds": 1, "bake.writers": 2, "render.views_per_batch": 2}
-    assert server.bake(out, settings={"bake.episodes": 2, **free}) == 0
-    assert verify(out).finished
-    assert server.bake(out) == 0
-    assert digests(out) == expected
-
-
 SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
 
 
@@ -226,9 +216,11 @@ def test_the_folder_is_removed(server, expected, tmp_path):
 
 @pytest.mark.slow
 def test_a_file_that_cannot_be_written(server, expected, tmp_path):
-    """The size of files is limited, as on a full disk: pictures can be written, an episode's lists cannot."""
+    """The size of files is limited, as on a full disk: pictures can be written, an episode's lists cannot. The set, begun with other worlds
+    and writers, grows."""
     out, log = tmp_path / "set", tmp_path / "log"
-    assert server.bake(out, settings={"bake.episodes": 2}) == 0
+    assert server.bake(out, settings={"bake.episodes": 2, "bake.worlds": 1, "bake.writers": 2, "render.views_per_batch": 2}) == 0
+    assert verify(out).finished
     server.start(out, log=str(log), alone=True, most_bytes=10_000)
     fails(server, log, "cannot write ")
     stays_whole(server, out, expected)

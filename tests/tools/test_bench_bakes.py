@@ -72,17 +72,12 @@ def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
     assert table.exists()
 
 
-def damage(out: Path, _: Cleaner) -> None:
-    (out / "manifest/000009.json").write_text("{")
-
-
-def kill_one(_: Path, cleaner: Cleaner) -> None:
-    os.kill(cleaner.pids[-1], signal.SIGKILL)
-
-
 @pytest.mark.parametrize(
     ("processes", "end", "said"),
-    [(1, damage, "000009.json"), (2, kill_one, "a process that verifies episodes was ended by SIGKILL; ")],
+    [
+        (1, lambda out, _: (out / "manifest/000009.json").write_text("{"), "000009.json"),
+        (2, lambda _, pids: os.kill(pids[-1], signal.SIGKILL), "a process that verifies episodes was ended by SIGKILL; "),
+    ],
     ids=["damage", "death"],
 )
 def test_the_processes_follow_a_growing_data_set_until_one_finds_damage_or_dies(tmp_path, processes, end, said):
@@ -96,7 +91,7 @@ def test_the_processes_follow_a_growing_data_set_until_one_finds_damage_or_dies(
         write_episode(tmp_path, 7)
         wait_for(lambda: cleaner.poll().episodes == 6)
         assert not cleaner.poll().problem
-        end(tmp_path, cleaner)
+        end(tmp_path, cleaner.pids)
         wait_for(lambda: cleaner.poll().problem)
         assert said in cleaner.poll().problem
         assert cleaner.poll().episodes == 6
