@@ -74,9 +74,9 @@ ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
 
-MAX_QUEUE_VIEWS = 32
-"""Maximum number of views with path queues at a time; the views of a larger batch take turns. With 8 views of a batch of 25, launches wait
-for their longest path on a nearly idle GPU, and queues gain nothing."""
+MAX_QUEUE_REGIONS = 8192
+"""Maximum number of regions with path queues at a time, those of 32 views in full HD; views of a larger batch take turns. With a quarter,
+launches wait for their longest path on a nearly idle GPU, and queues gain nothing."""
 MAX_QUEUE_FRACTION = 1 / 96
 """Maximum size of path queues as a fraction of the device's memory. At full HD, 42 views fit into that of an H100, and 6 into that of a GPU
 of 12 GiB, which is better used for worlds."""
@@ -184,7 +184,7 @@ def queue_sizes(render: Render, width: int, height: int, views: int, histories: 
 def queue_views(views: int, regions: int, memory: int) -> int:
     """Number of views with path queues at a time, on a device with this much `memory` [bytes], so that turns are of equal length."""
     size = regions * int(QUEUE_CAPACITY) * int(PATH_RECORDS) * wp.types.type_size_in_bytes(wp.vec4)
-    most = max(1, min(MAX_QUEUE_VIEWS, int(MAX_QUEUE_FRACTION * memory) // size))
+    most = max(1, min(MAX_QUEUE_REGIONS // regions, int(MAX_QUEUE_FRACTION * memory) // size))
     return -(-views // -(-views // most))
 
 

@@ -412,7 +412,10 @@ def test_batches_of_more_views_than_queues_take_turns(device):
     assert_same_light(images[1], images[0], device)
 
 
-@pytest.mark.parametrize(("views", "gigabytes", "expected"), [(25, 80, 25), (25, 24, 9), (13, 12, 5), (414, 80, 32), (1, 1, 1)])
-def test_views_take_turns_of_equal_length(views, gigabytes, expected):
-    """Full HD: a view's queues take 20.9 MB."""
-    assert queue_views(views, 255, gigabytes << 30) == expected
+@pytest.mark.parametrize(
+    ("views", "regions", "gigabytes", "expected"),
+    [(25, 255, 80, 25), (25, 255, 24, 9), (13, 255, 12, 5), (414, 255, 80, 32), (1, 255, 1, 1), (6144, 8, 80, 1024)],
+)
+def test_views_take_turns_of_equal_length(views, regions, gigabytes, expected):
+    """A view's queues take 20.9 MB in full HD, with 255 regions, and 0.7 MB at 64x64."""
+    assert queue_views(views, regions, gigabytes << 30) == expected
