@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, TILE_WIDTH
 from synpick_warp.kernels.render.visibility.masks import KeptMasks, keep_masks_kernel, lay_out_masks_kernel, restore_masks_kernel
 from synpick_warp.kernels.render.visibility.raster import (
     MAX_TRIANGLES,
@@ -89,7 +89,7 @@ class Rasterizer:
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         instance, depth = (None, None) if out is None else (out.instance, out.depth)
         damage, kept = self.whole if damage is None else damage, self.kept_masks
-        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, damage, views], [visibility], device)
+        launch_pixels(clear_visibility_kernel, pixels // int(TILE_WIDTH), [scene.grid, damage, views], [visibility], device)
         if out is not None:
             dim = (views.count, out.mask_first.shape[1])
             wp.launch(lay_out_masks_kernel, dim=dim, inputs=[scene.grid, bodies], outputs=[masks], device=device)

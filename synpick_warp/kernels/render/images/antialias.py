@@ -210,15 +210,14 @@ def has_discontinuity(
 def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: ShadedImage, lists_inout: FootprintLists):
     """Find footprints with a geometric discontinuity and visible contrast, and list them.
 
-    `count`, which must be 0, receives the numbers of footprints, and `resolve` is cleared to 0. Footprint (row, column) has pixel (row,
-    column) as its lower right corner, and only one or two corners at the image border. Launched over view, footprint, in tile order.
+    `count`, which must be 0, receives the numbers of footprints, and `resolve` is cleared to 0 in tiles of SHADE_PASS. Footprint (row,
+    column) has pixel (row, column) as its lower right corner, and only one or two corners at the image border. Launched over view,
+    footprint, in tile order.
     """
     grid = shot.grid
     view, row, column = tile_pixel(footprints, wp.tid())
     if not in_image(footprints, row, column):
         return
-    if row < grid.height and column < grid.width:
-        image_inout.resolve[view, row, column] = wp.uint32(0)
     top = wp.max(row - 1, 0)
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
@@ -226,6 +225,8 @@ def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: Sh
     # All pixels beside those of COLOR_PASS have it.
     if not needs(grid, image_inout.passes, SHADE_PASS, view, bottom, right):
         return
+    if row < grid.height and column < grid.width:
+        image_inout.resolve[view, row, column] = wp.uint32(0)
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
     if has_contrast(image_inout.radiance, view, top, left, bottom, right):
         if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):

@@ -18,7 +18,7 @@ from synpick_warp.kernels.state import Frames
 
 wp.set_module_options({"enable_backward": False})
 
-LIGHT_CHANGE = wp.constant(0.25)
+LIGHT_CHANGE = wp.constant(0.07)
 """Temporal lag that an average may have, as a fraction of the light, see `lag_frames`; compared with others in tools/DECISIONS.md."""
 MAX_TRAVEL = wp.constant(2.0)
 """Displacement of a body [sizes] from which on it changes no more of a point's light: it has uncovered all that it covered, and covers as

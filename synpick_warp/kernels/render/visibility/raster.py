@@ -10,7 +10,16 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, ImageGrid, camera_ray, in_image, loop_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import (
+    TILE_WIDTH,
+    AnyCameras,
+    AnyViews,
+    ImageGrid,
+    camera_ray,
+    in_image,
+    loop_ray,
+    tile_pixel,
+)
 from synpick_warp.kernels.render.visibility.damage import Damage, any_flagged, is_damaged
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
@@ -145,13 +154,14 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
 def clear_visibility_kernel(grid: ImageGrid, damage: Damage, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
     """Clear damaged tiles of the visibility buffer, and the work list; unused views (camera -1) keep theirs.
 
-    Launched over view, pixel (tile order, from flat index `first` on).
+    Launched over view, row of a tile (tile order, from flat index `first` on): with a thread a pixel, launching them would take most time.
     """
-    view, row, column = tile_pixel(grid, wp.tid() + first)
+    view, row, column = tile_pixel(grid, (wp.tid() + first) * TILE_WIDTH)
     if not in_image(grid, row, column) or views.camera[view] < 0:
         return
     if is_damaged(damage, grid, view, row, column):
-        visibility_out.nearest[damage.history_row[view], row, column] = EMPTY
+        for right in range(column, wp.min(column + TILE_WIDTH, grid.width)):
+            visibility_out.nearest[damage.history_row[view], row, right] = EMPTY
     if row == 0 and column == 0:
         visibility_out.blocks[view] = 0
 
