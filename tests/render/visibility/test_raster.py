@@ -287,8 +287,8 @@ def test_the_rasterizer_misses_no_ray(name, seed, size):
     ours, theirs = gbuffer_of(toy, device), gbuffer_of(toy, device, by_rays=True)
     differs = ours["segment"] != theirs["segment"]
     assert differs.sum() <= (2 if device.is_cuda else 0)
-    # Both are float32, and depth is interpolated over two metres.
-    np.testing.assert_allclose(ours["depth"][~differs], theirs["depth"][~differs], rtol=2e-5, atol=2e-6)
+    # Both are float32, and depth is interpolated over two metres: of 70 seeds, the worst differs by 5e-5.
+    np.testing.assert_allclose(ours["depth"][~differs], theirs["depth"][~differs], rtol=1e-4, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", VIEWS)
