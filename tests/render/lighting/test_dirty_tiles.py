@@ -11,7 +11,7 @@ import warp as wp
 from synpick_warp.configs.schema import FAST, UNOCCLUDED
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
+from synpick_warp.stages.buffers import ViewBuffers, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from tests.render.lighting.test_history import LIGHT, link
@@ -64,15 +64,13 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
     """Render the views of all frames, in random order and batches: what is told of each view by its world and camera (view, ...), frame by
     frame, and the share of tiles that were shaded."""
     random, device = np.random.default_rng(seed), renderer.scene.device
-    before: Snapshot | None = None
-    pictures, shares = [], []
+    before, pictures, shares = None, [], []
     for frame, placed in enumerate(frames):
         state = snapshot(replace(toy, placed=placed), device)
         state.frame.fill_(frame)
         link(state, before or state)
         views = [{} for _ in range(4)]
-        order = random.permutation(4)
-        for part in np.split(order, np.flatnonzero(random.random(3) < 0.4) + 1):
+        for part in np.split(random.permutation(4), np.flatnonzero(random.random(3) < 0.4) + 1):
             world, which = (wp.array(values.astype(np.int32), dtype=wp.int32, device=device) for values in (part // 2, part % 2))
             out = allocate_view_buffers(len(part), 90, 61, ROOM, device)
             renderer.render(state, make_views(world, which, len(part), ROOM), out)
@@ -87,8 +85,7 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
 @pytest.mark.parametrize("size", [1, 2, 3])
 @pytest.mark.parametrize(("lights", "mode"), [(LAMPS, FAST), (LIGHT, FAST), (LAMPS, UNOCCLUDED)], ids=["lamps", "gradient", "unoccluded"])
 def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode):
-    frames = scripts(size)
-    pictures, shares = {}, {}
+    frames, pictures, shares = scripts(size), {}, {}
     for reuse in (True, False):
         config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse, mode=mode)
         toy = ToyScene(ENTRIES, frames[0], CAMERAS, lights=(lights,), instances=ROOM, config=config)
@@ -97,8 +94,7 @@ def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode)
     for frame, (kept, whole) in enumerate(zip(pictures[True], pictures[False], strict=True)):
         for name in whole:
             np.testing.assert_array_equal(kept[name], whole[name], err_msg=f"{name} of frame {frame}")
-    assert np.mean(shares[True]) < 0.9
-    assert np.mean(shares[False]) == 1.0
+    assert np.mean(shares[True]) < 0.9 < np.mean(shares[False]) == 1.0
 
 
 def test_a_still_scene_is_shaded_when_its_light_is_due(device):
