@@ -296,7 +296,7 @@ def test_episodes_that_are_given_up(tmp_path, capsys):
     """One arrangement without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
     out = tmp_path / "set"
     given = assignments({"settle.max_time": 0.1, "settle.tries": 1, "bake.episodes": 2})
-    assert commands.main(["bake", "--out", str(out), *COMMAND, *given]) == commands.EXIT_INCOMPLETE
+    assert commands.main(["bake", "--out", str(out), *COMMAND, *given]) == commands.options.EXIT_INCOMPLETE
     capsys.readouterr()
     rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert [(row["episode"], row["ending"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
