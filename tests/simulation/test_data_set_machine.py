@@ -6,7 +6,6 @@ undisturbed bake of these episodes.
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import shutil
@@ -107,12 +106,9 @@ class DataSets(RuleBasedStateMachine):
     def folder(self, name: str) -> Path:
         return self.base / name
 
-    @contextlib.contextmanager
     def refused(self):
-        """Within, a call must end with a SynpickError, and change nothing."""
-        with pytest.raises(SynpickError) as caught:
-            yield
-        assert "\n" not in str(caught.value)
+        """Within, a call must end with a SynpickError of one line, and change nothing."""
+        return pytest.raises(SynpickError, match=r"\A.*\Z")
 
     # ---- bakes ----
 
@@ -181,8 +177,7 @@ class DataSets(RuleBasedStateMachine):
         there = set(committed_episodes(folder))
         whole = {episode for episode in there if is_complete(folder, episode_entry(episode))}
         assert before.whole <= whole <= after.whole, "lost, or not asked for"
-        indices = manifest.read_entry(folder, INDICES) if is_complete(folder, INDICES) else None
-        indexed = None if indices is None else frozenset(indices["episodes"])
+        indexed = frozenset((manifest.read_entry(folder, INDICES) or {})["episodes"]) if is_complete(folder, INDICES) else None
         assert indexed in (None, before.indexed, after.indexed)
         planned = before.planned
         if (folder / CONFIG_FILE).exists():
@@ -232,11 +227,15 @@ class DataSets(RuleBasedStateMachine):
             return
         self.known[out] = Known(known[0].kind, planned, whole, set(), frozenset(whole))
 
-    @precondition(lambda self: self.known)
+    def _convertible(self) -> list[str]:
+        """Sets but for those whose constants a power cut took after an episode was committed: a resumed bake writes them again."""
+        return sorted(name for name, known in self.known.items() if begun_in(self.folder(name)) or not known.committed)
+
+    @precondition(_convertible)
     @rule(data=st.data(), out=st.sampled_from(FOLDERS), crash=CRASH)
     def convert(self, data, out, crash):
         """Convert a set to the other format, also into an earlier conversion that grows or was killed."""
-        source = data.draw(st.sampled_from(sorted(self.known)))
+        source = data.draw(st.sampled_from(self._convertible()))
         known = self.known[source]
         (kind,) = set(FORMATS) - {known.kind}
         target = self.known.get(out, Known(kind, known.planned))
@@ -331,8 +330,11 @@ def _move(source: Path, target: Path) -> None:
     source.rename(target)
 
 
-@pytest.mark.parametrize("bug", [pytest.param(bug, marks=[pytest.mark.slow] * (bug == "uncommitted files stay")) for bug in BUGS])
-def test_a_planted_bug_of_data_sets_is_found(bug, monkeypatch):
+@pytest.mark.parametrize(
+    ("bug", "examples"),
+    [pytest.param("uncommitted files stay", 400, marks=pytest.mark.slow), ("a data set may shrink", 100), ("a merge moves files", 100)],
+)
+def test_a_planted_bug_of_data_sets_is_found(bug, examples, monkeypatch):
     BUGS[bug](monkeypatch)
     with pytest.raises((AssertionError, SynpickError, pytest.fail.Exception)):
-        run(100, 12, phases=[Phase.generate])
+        run(examples, 12, phases=[Phase.generate])
