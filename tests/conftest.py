@@ -24,7 +24,7 @@ REAL_DATA = ROOT.parent / "shared" / "data"
 """Real objects and lights, where somebody has put them beside the checkout; tests that want them are skipped elsewhere."""
 
 MEMORY, ROOM = Path("/dev/shm"), 4 << 30
-"""Folder in memory, and the free space there [B] from which tests write there: on a disk, calls for files take five times as long."""
+"""RAM disk for the temporary files of tests, and the free space it must have [B]: on a disk, file operations take five times as long."""
 
 # Examples follow from the test's name, so that two runs do the same; compiling a kernel may take any time.
 settings.register_profile("house", deadline=None, derandomize=True, max_examples=50)

@@ -36,7 +36,7 @@ def has_members(words: wp.array2d[wp.uint32], row: int) -> bool:
 
 @wp.func
 def lowest_bit(word: Any) -> int:
-    """Index of the lowest bit that is set in a word of 32 or 64 bits; their number if there is none."""
+    """Count of trailing zeros of a word of 32 or 64 bits: the index of its lowest set bit; the number of bits if none is set."""
     return int(wp.bit_count(~word & (word - type(word)(1))))
 
 

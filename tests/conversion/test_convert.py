@@ -334,7 +334,7 @@ np.testing.assert_allclose(view.layer("range"), 1e3 * view.depth * np.linalg.nor
 
 
 def run_with(packages: Path, folder: Path, program: str) -> subprocess.CompletedProcess[str]:
-    """Run a Python program in a folder, with the packages of another one installed."""
+    """Run a Python program in a folder, with the packages of a second folder installed."""
     environment = checkout_environment()
     environment["PYTHONPATH"] += f":{packages}"
     return subprocess.run([sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=False)

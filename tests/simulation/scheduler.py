@@ -1,7 +1,7 @@
 """Discrete-event simulation of processes and their threads in virtual time (after FoundationDB's simulator; Zhou et al., 2021).
 
 One thread runs at a time, and hands over at each sleep, wait, lock and request; a seed draws which comes next. So a schedule repeats.
-Simulated threads are greenlets of one real thread: switching between those takes less time than between real ones.
+Simulated threads are greenlets, coroutines of one operating-system thread, which switch faster than threads.
 """
 
 from __future__ import annotations

@@ -96,13 +96,13 @@ class BinSurface:
 
 
 def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bisect the longest edges of triangles (F, 3, 3) until none exceeds `longest`; returns the triangles, and the given one of each."""
+    """Longest-edge bisection of triangles (F, 3, 3) until no edge exceeds `longest`: the triangles, and the input triangle of each (N,)."""
     parts = [(batch[..., small], owner[small]) for batch, owner, small, _, _ in _bisect(corners, longest)]
     return np.concatenate([part for part, _ in parts], axis=2).transpose(2, 0, 1), np.concatenate([owner for _, owner in parts])
 
 
 def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (N, 3) of the triangles of `subdivide`, one for each split edge, and the index of the input triangle of each."""
+    """Sample points (N, 3): corners of the triangles, midpoints of the edges that `subdivide` splits; and the triangle of each point (N,)."""
     parts = [(middle, owner) for _, _, _, middle, owner in _bisect(corners, longest)]
     points = np.concatenate([corners.reshape(-1, 3).T, *(middle for middle, _ in parts)], axis=1).T
     return points, np.concatenate([np.repeat(np.arange(len(corners)), 3), *(owner for _, owner in parts)])

@@ -60,8 +60,8 @@ def labels_of(out: ViewBuffers, view: int) -> dict[str, np.ndarray]:
 
 
 def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[list[dict[str, np.ndarray]], list[float]]:
-    """Render the views of all frames, in random order and batches: what is told of each view by its world and camera (view, ...), frame by
-    frame, and the share of tiles that were shaded."""
+    """Render the views of all frames, in random order and batches: by frame, the outputs of each world and camera (view, ...); and the
+    fraction of tiles that were shaded, by batch."""
     random, device = np.random.default_rng(seed), renderer.scene.device
     before, pictures, shares = None, [], []
     for frame, placed in enumerate(frames):

@@ -37,7 +37,7 @@ class BoxesCounts:
 
 @wp.struct
 class BorderCounts:
-    """Amodal pixels of every instance beyond the image, and their boxes, kept from frame to frame."""
+    """Amodal pixel counts and boxes of every instance beyond the image border, kept from frame to frame."""
 
     pixels: wp.array2d[int]
     """(kept, instance); `kept` is the view's `Damage.history_row`."""

@@ -1,4 +1,4 @@
-"""Flags of the tiles of images and of coarse grids: what is recomputed in a frame; all else keeps its values of the previous frame."""
+"""Tile flags: which tiles of an image, and of coarse grids, are recomputed in a frame; all others keep the values of the previous frame."""
 
 import warp as wp
 

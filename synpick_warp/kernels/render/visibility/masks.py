@@ -34,10 +34,10 @@ class InstanceMasks:
 
 @wp.struct
 class KeptMasks:
-    """Amodal masks of the previous frame of each world and camera, as they lay in their pool."""
+    """Amodal masks of the previous frame of each world and camera, in the layout of the pool of `InstanceMasks`."""
 
     first: wp.array2d[int]
-    """(kept, instance): index of the mask's first word."""
+    """(kept, instance): index in `words` of the first word of the instance's mask."""
     words: wp.array2d[wp.uint32]
     """(kept, word): words of the masks."""
     length: wp.array[int]
@@ -166,7 +166,7 @@ def restore_masks_kernel(damage: Damage, kept: KeptMasks, threads: int, masks_in
 
 @wp.kernel
 def keep_masks_kernel(damage: Damage, masks: InstanceMasks, threads: int, kept_inout: KeptMasks):
-    """Keep the masks of a frame for the next one. Launched over view, thread: `threads` threads stride over a view's words."""
+    """Store the masks of this frame for the next one. Launched over view, thread: `threads` threads stride over a view's words."""
     view, thread = wp.tid()
     row, length = damage.history_row[view], masks.length[view]
     kept_inout.length[row] = wp.where(length <= masks.words.shape[1], length, 0)

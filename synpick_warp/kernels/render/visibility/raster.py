@@ -152,7 +152,7 @@ def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: in
 
 @kernel_of_views
 def clear_visibility_kernel(grid: ImageGrid, damage: Damage, views: AnyViews, first: int, visibility_out: VisibilityBuffer):
-    """Clear damaged tiles of the visibility buffer, and the work list; unused views (camera -1) keep theirs.
+    """Reset the visibility keys of damaged tiles, and empty the work list; nothing is written for unused views (camera -1).
 
     Launched over view, row of a tile (tile order, from flat index `first` on): with a thread a pixel, launching them would take most time.
     """
