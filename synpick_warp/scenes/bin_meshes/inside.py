@@ -102,7 +102,7 @@ def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarr
 
 
 def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sample points (N, 3): corners of the triangles, midpoints of the edges that `subdivide` splits; and the triangle of each point (N,)."""
+    """Sample points (N, 3): triangle corners, midpoints of the edges that `subdivide` splits; and the triangle of each point (N,)."""
     parts = [(middle, owner) for _, _, _, middle, owner in _bisect(corners, longest)]
     points = np.concatenate([corners.reshape(-1, 3).T, *(middle for middle, _ in parts)], axis=1).T
     return points, np.concatenate([np.repeat(np.arange(len(corners)), 3), *(owner for _, owner in parts)])
