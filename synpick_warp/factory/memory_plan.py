@@ -54,7 +54,7 @@ from synpick_warp.system.hardware.free_memory import free_device_memory, free_ho
 
 KEPT_PICTURES = "pictures kept over frames"
 """Name of the term of `render.reuse` ..."""
-KEPT_ARRAYS = (KeptColors.__name__, "VisibilityBuffer", "KeptMasks", "BorderCounts")
+KEPT_ARRAYS = (KeptColors.__name__, "VisibilityBuffer", "KeptMasks", "BorderCounts", "KeptSources")
 """... and the declarations of its arrays."""
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""

@@ -63,6 +63,7 @@ def _history_arrays(renderer: Renderer) -> dict[str, wp.array]:
     if history is None or not isinstance(shading, DenoisedRenderer):
         return {}
     kept = {"ratios": shading.ratios.record, "bodies": shading.flags.bodies, "color": renderer.postprocessor.kept}
+    kept["sources"] = shading.kept_sources.word
     if renderer.damage is not renderer.rasterizer.whole:
         owners = renderer.rasterizer.visibility, renderer.rasterizer.kept_masks, renderer.annotator.border
         kept |= {f"{name} {index}": getattr(owner, name) for index, owner in enumerate(owners) for name in _KEPT[index]}

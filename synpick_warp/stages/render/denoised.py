@@ -17,6 +17,7 @@ from synpick_warp.kernels.render.images.antialias import (
     find_footprints_kernel,
     resolve_footprints_kernel,
 )
+from synpick_warp.kernels.render.images.kept_sources import WORD_SAMPLES, KeptSources
 from synpick_warp.kernels.render.lighting import denoise as denoising
 from synpick_warp.kernels.render.lighting import shadow_edges
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
@@ -132,6 +133,7 @@ PATH_QUEUES = struct_arrays(
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 KEPT_RATIOS = struct_arrays(RatioImages, "world_camera", "cell_row", "cell_column")
 SHADOW_RAYS = struct_arrays(ShadowRays, "view", "shadow_row", "shadow_column")
+KEPT_SOURCES = struct_arrays(KeptSources, "world_camera", "source_word")
 FOOTPRINT_LISTS = struct_arrays(FootprintLists, "view", "chunk", footprint=("view", "chunk", "chunk_footprint"))
 
 
@@ -270,6 +272,9 @@ class DenoisedRenderer:
         self.flags.history_row.assign(np.arange(views))
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
+        words = -(-(scene.width + 1) * (scene.height + 1) * self.coverage_rays // int(WORD_SAMPLES))
+        kept = {"world_camera": histories if self.reuses and self.antialias else 0, "source_word": words}
+        self.kept_sources = allocate_struct(KEPT_SOURCES, kept, scene.device)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
         """Render the radiance of a batch of views, for which `find_damage` was called.
@@ -419,13 +424,14 @@ class DenoisedRenderer:
         lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
         options: dict[str, Any] = {"device": device, "block_dim": PIXEL_BLOCK}
-        inputs = [self.footprints, shot]
+        inputs, outputs = [self.footprints, shot, self.flags], [image, lists, self.kept_sources]
         dim = shot.views.count * self.footprints.tiles * int(TILE_PIXELS)
-        wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=[image, lists], **options)
+        wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
         threads = FOOTPRINT_THREADS if device.is_cuda else CPU_FOOTPRINT_THREADS
-        inputs = [self.scene.plain, self.footprints, shot, lists, threads, mask_width_of(shot.bodies)]
+        inputs = [self.scene.plain, self.footprints, shot, lists, self.flags.history_row, threads, mask_width_of(shot.bodies)]
+        outputs = [image, self.kept_sources]
         dim = shot.views.count * lists.count.shape[1] * threads
-        wp.launch(kernel_for(resolve_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=[image], **options)
+        wp.launch(kernel_for(resolve_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Tone
@@ -11,6 +12,7 @@ from synpick_warp.kernels.render.images.camera_effects import EffectParameters, 
 from synpick_warp.kernels.render.images.postprocess import (
     PostProcessSettings,
     filter_lens_rows_kernel,
+    gather_images_kernel,
     postprocess_effects_kernel,
     postprocess_kernel,
 )
@@ -37,8 +39,8 @@ class KeptColors:
 
     color: wp.array = device_array("world_camera", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
-    history_row: wp.array = device_array("view", dtype=wp.int32)
-    """Image of each view of a batch, where no renderer says which."""
+    view: wp.array = device_array("view", dtype=wp.int32)
+    """Index of each view of a batch."""
 
 
 def has_effects(effects: Effects) -> bool:
@@ -60,6 +62,13 @@ def make_effect_ranges(effects: Effects, seed: int) -> Any:
     return result
 
 
+def as_words(images: wp.array) -> wp.array:
+    """View of an array of images as (image, word), in the largest words into which an image can be divided."""
+    size = images.strides[0]
+    dtype, width = next((dtype, width) for dtype, width in ((wp.vec4ui, 16), (wp.uint32, 4), (wp.uint8, 1)) if size % width == 0)
+    return wp.array(ptr=images.ptr, shape=(images.shape[0], size // width), dtype=dtype, device=images.device)
+
+
 class PostProcessor:
     """Turns radiance into sRGB images. Owns its scratch; `process` only launches, so a CUDA graph can capture it."""
 
@@ -74,13 +83,17 @@ class PostProcessor:
             seed: Seed of the bake.
             scene: Constant data.
             views: Largest number of views in a batch.
-            history_row: (view) int32: the kept images of a batch's views; None: there are none.
+            history_row: (view) int32: indices of the kept images of a batch's views; None: nothing is kept.
             kept: Number of images that are kept from frame to frame, for tiles that are not computed anew.
         """
         self.scene = scene
         sizes = {"world_camera": kept, "row": scene.height, "column": scene.width, "view": views}
         images = allocate(KeptColors, sizes, scene.device)
-        self.kept, self.history_row = images.color, images.history_row if history_row is None else history_row
+        self.kept, self.rows = images.color, images.view
+        if kept and history_row is not None:
+            self.rows = history_row
+        else:
+            self.rows.assign(np.arange(views))
         self.effects = make_effect_ranges(effects, seed) if has_effects(effects) else None
         self.settings = PostProcessSettings()
         self.settings.seed = seed
@@ -101,8 +114,12 @@ class PostProcessor:
         """
         scene, count = self.scene, shot.views.count
         if self.effects is None:
-            inputs = [scene.lights, shot, image, self.settings.tone, self.history_row]
-            launch_pixels(postprocess_kernel, count * scene.grid.tiles * int(TILE_PIXELS), inputs, [self.kept, out.color], scene.device)
+            color = self.kept if self.kept.size else out.color
+            self._launch(postprocess_kernel, count, [scene.lights, shot, image, self.settings.tone, self.rows], color)
+            if self.kept.size:
+                kept, written = (as_words(array) for array in (self.kept, out.color))
+                dim = count, kept.shape[1]
+                wp.launch(gather_images_kernel, dim=dim, inputs=[self.rows, kept], outputs=[written], device=scene.device)
             return
         inputs = [self.effects, shot]
         wp.launch(kernel_for(sample_effects_kernel, shot), dim=count, inputs=inputs, outputs=[out.effects], device=scene.device)

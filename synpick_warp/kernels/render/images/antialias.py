@@ -11,10 +11,19 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.bitsets import lowest_bit
+from synpick_warp.kernels.render.images.kept_sources import (
+    SOURCE_BITS,
+    KeptSources,
+    clear_sources,
+    footprint_mask,
+    footprint_shift,
+    footprint_word,
+    recall_sources,
+)
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
-from synpick_warp.kernels.render.lighting.tile_flags import needs
+from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, TileFlags, needs
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
@@ -42,8 +51,6 @@ QUADRANTS = wp.constant(4)
 """Quadrants of a pixel, in the order upper left, upper right, lower left, lower right. Each lies in a different footprint."""
 FOOTPRINT_PIXELS = wp.constant(4)
 """Pixels whose centres are a footprint's corners: upper left, upper right, lower left, lower right."""
-SOURCE_BITS = wp.constant(2)
-"""Bits of a sample in `ShadedImage.resolve`."""
 SOURCE_MASK = wp.constant(wp.uint32(3))
 """The lowest SOURCE_BITS."""
 RANK_BITS, RANK_MASK = wp.constant(8), wp.constant(wp.uint32(0xFF))
@@ -206,13 +213,53 @@ def has_discontinuity(
     )
 
 
-@kernel_of_views
-def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: ShadedImage, lists_inout: FootprintLists):
-    """Find footprints with a geometric discontinuity and visible contrast, and list them.
+@wp.func
+def corner_row(row: int, corner: int) -> int:
+    """Row of the pixel at a corner of a footprint in this row."""
+    return row - 1 + corner // 2
 
-    `count`, which must be 0, receives the numbers of footprints, and `resolve` is cleared to 0 in tiles of SHADE_PASS. Footprint (row,
-    column) has pixel (row, column) as its lower right corner, and only one or two corners at the image border. Launched over view,
-    footprint, in tile order.
+
+@wp.func
+def corner_column(column: int, corner: int) -> int:
+    """Column of the pixel at a corner of a footprint in this column."""
+    return column - 1 + corner % 2
+
+
+@wp.func
+def any_damaged(grid: ImageGrid, flags: TileFlags, view: int, top: int, left: int, bottom: int, right: int) -> bool:
+    """Whether the tile of any corner of a footprint between these rows and columns is damaged."""
+    upper, lower = tile_of(grid, top, left), tile_of(grid, bottom, right)
+    damage = int(flags.dirty[view, upper])
+    if lower != upper:
+        damage = damage | int(flags.dirty[view, lower])
+        damage = damage | int(flags.dirty[view, tile_of(grid, top, right)]) | int(flags.dirty[view, tile_of(grid, bottom, left)])
+    return (damage & DAMAGED) != 0
+
+
+@wp.func
+def place_sources(image: ShadedImage, view: int, row: int, column: int, sources: wp.uint32):
+    """Add the source bits of a footprint to those of its corner pixels, each of which has the samples of a quadrant."""
+    bits = SOURCE_BITS * (image.samples // QUADRANTS)
+    for own in range(FOOTPRINT_PIXELS):
+        shift = wp.uint32(bits * (QUADRANTS - 1 - own))
+        mine = ((sources >> shift) & ((wp.uint32(1) << wp.uint32(bits)) - wp.uint32(1))) << shift
+        if mine != wp.uint32(0):
+            wp.atomic_or(image.resolve, view, corner_row(row, own), corner_column(column, own), mine)
+
+
+@kernel_of_views
+def find_footprints_kernel(
+    footprints: ImageGrid,
+    shot: AnyShot,
+    flags: TileFlags,
+    image_inout: ShadedImage,
+    lists_inout: FootprintLists,
+    kept_inout: KeptSources,
+):
+    """Find footprints with a geometric discontinuity and visible contrast; list them, or place their source bits if these are kept.
+
+    `count`, which must be 0, receives the numbers of listed footprints. Footprint (row, column) has pixel (row, column) as its lower right
+    corner, and only one or two corners at the image border. Launched over view, footprint, in tile order.
     """
     grid = shot.grid
     view, row, column = tile_pixel(footprints, wp.tid())
@@ -225,26 +272,24 @@ def find_footprints_kernel(footprints: ImageGrid, shot: AnyShot, image_inout: Sh
     # All pixels beside those of COLOR_PASS have it.
     if not needs(grid, image_inout.passes, SHADE_PASS, view, bottom, right):
         return
-    if row < grid.height and column < grid.width:
-        image_inout.resolve[view, row, column] = wp.uint32(0)
+    footprint, samples, history = row * footprints.width + column, image_inout.samples, flags.history_row[view]
+    keeps = kept_inout.word.shape[0] > 0
+    unknown = footprint_mask(samples)
+    sources = unknown
+    if keeps:
+        damaged = any_damaged(grid, flags, view, top, left, bottom, right)
+        sources = recall_sources(kept_inout, history, footprint, samples, damaged)
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
-    if has_contrast(image_inout.radiance, view, top, left, bottom, right):
+    if sources != wp.uint32(0) and has_contrast(image_inout.radiance, view, top, left, bottom, right):
+        if sources != unknown:
+            place_sources(image_inout, view, row, column, sources)
+            return
+        if keeps:
+            clear_sources(kept_inout, history, footprint, samples)
         if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
             chunk = tile_of(footprints, row, column) // CHUNK_TILES
             rank = wp.atomic_add(lists_inout.count, view, chunk, 1)
-            lists_inout.footprint[view, chunk, rank] = row * footprints.width + column
-
-
-@wp.func
-def corner_row(row: int, corner: int) -> int:
-    """Row of the pixel at a corner of a footprint in this row."""
-    return row - 1 + corner // 2
-
-
-@wp.func
-def corner_column(column: int, corner: int) -> int:
-    """Column of the pixel at a corner of a footprint in this column."""
-    return column - 1 + corner % 2
+            lists_inout.footprint[view, chunk, rank] = footprint
 
 
 @wp.struct
@@ -385,14 +430,16 @@ def resolve_footprints_kernel(
     footprints: ImageGrid,
     shot: AnyShot,
     lists: FootprintLists,
+    history_row: wp.array[int],  # (view)
     threads: int,
     mask_width: AnyMaskWidth,
     image_inout: ShadedImage,
+    kept_inout: KeptSources,
 ):
     """Trace a coverage ray for each sample in the listed footprints, and select the pixel whose radiance the sample takes.
 
     A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve` receives the
-    samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
+    samples' source bits, and so does `KeptSources`, unless it is empty. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
     neighbouring threads take samples of one footprint, whose rays meet the same bodies. Launched over view, chunk, thread.
     """
     # Unsigned: cheaper to divide.
@@ -424,4 +471,9 @@ def resolve_footprints_kernel(
             # The plane passes through the hit of the sample's ray, not through the pixel's centre.
             plane.height = hit.depth * wp.dot(normal, ray)
             best = select_source(scene.meshes, shot, view, row, column, own, offset, hit, plane)
-            wp.atomic_or(image_inout.resolve, view, r, c, wp.uint32(best ^ own) << wp.uint32(SOURCE_BITS * sample))
+            if best != own:
+                bits, shift = wp.uint32(best ^ own), SOURCE_BITS * sample
+                wp.atomic_or(image_inout.resolve, view, r, c, bits << wp.uint32(shift))
+                if kept_inout.word.shape[0] > 0:
+                    shift += footprint_shift(int(cell), samples)
+                    wp.atomic_or(kept_inout.word, history_row[view], footprint_word(int(cell), samples), bits << wp.uint32(shift))

@@ -1,6 +1,8 @@
 """Post-processing of linear radiance to sRGB bytes: lens, exposure, sensor noise, tone map, sRGB transfer curve, contrast, in this
 order."""
 
+from typing import Any
+
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream, Tone
@@ -24,6 +26,9 @@ from synpick_warp.kernels.render.visibility.gbuffer import COLOR_PASS, AnyShot, 
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+AnyWord = Any
+"""Words in which whole images are copied: `wp.vec4ui`, `wp.uint32` or `wp.uint8`."""
 
 SHOULDER_START = wp.constant(0.6)
 """Tone.SHOULDER is linear below this value, so that colours keep their ratio."""
@@ -63,32 +68,32 @@ def postprocess_kernel(
     shot: AnyShot,
     image: ShadedImage,
     tone: int,
-    history_row: wp.array[int],  # (view)
+    rows: wp.array[int],  # (view)
     first: int,
     # Out:
-    kept_inout: wp.array3d[wp.vec3ub],  # (world_camera, row, column)
-    color_out: wp.array3d[wp.vec3ub],  # (view, row, column)
+    color_inout: wp.array3d[wp.vec3ub],  # (rows, row, column)
 ):
     """Radiance to sRGB without camera effects: exposure (the map's factor times 2 to the episode's exposure value), tone map, transfer.
 
-    `color_out` receives red, green, blue bytes; outside tiles of COLOR_PASS those of the frame before, from `kept_inout`, to which others
-    are added if it is not empty. Launched over view, pixel (tile order, from flat index `first` on).
+    `color_inout` receives red, green, blue bytes of tiles of COLOR_PASS, at the view's index in `rows`. Launched over view, pixel (tile
+    order, from flat index `first` on).
     """
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
-    if not in_image(shot.grid, row, column):
-        return
-    history = history_row[view]
-    if not needs(shot.grid, image.passes, COLOR_PASS, view, row, column):
-        color_out[view, row, column] = kept_inout[history, row, column]
+    if not in_image(shot.grid, row, column) or not needs(shot.grid, image.passes, COLOR_PASS, view, row, column):
         return
     world, snapshot = shot.views.world[view], shot.snapshot
     value = (
         lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world]) * resolve_radiance(image, view, row, column)
     )
     color = wp.vec3ub(encode_display(value[0], tone), encode_display(value[1], tone), encode_display(value[2], tone))
-    color_out[view, row, column] = color
-    if kept_inout.shape[0] > 0:
-        kept_inout[history, row, column] = color
+    color_inout[rows[view], row, column] = color
+
+
+@wp.kernel
+def gather_images_kernel(rows: wp.array[int], images: wp.array2d[AnyWord], images_out: wp.array2d[AnyWord]):
+    """Gather: copy the images at the indices `rows`, as words (image, word). Launched over image, word."""
+    image, word = wp.tid()
+    images_out[image, word] = images[rows[image], word]
 
 
 @wp.func

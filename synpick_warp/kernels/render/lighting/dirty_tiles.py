@@ -10,7 +10,7 @@ from synpick_warp.kernels.bitsets import lowest_bit
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.moving_bodies import MovingBodies
 from synpick_warp.kernels.render.lighting.shadow_filter import FILTER_RADIUS, STEEPNESS_DISTANCE
-from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, tile_corner
+from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, RELIT, TileFlags, tile_corner
 from synpick_warp.kernels.render.lighting.upsampling import RING
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_WIDTH, ImageGrid, clamp_index
 from synpick_warp.kernels.render.visibility.damage import any_flagged
@@ -83,7 +83,7 @@ def mark_damaged_tiles_kernel(bodies: ViewBodies, moving_inout: MovingBodies, fl
             flags_inout.bodies[history, tile, word] = members
         elif not dirty:
             dirty = any_moved(moving_inout, view, word, members)
-    flags_inout.dirty[view, tile] = wp.uint8(dirty)
+    flags_inout.dirty[view, tile] = wp.uint8(wp.where(dirty, DAMAGED, 0))
     if dirty and moving_inout.holds[view] != 0:
         for word in range(flags_inout.bodies.shape[2]):
             touch_bodies(moving_inout, view, word, flags_inout.bodies[history, tile, word])
@@ -100,7 +100,7 @@ def mark_relit_tiles_kernel(coarse: CoarseGrid, shadow_grid: CoarseGrid, shot: A
             dirty = any_near(flags_inout.due, coarse, view, row, column, LIGHT_REACH)
         if not dirty:
             dirty = any_near(flags_inout.shadowed, shadow_grid, view, row, column, SHADOW_REACH)
-        flags_inout.dirty[view, tile] = wp.uint8(dirty)
+        flags_inout.dirty[view, tile] = wp.uint8(wp.where(dirty, RELIT, 0))
 
 
 @wp.func

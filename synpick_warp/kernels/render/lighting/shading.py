@@ -231,7 +231,7 @@ def shade_pixel(
 
 def kernel_of_shading(name: str, samples_per_axis: int, registers: int) -> Any:
     """Kernel of `shade_pixel`. Before, `radiance` holds the visible fractions of lamps at shadow edges, see `filter_shadow_edges_kernel`.
-    Launched over view, pixel (tile order, from flat index `first` on)."""
+    Clears `resolve` for anti-aliasing. Launched over view, pixel (tile order, from flat index `first` on)."""
 
     @kernel_of_views(name=name, cuda_max_registers=registers)
     def shade_pixels_kernel(scene: AnyScene, shot: AnyShot, denoised: DenoisedLight, first: int, image_inout: ShadedImage):
@@ -241,6 +241,7 @@ def kernel_of_shading(name: str, samples_per_axis: int, registers: int) -> Any:
             image_inout.radiance[view, row, column] = shade_pixel(
                 scene, shot, denoised, image_inout, view, row, column, wp.static(samples_per_axis)
             )
+            image_inout.resolve[view, row, column] = wp.uint32(0)
 
     return shade_pixels_kernel
 

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, tangent_p
 from synpick_warp.kernels.render.lighting.shadow_filter import STEEPNESS_BITS, STEEPNESS_LEVELS, LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import all_steepness, filter_edge, find_shadow_taps, pack_fractions
 from synpick_warp.kernels.render.lighting.shadows import is_shadowed, may_change, point_direction, visible_normal
-from synpick_warp.kernels.render.lighting.tile_flags import TileFlags, needs
+from synpick_warp.kernels.render.lighting.tile_flags import RELIT, TileFlags, needs
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, AnyViews, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import EDGE_PASS, SHADE_PASS, AnyShot, Meshes, ShadedImage, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -147,7 +147,7 @@ def list_edge_pixels_kernel(
                     tile = tile_of(shot.grid, row, column)
                     if flags_inout.dirty[view, tile] == wp.uint8(0):
                         if edges_may_change(lights, coarse, shot, moving, steepness, view, row, column):
-                            flags_inout.dirty[view, tile] = wp.uint8(1)
+                            flags_inout.dirty[view, tile] = wp.uint8(RELIT)
                     rank = wp.atomic_add(lists_inout.count, view, chunk, PIXELS, 1)
                     lists_inout.pixel[view, chunk, rank] = wp.uint16(index)
 

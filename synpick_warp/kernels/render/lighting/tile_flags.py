@@ -10,6 +10,9 @@ RATIO_STAGE, CHOICE_STAGE, BLOCK_STAGE, LIGHT_STAGE = wp.constant(1), wp.constan
 """Bits of the stages that a tile of coarse pixels needs in a frame: its ratios, its choice of kernels, its block means, its light."""
 ALL_STAGES = int(RATIO_STAGE) | int(CHOICE_STAGE) | int(BLOCK_STAGE) | int(LIGHT_STAGE)
 
+DAMAGED, RELIT = wp.constant(1), wp.constant(2)
+"""Values of a dirty tile: its bodies changed; only its light or shadows did."""
+
 
 @wp.struct
 class TileFlags:
@@ -24,7 +27,7 @@ class TileFlags:
     shadowed: wp.array2d[wp.uint8]
     """(view, shadow_tile): 1: a shadow ray of the tile's pixels of the shadow grid changed."""
     dirty: wp.array2d[wp.uint8]
-    """(view, tile): 1: a pixel of the tile may have changed."""
+    """(view, tile): DAMAGED or RELIT: a pixel of the tile may have changed."""
     bodies: wp.array3d[wp.uint64]
     """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
 
