@@ -37,8 +37,8 @@ WORLDS = MIN_GPU_WORLDS + 1
 NAMES = (
     "WorldState AttemptState SealState LastFrame Observation Plan WorldStatus Snapshot ViewBuffers ViewBodies GBuffer ShadedImage "
     "BoundaryBuffers BoundaryScratch Guide CoarseLight RatioImages LampShadows ShadowRays EdgeLists FootprintLists VisibilityBuffer "
-    "CameraTable BorderBoxes BorderCounts KeptMasks Damage KeptColors LightHistory MovingBodies PathLists PathQueues DepthBuffers "
-    "DepthScratch SlotSums TileFlags"
+    "CameraTable BorderBoxes BorderCounts KeptMasks Damage KeptColors KeptSources LightHistory MovingBodies PathLists PathQueues "
+    "DepthBuffers DepthScratch SlotSums TileFlags"
 )
 BASE = set(NAMES.split())
 """Declarations of which every bake has arrays."""

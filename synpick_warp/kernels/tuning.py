@@ -39,6 +39,9 @@ TRIANGLE_THREADS = 4096
 Rasterizing triangles takes 0.10 of the 0.18 ms of a view's G-buffer."""
 BLOCK_THREADS = 16384
 """Threads that share a view's blocks of large triangles in the rasterizer (0.015 ms of a view)."""
+RUN_BANDS = 8
+"""Bands of rows of a column of segmentation ids, each of which a thread searches for run boundaries: without them, a batch of 25 full-HD
+views has 48,000 threads, where an H200 holds 270,000."""
 RUN_LANES = 32
 """Lanes that share the columns of an amodal mask when its runs are listed: a warp."""
 RESTORE_THREADS, KEEP_THREADS = 256, 4096

@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.images.antialias import (
     find_footprints_kernel,
     resolve_footprints_kernel,
 )
-from synpick_warp.kernels.render.images.kept_sources import WORD_SAMPLES, KeptSources
+from synpick_warp.kernels.render.images.kept_sources import WORD_SAMPLES, KeptSources, forget_sources_kernel
 from synpick_warp.kernels.render.lighting import denoise as denoising
 from synpick_warp.kernels.render.lighting import shadow_edges
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
@@ -36,7 +36,7 @@ from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows, filt
 from synpick_warp.kernels.render.lighting.shadows import ShadowRays, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.tile_flags import ALL_STAGES, TileFlags
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS
 from synpick_warp.kernels.render.visibility.damage import Damage
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_EDGE_THREADS, CPU_FOOTPRINT_THREADS, EDGE_THREADS, FOOTPRINT_THREADS, PIXEL_BLOCK, VIEW_BLOCK
@@ -424,7 +424,10 @@ class DenoisedRenderer:
         lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
         options: dict[str, Any] = {"device": device, "block_dim": PIXEL_BLOCK}
-        inputs, outputs = [self.footprints, shot, self.flags], [image, lists, self.kept_sources]
+        if self.kept_sources.word.size:
+            dim, inputs = (shot.views.count, shot.grid.tiles, int(TILE_HEIGHT) + 1), [shot.grid, self.flags, self.coverage_rays]
+            wp.launch(forget_sources_kernel, dim=dim, inputs=inputs, outputs=[self.kept_sources], **options)
+        inputs, outputs = [self.footprints, shot, self.flags.history_row], [image, lists, self.kept_sources]
         dim = shot.views.count * self.footprints.tiles * int(TILE_PIXELS)
         wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
         threads = FOOTPRINT_THREADS if device.is_cuda else CPU_FOOTPRINT_THREADS

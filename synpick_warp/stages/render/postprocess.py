@@ -64,7 +64,7 @@ def make_effect_ranges(effects: Effects, seed: int) -> Any:
 
 def as_words(images: wp.array) -> wp.array:
     """View of an array of images as (image, word), in the largest words into which an image can be divided."""
-    size = images.strides[0]
+    size = images.shape[1] * images.shape[2] * wp.types.type_size_in_bytes(images.dtype)
     dtype, width = next((dtype, width) for dtype, width in ((wp.vec4ui, 16), (wp.uint32, 4), (wp.uint8, 1)) if size % width == 0)
     return wp.array(ptr=images.ptr, shape=(images.shape[0], size // width), dtype=dtype, device=images.device)
 

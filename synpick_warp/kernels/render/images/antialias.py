@@ -18,12 +18,12 @@ from synpick_warp.kernels.render.images.kept_sources import (
     footprint_mask,
     footprint_shift,
     footprint_word,
-    recall_sources,
+    read_sources,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
-from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, TileFlags, needs
+from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, no_hit, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, clamp_index, in_image, loop_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
@@ -226,17 +226,6 @@ def corner_column(column: int, corner: int) -> int:
 
 
 @wp.func
-def any_damaged(grid: ImageGrid, flags: TileFlags, view: int, top: int, left: int, bottom: int, right: int) -> bool:
-    """Whether the tile of any corner of a footprint between these rows and columns is damaged."""
-    upper, lower = tile_of(grid, top, left), tile_of(grid, bottom, right)
-    damage = int(flags.dirty[view, upper])
-    if lower != upper:
-        damage = damage | int(flags.dirty[view, lower])
-        damage = damage | int(flags.dirty[view, tile_of(grid, top, right)]) | int(flags.dirty[view, tile_of(grid, bottom, left)])
-    return (damage & DAMAGED) != 0
-
-
-@wp.func
 def place_sources(image: ShadedImage, view: int, row: int, column: int, sources: wp.uint32):
     """Add the source bits of a footprint to those of its corner pixels, each of which has the samples of a quadrant."""
     bits = SOURCE_BITS * (image.samples // QUADRANTS)
@@ -249,9 +238,12 @@ def place_sources(image: ShadedImage, view: int, row: int, column: int, sources:
 
 @kernel_of_views
 def find_footprints_kernel(
+    # Scene:
     footprints: ImageGrid,
+    # In:
     shot: AnyShot,
-    flags: TileFlags,
+    history_row: wp.array[int],  # (view)
+    # Out:
     image_inout: ShadedImage,
     lists_inout: FootprintLists,
     kept_inout: KeptSources,
@@ -272,24 +264,21 @@ def find_footprints_kernel(
     # All pixels beside those of COLOR_PASS have it.
     if not needs(grid, image_inout.passes, SHADE_PASS, view, bottom, right):
         return
-    footprint, samples, history = row * footprints.width + column, image_inout.samples, flags.history_row[view]
-    keeps = kept_inout.word.shape[0] > 0
-    unknown = footprint_mask(samples)
-    sources = unknown
-    if keeps:
-        damaged = any_damaged(grid, flags, view, top, left, bottom, right)
-        sources = recall_sources(kept_inout, history, footprint, samples, damaged)
     # First the contrast: most footprints have none, and this test costs a fifth of the other.
-    if sources != wp.uint32(0) and has_contrast(image_inout.radiance, view, top, left, bottom, right):
-        if sources != unknown:
+    if not has_contrast(image_inout.radiance, view, top, left, bottom, right):
+        return
+    footprint = row * footprints.width + column
+    if kept_inout.word.shape[0] > 0:
+        history, samples = history_row[view], image_inout.samples
+        sources = read_sources(kept_inout, history, footprint, samples)
+        if sources != footprint_mask(samples):
             place_sources(image_inout, view, row, column, sources)
             return
-        if keeps:
-            clear_sources(kept_inout, history, footprint, samples)
-        if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
-            chunk = tile_of(footprints, row, column) // CHUNK_TILES
-            rank = wp.atomic_add(lists_inout.count, view, chunk, 1)
-            lists_inout.footprint[view, chunk, rank] = footprint
+        clear_sources(kept_inout, history, footprint, samples)
+    if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
+        chunk = tile_of(footprints, row, column) // CHUNK_TILES
+        rank = wp.atomic_add(lists_inout.count, view, chunk, 1)
+        lists_inout.footprint[view, chunk, rank] = footprint
 
 
 @wp.struct
@@ -426,21 +415,25 @@ def select_source(
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
 def resolve_footprints_kernel(
+    # Scene:
     scene: PathScene,
     footprints: ImageGrid,
+    # In:
     shot: AnyShot,
     lists: FootprintLists,
     history_row: wp.array[int],  # (view)
     threads: int,
     mask_width: AnyMaskWidth,
+    # Out:
     image_inout: ShadedImage,
     kept_inout: KeptSources,
 ):
     """Trace a coverage ray for each sample in the listed footprints, and select the pixel whose radiance the sample takes.
 
     A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve` receives the
-    samples' source bits, and so does `KeptSources`, unless it is empty. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
-    neighbouring threads take samples of one footprint, whose rays meet the same bodies. Launched over view, chunk, thread.
+    samples' source bits, and so does `KeptSources`, unless it is empty. The host does not read the counts, so a fixed number of `threads`
+    strides over the samples of a chunk; neighbouring threads take samples of one footprint, whose rays meet the same bodies. Launched over
+    view, chunk, thread.
     """
     # Unsigned: cheaper to divide.
     thread = wp.uint32(wp.tid())

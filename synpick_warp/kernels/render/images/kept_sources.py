@@ -2,6 +2,9 @@
 
 import warp as wp
 
+from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, TileFlags, tile_corner
+from synpick_warp.kernels.render.visibility.camera import TILE_WIDTH, ImageGrid
+
 wp.set_module_options({"enable_backward": False})
 
 SOURCE_BITS = wp.constant(2)
@@ -38,15 +41,10 @@ def footprint_shift(footprint: int, samples: int) -> int:
 
 
 @wp.func
-def recall_sources(kept: KeptSources, history: int, footprint: int, samples: int, damaged: bool) -> wp.uint32:
-    """Source bits of a footprint, all 1 if they are unknown; those of a `damaged` footprint are forgotten."""
-    mask = footprint_mask(samples)
-    word, shift = footprint_word(footprint, samples), wp.uint32(footprint_shift(footprint, samples))
-    sources = (kept.word[history, word] >> shift) & mask
-    if damaged and sources != mask:
-        sources = mask
-        wp.atomic_or(kept.word, history, word, mask << shift)
-    return sources
+def read_sources(kept: KeptSources, history: int, footprint: int, samples: int) -> wp.uint32:
+    """Source bits of a footprint, all 1 if they are unknown."""
+    shift = wp.uint32(footprint_shift(footprint, samples))
+    return (kept.word[history, footprint_word(footprint, samples)] >> shift) & footprint_mask(samples)
 
 
 @wp.func
@@ -54,3 +52,24 @@ def clear_sources(kept: KeptSources, history: int, footprint: int, samples: int)
     """Set the source bits of a footprint to 0: each sample takes the radiance of its own pixel."""
     bits = footprint_mask(samples) << wp.uint32(footprint_shift(footprint, samples))
     wp.atomic_and(kept.word, history, footprint_word(footprint, samples), ~bits)
+
+
+@wp.kernel
+def forget_sources_kernel(grid: ImageGrid, flags: TileFlags, samples: int, kept_inout: KeptSources):
+    """Set the source bits of all footprints that have a corner in a damaged tile to unknown.
+
+    The pixels of a tile are corners of one footprint more in each direction; in a row, their bits are consecutive. Launched over view,
+    tile, row of footprints.
+    """
+    view, tile, down = wp.tid()
+    if (int(flags.dirty[view, tile]) & DAMAGED) == 0:
+        return
+    top, left = tile_corner(grid, tile)
+    history, share, width = flags.history_row[view], WORD_SAMPLES // samples, SOURCE_BITS * samples
+    first = wp.min(top + down, grid.height) * (grid.width + 1) + left
+    last = first + wp.min(TILE_WIDTH, grid.width - left)
+    for word in range(first // share, last // share + 1):
+        begin, end = wp.max(first - word * share, 0), wp.min(last - word * share + 1, share)
+        bits = (wp.uint32(0xFFFFFFFF) >> wp.uint32(32 - width * (end - begin))) << wp.uint32(width * begin)
+        if (kept_inout.word[history, word] & bits) != bits:
+            wp.atomic_or(kept_inout.word, history, word, bits)

@@ -32,10 +32,12 @@ class Boundaries:
 
 @wp.struct
 class BoundaryCounts:
-    """Run boundaries of each column of the ids, and of each lane of a mask. Scratch between the two passes."""
+    """Run boundaries of each column of the ids and of each of its bands, and of each lane of a mask. Scratch between the two passes."""
 
     column_count: wp.array2d[int]
     """(view, column)."""
+    band_count: wp.array3d[int]
+    """(view, band, column): a band is a range of rows."""
     lane_count: wp.array3d[int]
     """(view, instance, lane)."""
 
@@ -48,26 +50,36 @@ def read_id(instance_image: wp.array3d[wp.uint8], view: int, row: int, column: i
     return wp.uint32(instance_image[view, row, column])
 
 
+@wp.func
+def band_rows(rows: int, bands: int) -> int:
+    """Rows of a band, where an image of `rows` rows, and the one below it, is divided into `bands`."""
+    return rows // bands + 1
+
+
 @wp.kernel
 def count_boundaries_kernel(
     # In:
     instance_image: wp.array3d[wp.uint8],  # (view, row, column)
     # Out:
-    counts_out: BoundaryCounts,
+    counts_inout: BoundaryCounts,
 ):
-    """Count run boundaries per column: rows, from the first to the one below the image, whose id differs from the row above.
+    """Count run boundaries per column and band: rows, from the first to the one below the image, whose id differs from the row above.
 
-    First pass of a stream compaction, whose counts `list_boundaries_kernel` sums to offsets. Launched over view, column.
+    First pass of a stream compaction, whose counts `list_boundaries_kernel` sums to offsets. `column_count`, which must be 0, is increased.
+    Launched over view, band, column.
     """
-    view, column = wp.tid()
+    view, band, column = wp.tid()
+    rows = instance_image.shape[1]
+    share = band_rows(rows, counts_inout.band_count.shape[1])
     count = int(0)
-    above = wp.uint32(0)
-    for row in range(instance_image.shape[1] + 1):
+    above = read_id(instance_image, view, band * share - 1, column)
+    for row in range(band * share, wp.min((band + 1) * share, rows + 1)):
         below = read_id(instance_image, view, row, column)
         if below != above:
             count += 1
         above = below
-    counts_out.column_count[view, column] = count
+    counts_inout.band_count[view, band, column] = count
+    wp.atomic_add(counts_inout.column_count, view, column, count)
 
 
 @wp.kernel
@@ -80,15 +92,18 @@ def list_boundaries_kernel(
 ):
     """Write the run boundaries of the segmentation ids as a list sorted by column, then row: second pass of a stream compaction.
 
-    Launched over view, column.
+    Launched over view, band, column.
     """
-    view, column = wp.tid()
-    rows = instance_image.shape[1]
+    view, band, column = wp.tid()
+    rows, bands = instance_image.shape[1], counts.band_count.shape[1]
     index = int(0)
     for before in range(column):
         index += counts.column_count[view, before]
-    above = wp.uint32(0)
-    for row in range(rows + 1):
+    for before in range(band):
+        index += counts.band_count[view, before, column]
+    share = band_rows(rows, bands)
+    above = read_id(instance_image, view, band * share - 1, column)
+    for row in range(band * share, wp.min((band + 1) * share, rows + 1)):
         below = read_id(instance_image, view, row, column)
         if below != above:
             if index < runs_out.boundaries.shape[2]:
@@ -96,7 +111,7 @@ def list_boundaries_kernel(
                 runs_out.boundaries[view, 1, index] = above | (below << BELOW_SHIFT)
             index += 1
         above = below
-    if column == counts.column_count.shape[1] - 1:
+    if column == counts.column_count.shape[1] - 1 and band == bands - 1:
         runs_out.boundary_count[view] = index
 
 

@@ -90,8 +90,14 @@ def postprocess_kernel(
 
 
 @wp.kernel
-def gather_images_kernel(rows: wp.array[int], images: wp.array2d[AnyWord], images_out: wp.array2d[AnyWord]):
-    """Gather: copy the images at the indices `rows`, as words (image, word). Launched over image, word."""
+def gather_images_kernel(
+    # In:
+    rows: wp.array[int],  # (image)
+    images: wp.array2d[AnyWord],  # (row, word)
+    # Out:
+    images_out: wp.array2d[AnyWord],  # (image, word)
+):
+    """Gather: copy the images at the indices `rows`. Launched over image, word."""
     image, word = wp.tid()
     images_out[image, word] = images[rows[image], word]
 
