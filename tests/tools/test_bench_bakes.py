@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import subprocess
-from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -205,42 +204,6 @@ def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
 
 
 # ---- growth ----
-
-
-def test_each_factor_changes_its_setting_alone():
-    config = bench.Config()
-    varied = {factor: scaling.vary(config, factor, factor == "paths" or 0.5) for factor in scaling.FACTORS}
-    assert varied["objects"][0] == "3.5 l"
-    assert varied["resolution"][0] == "960x540"
-    assert varied["paths"][0] == "1"
-    changed = {
-        "objects": ("arrangement", "volume", 3.5e-3),
-        "resolution": ("cameras", "resolution", (960, 540)),
-        "paths": ("render", "coarse_paths", 1),
-    }
-    for factor, (section, name, value) in changed.items():
-        assert varied[factor][1] == replace(config, **{section: replace(getattr(config, section), **{name: value})})
-
-
-def test_more_cameras_are_turned_about_the_vertical():
-    cameras = replace(bench.Config().cameras, positions=((1.0, 2.0, 3.0), (0.0, 0.0, 2.0)), ups=((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
-    value, varied = scaling.vary(replace(bench.Config(), cameras=cameras), "cameras", 1.5)
-    assert value == "3"
-    assert varied.cameras.positions == ((1.0, 2.0, 3.0), (0.0, 0.0, 2.0), (-1.0, -2.0, 3.0))
-    assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
-@pytest.mark.slow
-def test_growth_has_rows_of_all_factors(tmp_path, monkeypatch):
-    monkeypatch.setattr(scaling, "DROP_TICKS", 1)
-    monkeypatch.setattr(run, "BURST", 1)
-    factors = {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "paths": (4,), "cameras": (2.0,)}
-    monkeypatch.setattr(scaling, "FACTORS", factors)
-    monkeypatch.setattr(run, "MIN_REPEATS", 1)
-    names = list(bench_rows(tmp_path, "--parts", "growth", "--seconds", "0"))
-    wanted = ["as set", "worlds 1", "objects 0.5 l", "resolution 16x9", "paths 4", "cameras 6"]
-    assert [name for name in names if name.endswith("a view")] == [f"{point}: a view" for point in wanted]
-    assert [name for name in names if name.endswith("world-steps")] == [f"{point}: world-steps" for point in wanted[:3]]
 
 
 def test_growth_by_instances_has_rows_of_each_number(tmp_path, monkeypatch):

@@ -27,7 +27,7 @@ from tools.bench.online import measure_environment
 from tools.bench.peers import PEERS, check_installed, measure_peers
 from tools.bench.pictures import measure_pictures
 from tools.bench.run import Bench
-from tools.bench.scaling import measure_growth, measure_heaps, measure_patches
+from tools.bench.scaling import measure_growth, measure_patches
 from tools.bench.worlds import measure_worlds
 from tools.figures import describe_run, write_run
 
@@ -39,7 +39,6 @@ OWN_PARTS: Mapping[str, Callable[[Bench], Iterator[command_line.MeasuredRow]]] =
     "trajectories": measure_trajectories,
     "growth": measure_growth,
     "patches": measure_patches,
-    "heaps": measure_heaps,
     "environment": measure_environment,
 }
 """Parts that build worlds of their own, in the order in which they are measured."""

@@ -144,6 +144,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     tile_pixels = int(TILE_PIXELS) * shadow**2
     edge_tiles = min(int(EDGE_CHUNK_TILES), shadow_edges.MAX_CHUNK_PIXELS // tile_pixels)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
+    samples = (width + 1) * (height + 1) * coverage_rays(render, width, histories)
     columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
     return {
         "cell_row": rows,
@@ -160,6 +161,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
         "chunk_pixel": edge_tiles * tile_pixels,
         "edge_counter": 2,
         "chunk": chunks,
+        "source_word": -(-samples // int(WORD_SAMPLES)) if render.antialias else 0,
         "chunk_footprint": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
 
@@ -267,13 +269,12 @@ class DenoisedRenderer:
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
         sizes["cell_tile"], sizes["shadow_tile"] = self.coarse.grid.tiles, self.shadow_grid.grid.tiles
-        self.flags = allocate_struct(TILE_FLAGS, sizes if self.reuses else sizes | {"world_camera": 0}, scene.device)
+        kept = sizes if self.reuses else sizes | {"world_camera": 0}
+        self.flags = allocate_struct(TILE_FLAGS, kept, scene.device)
         self.flags.stages.fill_(ALL_STAGES)
         self.flags.history_row.assign(np.arange(views))
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
-        words = -(-(scene.width + 1) * (scene.height + 1) * self.coverage_rays // int(WORD_SAMPLES))
-        kept = {"world_camera": histories if self.reuses and self.antialias else 0, "source_word": words}
         self.kept_sources = allocate_struct(KEPT_SOURCES, kept, scene.device)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
