@@ -12,8 +12,6 @@ from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import (
     CHUNK_TILES,
     FootprintLists,
-    MultiWordMask,
-    SingleWordMask,
     find_footprints_kernel,
     resolve_footprints_kernel,
 )
@@ -432,7 +430,7 @@ class DenoisedRenderer:
         dim = shot.views.count * self.footprints.tiles * int(TILE_PIXELS)
         wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
         threads = FOOTPRINT_THREADS if device.is_cuda else CPU_FOOTPRINT_THREADS
-        inputs = [self.scene.plain, self.footprints, shot, lists, self.flags.history_row, threads, mask_width_of(shot.bodies)]
+        inputs = [self.scene.plain, self.footprints, shot, lists, self.flags.history_row, threads]
         outputs = [image, self.kept_sources]
         dim = shot.views.count * lists.count.shape[1] * threads
         wp.launch(kernel_for(resolve_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
@@ -440,10 +438,3 @@ class DenoisedRenderer:
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""
         launch_pixels(kernel, views.count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)
-
-
-def mask_width_of(bodies: Any) -> Any:
-    """Tag that selects the kernel for the number of words of `ViewBodies.body_mask`."""
-    width = SingleWordMask() if bodies.body_mask.shape[2] == 1 else MultiWordMask()
-    width.words = bodies.body_mask.shape[2]
-    return width

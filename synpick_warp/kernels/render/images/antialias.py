@@ -5,8 +5,6 @@ the whole footprint. Where they do not, coverage rays within the footprint find 
 whichever of the four pixels shows that surface; so a ray costs no shading. Textures are filtered already.
 """
 
-from typing import Any
-
 import warp as wp
 
 from synpick_warp.codes import Segment
@@ -40,10 +38,8 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     segment_of,
     triangle_normal,
 )
-from synpick_warp.kernels.render.visibility.variants import VARIANTS, kernel_of_views, variant_of
+from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.tuning import RAY_REGISTERS
-
-AnyMaskWidth = Any
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -281,47 +277,6 @@ def find_footprints_kernel(
         lists_inout.footprint[view, chunk, rank] = footprint
 
 
-@wp.struct
-class SingleWordMask:
-    """Compile-time tag: at most 63 bodies, in one word of `ViewBodies.body_mask`, so that no bit shift reaches 64."""
-
-    words: int
-
-
-MultiWordMask = variant_of(SingleWordMask, "MultiWordMask")
-"""Compile-time tag: more bodies, in several words of `ViewBodies.body_mask`."""
-VARIANTS["mask_width"] = SingleWordMask, MultiWordMask
-
-
-@wp.func
-def visible_bodies(shot: AnyShot, view: int, row: int, column: int) -> wp.uint64:
-    """Bit mask, by body index, of the bodies that a footprint's corners show, if there are at most 64."""
-    mask = wp.uint64(0)
-    for corner in range(FOOTPRINT_PIXELS):
-        # Clamped, a corner outside the image is another corner within it.
-        r = clamp_index(corner_row(row, corner), shot.grid.height)
-        c = clamp_index(corner_column(column, corner), shot.grid.width)
-        segment = int(shot.gbuffer.segment[view, r, c])
-        if segment != Segment.NOTHING and segment != Segment.TABLE:
-            mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, shot.views.instances)))
-    return mask
-
-
-@wp.func
-def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint64) -> wp.uint64:
-    """Keep those bodies of a tile's mask (bits by rank, see `ViewBodies.order`) that are in `visible` (bits by body index)."""
-    body_mask = bodies.body_mask[view, tile, 0]
-    result = wp.uint64(0)
-    rank = int(0)
-    while (body_mask >> wp.uint64(rank)) != wp.uint64(0):
-        bit = wp.uint64(1) << wp.uint64(rank)
-        if (body_mask & bit) != wp.uint64(0):
-            if ((visible >> wp.uint64(bodies.order[view, rank])) & wp.uint64(1)) != wp.uint64(0):
-                result = result | bit
-        rank += 1
-    return result
-
-
 @wp.func
 def visible_segments(shot: AnyShot, view: int, row: int, column: int) -> wp.vec4i:
     """Segmentation ids at a footprint's corners; a corner outside the image has that of another."""
@@ -333,12 +288,12 @@ def visible_segments(shot: AnyShot, view: int, row: int, column: int) -> wp.vec4
 
 
 @wp.func
-def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: wp.vec4i, instances: int) -> tuple[wp.uint32, int]:
-    """Find the bodies of a tile's mask of `words` words whose segmentation id is one of the four. Returns their ranks (places in
+def find_ranks(bodies: ViewBodies, view: int, tile: int, segments: wp.vec4i, instances: int) -> tuple[wp.uint32, int]:
+    """Find the bodies of a tile's mask whose segmentation id is one of the four. Returns their ranks (places in
     `ViewBodies.order`), ascending, packed in RANK_BITS each from the lowest bits on, and their number."""
     ranks = wp.uint32(0)
     found = int(0)
-    for word in range(words):
+    for word in range(bodies.body_mask.shape[2]):
         left = bodies.body_mask[view, tile, word]
         while left != wp.uint64(0):
             rank = word * MASK_BITS + lowest_bit(left)
@@ -351,24 +306,13 @@ def find_ranks(bodies: ViewBodies, view: int, tile: int, words: int, segments: w
 
 
 @wp.func
-def trace_visible(
-    mask_width: SingleWordMask, meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3
-) -> Hit:
-    """Closest hit of a coverage ray among the bodies that its footprint's corners show."""
-    body_mask = filter_body_mask(shot.bodies, view, tile, visible_bodies(shot, view, row, column))
-    return trace_bodies(meshes, shot.bodies, view, 0, body_mask, ray, shot.views.instances, no_hit())
-
-
-@wp.func
-def trace_visible(  # noqa: F811
-    mask_width: MultiWordMask, meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3
-) -> Hit:
+def trace_visible(meshes: Meshes, shot: AnyShot, view: int, row: int, column: int, tile: int, ray: wp.vec3) -> Hit:
     """Closest hit of a coverage ray among the bodies that its footprint's corners show, at most four.
 
     All are found before the first is traced, so that rays of a warp traverse BVHs at the same time.
     """
     instances = shot.views.instances
-    ranks, found = find_ranks(shot.bodies, view, tile, mask_width.words, visible_segments(shot, view, row, column), instances)
+    ranks, found = find_ranks(shot.bodies, view, tile, visible_segments(shot, view, row, column), instances)
     hit = no_hit()
     for index in range(found):
         rank = int((ranks >> wp.uint32(RANK_BITS * index)) & RANK_MASK)
@@ -423,7 +367,6 @@ def resolve_footprints_kernel(
     lists: FootprintLists,
     history_row: wp.array[int],  # (view)
     threads: int,
-    mask_width: AnyMaskWidth,
     # Out:
     image_inout: ShadedImage,
     kept_inout: KeptSources,
@@ -455,7 +398,7 @@ def resolve_footprints_kernel(
         if in_image(shot.grid, r, c):
             offset = sample_offset(sample, samples)
             ray = loop_ray(cameras, intrinsics, view, r, c, offset)
-            hit = trace_visible(mask_width, scene.meshes, shot, view, row, column, tile_of(shot.grid, r, c), ray)
+            hit = trace_visible(scene.meshes, shot, view, row, column, tile_of(shot.grid, r, c), ray)
             hit = hit_table(scene.table, cameras, view, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
