@@ -31,13 +31,25 @@ def copied(picked_set, monkeypatch) -> None:
     monkeypatch.setattr(proof, "bake_episodes", bake)
 
 
-def test_a_data_set_proves_itself(picked_set):
+def test_a_data_set_proves_itself_and_says_so(copy):
     with boxes():
-        found = run("prove", picked_set, "--share", 1.0)
+        found = run("prove", copy, "--share", 1.0)
     assert found.code == 0
     last = found.out.splitlines()[-1]
     assert last.startswith("2 episodes baked again, ")
     assert last.endswith(" files compared: all are equal")
+    (line,) = (copy / proof.PROOFS_FILE).read_text().splitlines()
+    assert line.endswith(f"{last.split(', ')[1].split(' files')[0]} files are those of a new bake of episodes 0, 1")
+    assert run("verify", copy).code == 0
+
+
+def test_proofs_are_listed_where_the_folder_can_be_written(copy, copied):
+    (copy / proof.PROOFS_FILE).mkdir()
+    assert "not recorded: cannot write" in run("prove", copy).out.splitlines()[-1]
+    (copy / proof.PROOFS_FILE).rmdir()
+    for _ in range(2):
+        assert run("prove", copy).code == 0
+    assert len((copy / proof.PROOFS_FILE).read_text().splitlines()) == 2
 
 
 def test_a_seed_draws_at_least_one_episode(picked_set, copied):

@@ -1,15 +1,18 @@
 """Proof of a data set by replication: a random share of its episodes is baked again from the recorded settings, and compared by bytes.
 
-On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently.
+On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently. A proof without a
+difference leaves a line in PROOFS_FILE of the data set: what was proved, when, by which version and device.
 """
 
 import math
 import random
 import tempfile
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from synpick_warp._version import __version__
 from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,
     MANIFEST_FILE,
@@ -23,13 +26,20 @@ from synpick_warp.dataset.commit.manifest import (
 )
 from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.exporters.writing.files import output_errors, write_atomically
 from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress
+
+PROOFS_FILE = "proofs.md"
+"""List of the proofs of a data set, beside its manifest; it has no checksum."""
 
 
 class Proof(NamedTuple):
-    """Result of a proof: episodes that were baked again, their files, and the first difference (empty: none)."""
+    """Result of a proof: device, episodes that were baked again, their files, and the first difference (empty: none)."""
 
+    device: str
+    """Name of the device that baked."""
     episodes: list[int]
     files: int
     """Number of compared files, of these episodes and of the constants."""
@@ -60,23 +70,32 @@ def prove(folder: Path, share: float, seed: int, progress: Progress, device: str
             raise type(error)(str(error).replace(str(again), str(folder))) from error
         if summary.stopped:
             raise DatasetError(f"the proof of {folder} was interrupted: nothing was compared")
-        return _compare(folder, again, drawn)
+        return Proof(pick_device(config.bake.device).name, drawn, *_compare(folder, again, drawn))
 
 
-def _compare(folder: Path, again: Path, episodes: list[int]) -> Proof:
-    """Compare constants and episodes of two data sets, up to the first difference."""
+def record_proof(folder: Path, proof: Proof) -> None:
+    """Add a line on a proof without a difference to the data set's list. Raises OutputError: it cannot be written."""
+    path, episodes = folder / PROOFS_FILE, ", ".join(map(str, proof.episodes))
+    line = f"- {datetime.now(UTC):%Y-%m-%d}, synpick-warp {__version__}, {proof.device}: {proof.files:,} files are those of a new bake of"
+    with output_errors(path):
+        before = path.read_bytes() if path.exists() else b""
+        write_atomically(path, before + f"{line} episodes {episodes}\n".encode())
+
+
+def _compare(folder: Path, again: Path, episodes: list[int]) -> tuple[int, str]:
+    """Compare constants and episodes of two data sets, up to the first difference: number of files, and the difference."""
     files = 0
     for entry in (CONSTANTS, *map(episode_entry, episodes)):
         then, now = (read_checksums(each, entry) for each in (folder, again))
         for name in sorted(then | now):
             files += 1
             if then.get(name) != now.get(name):
-                return Proof(episodes, files, _describe(folder, again, name, then))
+                return files, _describe(folder, again, name, then)
         if problem := check_files(folder, then).problem:  # The records are equal; the files may have changed since.
-            return Proof(episodes, files, problem)
+            return files, problem
         if (folder / f"{entry}.json").read_bytes() != (again / f"{entry}.json").read_bytes():
-            return Proof(episodes, files, f"{folder / entry}.json differs from that of a new bake, but no file that it lists")
-    return Proof(episodes, files, "")
+            return files, f"{folder / entry}.json differs from that of a new bake, but no file that it lists"
+    return files, ""
 
 
 def _describe(folder: Path, again: Path, name: str, recorded: Mapping[str, str]) -> str:

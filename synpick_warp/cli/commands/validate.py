@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.folders import find_data_set
 from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, DataSetArgument, WholeNumber, check_range, one_line
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, OutputError
 from synpick_warp.system.inputs.urls import store_url
 
 if TYPE_CHECKING:
@@ -179,6 +179,8 @@ def prove(
 ) -> int:
     """Bake a share of a data set's episodes again, in a temporary folder, and compare their files byte by byte.
 
+    If all are equal, a line in proofs.md of the data set says so, with date, version and device.
+
     Exit codes: 0, all are equal; 1, a file differs (it is named); 2, it cannot be compared here, as with other versions or objects.
     """
     if not 0.0 < share <= 1.0:
@@ -186,6 +188,7 @@ def prove(
     check_range("--seed", seed, 0, _MAX_SAMPLE)
     place = find_data_set(folder, "synpick-warp prove DIR")
     from synpick_warp.apps.validation.proof import prove as bake_again
+    from synpick_warp.apps.validation.proof import record_proof
     from synpick_warp.cli.display import make_console, make_progress
 
     with make_progress(make_console()) as progress:
@@ -195,4 +198,8 @@ def prove(
         print(proof.problem)
         return EXIT_VIOLATIONS
     print(f"{episodes} baked again, {proof.files:,} files compared: all are equal")
+    try:
+        record_proof(place, proof)
+    except OutputError as error:
+        print(f"not recorded: {error}")
     return 0
