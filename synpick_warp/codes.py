@@ -299,6 +299,7 @@ def column_names(kind: type[enum.IntEnum]) -> Mapping[str, enum.IntEnum]:
     return MappingProxyType({member.name.lower(): member for member in sorted(kind)})
 
 
+@functools.cache
 def names(kind: type[enum.IntEnum]) -> tuple[str, ...]:
     """Lower-case names of an enum's members, in order of their values."""
     return tuple(member.name.lower() for member in sorted(kind))

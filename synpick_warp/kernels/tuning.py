@@ -42,8 +42,8 @@ BLOCK_THREADS = 16384
 RUN_BANDS = 8
 """Bands of rows of a column of segmentation ids, each of which a thread searches for run boundaries: without them, a batch of 25 full-HD
 views has 48,000 threads, where an H200 holds 270,000."""
-RUN_LANES = 32
-"""Lanes that share the columns of an amodal mask when its runs are listed: a warp."""
+RUN_LANES = 128
+"""Lanes that share the columns of an amodal mask when its runs are listed."""
 RESTORE_THREADS, KEEP_THREADS = 256, 4096
 """Threads that copy the words of a mask from the previous frame, or clear them, some 3,000; and that keep those of all masks of a view,
 some 30,000 in a full-HD view of a tote."""

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,6 +27,8 @@ def constant_files(layout: DataLayout) -> tuple[Path, ...]:
     return tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, *camera_files(layout), NOTES_FILE, PARAMS_FILE)))
 
 
+MAX_RUNNING = 4096
+"""Scenes whose paths are remembered: each view of a running one names it."""
 SceneImages = tuple[Sequence[int], ...]
 """Images (im_id) of each scene, ascending."""
 _Staged = StagedEpisode[tuple[Path, ...]]
@@ -56,6 +58,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
         self._pool = context.pool
         self._suffix = f".{bop.color_format}"
         layers = settings.render.layers if self.write_layer else ()
+        self._scene_path = lru_cache(MAX_RUNNING)(lambda scene: self._folder(scene) / f"{scene:06d}")
         self._supports: dict[int, list[FrameSupport]] = {}
         """Which object rests on which (edges of the support graph), for each frame of each running episode."""
         entries = context.catalog.entries if bop.keypoints and self.annotates(bop) else ()
@@ -154,7 +157,7 @@ class SceneExporter(EpisodeExporter[tuple[Path, ...]]):
             episode = self._staged(index, partial(self._create_scenes, index))
             scene = episode.content[camera]
             images, truth = bop_view.make_view_task(batch, view, self.scene_ids(index)[camera], self._views[camera])
-            place = self._folder(truth.scene) / scene.name
+            place = self._scene_path(truth.scene)
             arguments = (type(self).write_view, scene, self._views[camera], truth)
             yield self._task((episode,), bop_view.write_rendered_view, images, arguments, place, affinity=truth.scene)
             for name in self._views[camera].layers:

@@ -3,8 +3,10 @@
 Runs in writer processes, so it imports neither Warp nor Newton. Only BOP's formats (bop, shards, coco) use millimetres.
 """
 
+import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +82,20 @@ class ViewSettings:
     """Whether scene_graph.json is written."""
     classes: tuple[int, ...] = ()
     """obj_id of each class of the format yolo."""
+
+    def __reduce__(self) -> tuple[Callable[[bytes], "ViewSettings"], tuple[bytes]]:
+        """Interned pickle: one constant string, which a writer process decodes once; it comes with every view."""
+        return _load_settings, (self._pickled,)
+
+    @cached_property
+    def _pickled(self) -> bytes:
+        return pickle.dumps([getattr(self, each.name) for each in fields(self)])
+
+
+@cache
+def _load_settings(pickled: bytes) -> ViewSettings:
+    """Decode pickled settings; equal strings give the same object."""
+    return ViewSettings(*pickle.loads(pickled))
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +235,7 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
     boundaries, runs = _select_boundaries(batch, view, width * height), _select_runs(batch, view, most_words(width, height))
     rows, columns = (slice(0, 0), slice(0, 0)) if boundaries is not None else _crop_to_boxes(boxes, height, width)
     depth = batch.depth_source(view) if settings.depth or settings.keypoints else np.empty(0, np.uint8)
-    parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
+    parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True)) if settings.effects else {}
     truth = ViewTruth(
         scene=scene,
         frame=int(batch.frame[view]),

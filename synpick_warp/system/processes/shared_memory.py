@@ -73,13 +73,13 @@ class SharedSlots:
 
     def put(self, arrays: Sequence[np.ndarray], slot: int) -> tuple[tuple[SharedArray, ...], Future[None] | None]:
         """Copy arrays into a slot; returns their places, and the copy in progress if a thread makes it."""
-        if (size := shared_bytes(array.nbytes for array in arrays)) > self._slot_bytes:
-            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} of a slot of this pool")
-        offset = slot * self._slot_bytes
+        first = offset = slot * self._slot_bytes
         places: list[SharedArray] = []
         for array in arrays:
             places.append(SharedArray(offset, array.shape, array.dtype.str))
-            offset += shared_bytes((array.nbytes,))
+            offset += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
+        if offset - first > self._slot_bytes:
+            raise ValueError(f"images of {offset - first} bytes exceed the {self._slot_bytes} of a slot of this pool")
         targets = [place.map(self._memory) for place in places]
         if self._threads is None:
             _copy(targets, arrays)
