@@ -5,7 +5,7 @@ import contextlib
 import resource
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 from unittest import mock
 
@@ -48,36 +48,6 @@ NEWTONS_OWN = {
 # ---- growth ----
 
 
-@dataclass(frozen=True, eq=False)
-class Variant:
-    """One configuration to measure: settings of a run of the benchmark, and catalog."""
-
-    bench: Bench
-    catalog: Catalog
-
-    @property
-    def config(self) -> Config:
-        """Settings."""
-        return self.bench.config
-
-    @property
-    def steps(self) -> int:
-        """Physics steps in a tick, over all worlds."""
-        return self.config.physics.steps_per_tick * self.config.bake.worlds
-
-    def make_simulation(self) -> Simulation:
-        """Simulation whose piles never count as settled, so that episodes do not go on to their next phase."""
-        simulation = Simulation(self.config, self.catalog, 1, self.bench.device, None, range(self.config.bake.worlds))
-        simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
-        return simulation
-
-    def time_ticks(self, simulation: Simulation, lead: int) -> float:
-        """Time of a tick's physics [s], after `lead` ticks."""
-        for _ in range(lead):
-            simulation.tick()
-        return self.bench.seconds_per_call(simulation.tick)
-
-
 def number_settings(counts: Counts, number: int) -> dict[str, Any]:
     """Settings by which `number` copies of one workpiece are dropped, in layers: of the one with the largest number in `counts`."""
     part = max(counts or ((PART, 1, 1),), key=lambda row: row[2])[0]
@@ -92,26 +62,30 @@ def measure_growth(bench: Bench) -> Iterator[MeasuredRow]:
     varied = [config.with_values(number_settings(config.arrangement.counts, number)) for number in bench.instances or INSTANCES]
     catalog, bins = load_catalog(max(varied, key=lambda each: each.arrangement.max_objects)), make_bins(config.cell.bins)
     for fitted in [fit_to_catalog(each, catalog, bins, device, SilentProgress()) for each in varied]:
-        yield from _measure_equal_parts(Variant(replace(bench, config=fitted), catalog))
+        yield from _measure_equal_parts(replace(bench, config=fitted), catalog)
 
 
-def _measure_equal_parts(variant: Variant) -> Iterator[MeasuredRow]:
+def _measure_equal_parts(bench: Bench, catalog: Catalog) -> Iterator[MeasuredRow]:
     """Rows of landing and of resting workpieces, of contacts, of overlapping bounding boxes (broad phase) and of memory."""
-    config, device = variant.config, variant.bench.device
+    config, device = bench.config, bench.device
     worlds, before = config.bake.worlds, _memory_in_use(device)
-    simulation, name = variant.make_simulation(), f"{config.arrangement.max_objects} instances"
+    simulation, name = Simulation(config, catalog, 1, device, None, range(worlds)), f"{config.arrangement.max_objects} instances"
+    simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
+    steps = config.physics.steps_per_tick * worlds
     for state, ticks in (("landing", DROP_TICKS), ("at rest", REST_TICKS)):
-        seconds = variant.time_ticks(simulation, ticks)
+        for _ in range(ticks):
+            simulation.tick()
+        seconds = bench.seconds_per_call(simulation.tick)
         yield MeasuredRow(f"{name}, {state}: physics of a tick", 1e3 * seconds, "ms")
-        yield MeasuredRow(f"{name}, {state}: world-steps", variant.steps / seconds, "1/s")
-        yield MeasuredRow(f"{name}, {state}: part-steps", variant.steps * config.arrangement.max_objects / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: world-steps", steps / seconds, "1/s")
+        yield MeasuredRow(f"{name}, {state}: part-steps", steps * config.arrangement.max_objects / seconds, "1/s")
     own = simulation.physics
     for what, array in (("contacts", own.contacts.rigid_contact_count), ("overlaps", own.overlap_count)):
         yield MeasuredRow(f"{name}: {what} a world", int(array.numpy()[0]) / worlds)
     overflow = own.solver.constraint_overflow.numpy()[:-1]  # The last entry is that of bodies outside of all worlds.
     yield MeasuredRow(f"{name}: worlds without overflow", 100.0 * float(np.mean(~overflow)), "%")
     yield MeasuredRow(f"{name}: memory of the physics", (_memory_in_use(device) - before) / GIB, "GiB")
-    pieces = max(len(variant.catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, variant.catalog))
+    pieces = max(len(catalog.bodies[index].pieces) for index in find_drawn(config.arrangement, catalog))
     terms = [term for term in plan_memory(config, device, 0, pieces) if term.name.startswith(("Newton", "the state", "separating"))]
     yield MeasuredRow(f"{name}: memory planned for it, at least", sum(term.size for term in terms) / GIB, "GiB")
 
