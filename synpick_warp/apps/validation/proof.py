@@ -79,7 +79,7 @@ def record_proof(folder: Path, proof: Proof) -> None:
     line = f"- {datetime.now(UTC):%Y-%m-%d}, synpick-warp {__version__}, {proof.device}: {proof.files:,} files are those of a new bake of"
     with output_errors(path):
         before = path.read_bytes() if path.exists() else b""
-        write_atomically(path, before + f"{line} episodes {episodes}\n".encode())
+        write_atomically(path, before + f"{line} episode{'s' * (len(proof.episodes) > 1)} {episodes}\n".encode())
 
 
 def _compare(folder: Path, again: Path, episodes: list[int]) -> tuple[int, str]:
