@@ -14,7 +14,7 @@ from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes import reading
 from synpick_warp.scenes.bin_meshes.colliders import MAX_PIECES
-from synpick_warp.scenes.bin_meshes.inside import LIMIT_CELLS
+from synpick_warp.scenes.bin_meshes.inside import LIMIT_CELLS, _flood
 from synpick_warp.scenes.bin_meshes.reading import BinModel, measure_bins, read_bin
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.collision.simplification import hull_piece
@@ -385,3 +385,9 @@ def test_a_closed_box_is_as_the_mesh(tmp_path, mesh):
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (3000, 2)) * (np.array(sizes.opening) - 0.01)
     top = np.max([heights(trimesh.Trimesh(piece.vertices, piece.faces), points) for piece in found.pieces], axis=0)
     assert np.quantile(np.abs(top - heights(found.mesh, points)), 0.98) < 3e-3
+
+
+def test_a_pool_fills_to_the_lowest_notch_of_its_rim():
+    height = np.zeros((9, 8))
+    height[2:7, 2:7], height[3:6, 3:6], height[4, 6] = 3.0, 1.0, 2.0
+    np.testing.assert_array_equal(_flood(height), np.where(height == 1.0, 2.0, height))

@@ -5,7 +5,7 @@ where it would spill. Holes of the floor and of the walls do not matter, since n
 where wall: `scenes.bin_meshes.compartments`.
 """
 
-import heapq
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -192,20 +192,16 @@ def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell:
 
 
 def _flood(height: np.ndarray) -> np.ndarray:
-    """Level to which each cell fills, if nothing holds back at the border (nx, ny)."""
-    level = np.full(height.shape, np.inf)
-    border = np.ones(height.shape, bool)
-    border[1:-1, 1:-1] = False
-    level[border] = height[border]
-    queue = [(float(height[x, y]), int(x), int(y)) for x, y in np.argwhere(border)]
-    heapq.heapify(queue)
-    last = (height.shape[0] - 1, height.shape[1] - 1)
-    while queue:
-        here, x, y = heapq.heappop(queue)
-        for i, j in ((x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)):
-            if 0 <= i <= last[0] and 0 <= j <= last[1] and level[i, j] == np.inf:
-                level[i, j] = max(here, float(height[i, j]))
-                heapq.heappush(queue, (level[i, j], i, j))
+    """Depression filling (Planchon and Darboux, 2001): the level to which each cell fills, if nothing holds back at the border (nx, ny)."""
+    level = height.copy()
+    level[1:-1, 1:-1] = np.inf
+    before = np.empty_like(level)
+    while not np.array_equal(level, before):
+        before[:] = level
+        for filled, ground in ((level, height), (level.T, height.T)):
+            count = len(filled)
+            for row, last in itertools.chain(zip(range(1, count), range(count)), zip(range(count - 2, -1, -1), range(count - 1, 0, -1))):
+                np.minimum(filled[row], np.maximum(ground[row], filled[last]), out=filled[row])
     return level
 
 
