@@ -40,10 +40,10 @@ Rasterizing triangles takes 0.10 of the 0.18 ms of a view's G-buffer."""
 BLOCK_THREADS = 16384
 """Threads that share a view's blocks of large triangles in the rasterizer (0.015 ms of a view)."""
 RUN_BANDS = 8
-"""Bands of rows of a column of segmentation ids, each of which a thread searches for run boundaries: without them, a batch of 25 full-HD
-views has 48,000 threads, where an H200 holds 270,000."""
+"""Number of bands into which the rows of an image are divided to find run boundaries, with one thread per column and band. One thread per
+column would be 48,000 threads for a batch of 25 full-HD views; an H200 runs 270,000 at a time."""
 RUN_LANES = 128
-"""Lanes that share the columns of an amodal mask when its runs are listed."""
+"""Number of threads among which the columns of an amodal mask are divided to list its runs."""
 RESTORE_THREADS, KEEP_THREADS = 256, 4096
 """Threads that copy the words of a mask from the previous frame, or clear them, some 3,000; and that keep those of all masks of a view,
 some 30,000 in a full-HD view of a tote."""

@@ -15,7 +15,7 @@ import warp as wp
 
 from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.configs.episodes.objects import Counts
-from synpick_warp.configs.schema import LAYERED, Config
+from synpick_warp.configs.schema import LAYERED
 from synpick_warp.factory.assembly import fit_to_catalog
 from synpick_warp.factory.memory_plan import plan_memory
 from synpick_warp.scenes.bins import make_bins

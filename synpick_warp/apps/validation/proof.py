@@ -1,7 +1,7 @@
 """Proof of a data set by replication: a random share of its episodes is baked again from the recorded settings, and compared by bytes.
 
-On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently. A proof without a
-difference leaves a line in PROOFS_FILE of the data set: what was proved, when, by which version and device.
+On the same kind of device, with the same versions, nothing may differ; a device of another kind rounds differently. A successful
+proof is logged in PROOFS_FILE of the data set, with date, version, device and episodes.
 """
 
 import math
@@ -32,11 +32,11 @@ from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress
 
 PROOFS_FILE = "proofs.md"
-"""List of the proofs of a data set, beside its manifest; it has no checksum."""
+"""Log of the successful proofs of a data set, next to its manifest. It has no checksum."""
 
 
 class Proof(NamedTuple):
-    """Result of a proof: device, episodes that were baked again, their files, and the first difference (empty: none)."""
+    """Result of a proof: the device, the episodes that were baked again, the number of compared files, and the first difference."""
 
     device: str
     """Name of the device that baked."""
@@ -74,7 +74,7 @@ def prove(folder: Path, share: float, seed: int, progress: Progress, device: str
 
 
 def record_proof(folder: Path, proof: Proof) -> None:
-    """Add a line on a proof without a difference to the data set's list. Raises OutputError: it cannot be written."""
+    """Append a line about a successful proof to PROOFS_FILE of the data set. Raises OutputError: the file cannot be written."""
     path, episodes = folder / PROOFS_FILE, ", ".join(map(str, proof.episodes))
     line = f"- {datetime.now(UTC):%Y-%m-%d}, synpick-warp {__version__}, {proof.device}: {proof.files:,} files are those of a new bake of"
     with output_errors(path):
@@ -83,7 +83,7 @@ def record_proof(folder: Path, proof: Proof) -> None:
 
 
 def _compare(folder: Path, again: Path, episodes: list[int]) -> tuple[int, str]:
-    """Compare constants and episodes of two data sets, up to the first difference: number of files, and the difference."""
+    """Compare constants and episodes of two data sets up to the first difference. Returns the number of files and the difference, or ""."""
     files = 0
     for entry in (CONSTANTS, *map(episode_entry, episodes)):
         then, now = (read_checksums(each, entry) for each in (folder, again))

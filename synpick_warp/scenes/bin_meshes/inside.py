@@ -5,7 +5,6 @@ where it would spill. Holes of the floor and of the walls do not matter, since n
 where wall: `scenes.bin_meshes.compartments`.
 """
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -192,16 +191,16 @@ def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell:
 
 
 def _flood(height: np.ndarray) -> np.ndarray:
-    """Depression filling (Planchon and Darboux, 2001): the level to which each cell fills, if nothing holds back at the border (nx, ny)."""
+    """Depression filling (Planchon and Darboux, 2001): water level of each cell (nx, ny), if water drains off at the border."""
     level = height.copy()
     level[1:-1, 1:-1] = np.inf
     before = np.empty_like(level)
     while not np.array_equal(level, before):
         before[:] = level
-        for filled, ground in ((level, height), (level.T, height.T)):
-            count = len(filled)
-            for row, last in itertools.chain(zip(range(1, count), range(count)), zip(range(count - 2, -1, -1), range(count - 1, 0, -1))):
-                np.minimum(filled[row], np.maximum(ground[row], filled[last]), out=filled[row])
+        for turns in range(4):
+            filled, ground = np.rot90(level, turns), np.rot90(height, turns)
+            for row in range(1, len(filled)):
+                np.minimum(filled[row], np.maximum(ground[row], filled[row - 1]), out=filled[row])
     return level
 
 

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Tone
@@ -39,8 +38,6 @@ class KeptColors:
 
     color: wp.array = device_array("world_camera", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
-    view: wp.array = device_array("view", dtype=wp.int32)
-    """Index of each view of a batch."""
 
 
 def has_effects(effects: Effects) -> bool:
@@ -87,13 +84,8 @@ class PostProcessor:
             kept: Number of images that are kept from frame to frame, for tiles that are not computed anew.
         """
         self.scene = scene
-        sizes = {"world_camera": kept, "row": scene.height, "column": scene.width, "view": views}
-        images = allocate(KeptColors, sizes, scene.device)
-        self.kept, self.rows = images.color, images.view
-        if kept and history_row is not None:
-            self.rows = history_row
-        else:
-            self.rows.assign(np.arange(views))
+        sizes = {"world_camera": kept, "row": scene.height, "column": scene.width}
+        self.kept, self.rows = allocate(KeptColors, sizes, scene.device).color, history_row if kept else None
         self.effects = make_effect_ranges(effects, seed) if has_effects(effects) else None
         self.settings = PostProcessSettings()
         self.settings.seed = seed

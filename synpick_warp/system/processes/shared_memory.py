@@ -33,7 +33,12 @@ class SharedArray:
 
 def shared_bytes(sizes: Iterable[int]) -> int:
     """Shared memory that arrays of these sizes take, with alignment [B]."""
-    return sum(-(-size // _ALIGNMENT) * _ALIGNMENT for size in sizes)
+    return sum(map(_align, sizes))
+
+
+def _align(size: int) -> int:
+    """Size rounded up to the alignment [B]."""
+    return -(-size // _ALIGNMENT) * _ALIGNMENT
 
 
 def allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
@@ -77,7 +82,7 @@ class SharedSlots:
         places: list[SharedArray] = []
         for array in arrays:
             places.append(SharedArray(offset, array.shape, array.dtype.str))
-            offset += -(-array.nbytes // _ALIGNMENT) * _ALIGNMENT
+            offset += _align(array.nbytes)
         if offset - first > self._slot_bytes:
             raise ValueError(f"images of {offset - first} bytes exceed the {self._slot_bytes} of a slot of this pool")
         targets = [place.map(self._memory) for place in places]

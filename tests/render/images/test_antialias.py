@@ -9,12 +9,15 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
 from synpick_warp.kernels.render.images.antialias import sample_offset
+from synpick_warp.kernels.render.images.kept_sources import KeptSources, forget_sources_kernel
 from synpick_warp.kernels.render.lighting.shading import MAX_WEIGHT_CHANGE, move_weights, shade_kernel, shade_samples_kernel, sum_of
+from synpick_warp.kernels.render.lighting.tile_flags import DAMAGED, RELIT, TileFlags
 from synpick_warp.kernels.render.visibility.triangles import Triangle, edge_areas
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import EnvironmentMap, TriangleMesh
 from synpick_warp.stages.render import denoised
 from synpick_warp.stages.render.sampling_rates import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
+from synpick_warp.stages.render.scene import build_grid
 from tests.harness.probe import probe
 from tests.worlds.shapes import UPRIGHT, WHITE, ball, box, camera, entry, even_light, sheet, sun, surface
 from tests.worlds.toy_scene import ANNOTATIONS, RenderedViews, ToyScene, assert_same, render, render_objects, with_render
@@ -337,3 +340,18 @@ def test_the_mean_of_a_pixel_is_approached(device, monkeypatch, shape):
         monkeypatch.setattr(denoised, "shade_samples_kernel", kernel)
         errors.append(np.sqrt(np.square(radiance_of(*body, device)[inner] - mean).mean()))
     assert errors[0] < 0.7 * errors[1]
+
+
+@pytest.mark.parametrize("samples", [4, 16])
+def test_sources_with_a_corner_in_a_damaged_tile_are_unknown(device, samples):
+    grid, numbers = build_grid(21, 10), np.random.default_rng(samples)
+    dirty = numbers.choice(np.array([0, 0, 0, DAMAGED, RELIT], np.uint8), (40, grid.tiles))
+    flags, kept, footprints = TileFlags(), KeptSources(), 22 * 11
+    flags.dirty, flags.history_row = (wp.array(array, device=device) for array in (dirty, np.arange(40, dtype=np.int32)[::-1].copy()))
+    kept.word = wp.zeros((40, -(-footprints * samples // 16)), dtype=wp.uint32, device=device)
+    wp.launch(forget_sources_kernel, (40, grid.tiles, 5), [grid, flags, samples], [kept], device=device)
+    bits = np.unpackbits(kept.word.numpy()[::-1].copy().view(np.uint8), axis=1, bitorder="little")[:, : footprints * 2 * samples]
+    row, column = np.indices((10, 21))
+    pixels = np.pad(dirty[:, row // 4 * grid.tile_columns + column // 8] == DAMAGED, ((0, 0), (1, 1), (1, 1)))
+    expected = pixels[:, 1:, 1:] | pixels[:, :-1, 1:] | pixels[:, 1:, :-1] | pixels[:, :-1, :-1]
+    np.testing.assert_array_equal(bits.reshape(40, 11, 22, -1), np.repeat(expected[..., None], 2 * samples, axis=-1))

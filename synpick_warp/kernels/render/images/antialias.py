@@ -14,8 +14,7 @@ from synpick_warp.kernels.render.images.kept_sources import (
     KeptSources,
     clear_sources,
     footprint_mask,
-    footprint_shift,
-    footprint_word,
+    locate_sources,
     read_sources,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
@@ -223,7 +222,7 @@ def corner_column(column: int, corner: int) -> int:
 
 @wp.func
 def place_sources(image: ShadedImage, view: int, row: int, column: int, sources: wp.uint32):
-    """Add the source bits of a footprint to those of its corner pixels, each of which has the samples of a quadrant."""
+    """Scatter a footprint's source bits to its four corner pixels: each pixel receives those of its quadrant in the footprint."""
     bits = SOURCE_BITS * (image.samples // QUADRANTS)
     for own in range(FOOTPRINT_PIXELS):
         shift = wp.uint32(bits * (QUADRANTS - 1 - own))
@@ -289,8 +288,8 @@ def visible_segments(shot: AnyShot, view: int, row: int, column: int) -> wp.vec4
 
 @wp.func
 def find_ranks(bodies: ViewBodies, view: int, tile: int, segments: wp.vec4i, instances: int) -> tuple[wp.uint32, int]:
-    """Find the bodies of a tile's mask whose segmentation id is one of the four. Returns their ranks (places in
-    `ViewBodies.order`), ascending, packed in RANK_BITS each from the lowest bits on, and their number."""
+    """Find the bodies in a tile's mask that have one of four segmentation ids. Returns their ranks (indices into `ViewBodies.order`) in
+    ascending order, packed with RANK_BITS each from bit 0 on, and the number of bodies."""
     ranks = wp.uint32(0)
     found = int(0)
     for word in range(bodies.body_mask.shape[2]):
@@ -408,8 +407,8 @@ def resolve_footprints_kernel(
             plane.height = hit.depth * wp.dot(normal, ray)
             best = select_source(scene.meshes, shot, view, row, column, own, offset, hit, plane)
             if best != own:
-                bits, shift = wp.uint32(best ^ own), SOURCE_BITS * sample
-                wp.atomic_or(image_inout.resolve, view, r, c, bits << wp.uint32(shift))
+                bits = wp.uint32(best ^ own) << wp.uint32(SOURCE_BITS * sample)
+                wp.atomic_or(image_inout.resolve, view, r, c, bits)
                 if kept_inout.word.shape[0] > 0:
-                    shift += footprint_shift(int(cell), samples)
-                    wp.atomic_or(kept_inout.word, history_row[view], footprint_word(int(cell), samples), bits << wp.uint32(shift))
+                    word, shift = locate_sources(int(cell), samples)
+                    wp.atomic_or(kept_inout.word, history_row[view], word, bits << shift)

@@ -1,4 +1,4 @@
-"""Cache of anti-aliasing: which pixels lend their radiance to the samples of a footprint, as found by coverage rays in an earlier frame."""
+"""Cache of coverage sampling for anti-aliasing: the source pixel of each coverage sample, from an earlier frame of the same geometry."""
 
 import warp as wp
 
@@ -15,51 +15,46 @@ WORD_SAMPLES = wp.constant(16)
 
 @wp.struct
 class KeptSources:
-    """Source bits of the samples of each footprint, which are kept as long as the footprint's tiles are not damaged."""
+    """Source pixels of the coverage samples of each footprint, valid until a tile of the footprint is damaged."""
 
     word: wp.array2d[wp.uint32]
-    """(row of the light history, word): SOURCE_BITS for each sample, of one footprint after the other; all 1: unknown. The samples of a
-    footprint belong to one word. Empty: nothing is kept."""
+    """(row of the light history, word): SOURCE_BITS per sample, footprints in row-major order; a footprint's samples share a word. All bits
+    of a footprint are 1 if its sources are unknown. Empty: nothing is kept."""
 
 
 @wp.func
 def footprint_mask(samples: int) -> wp.uint32:
-    """Bit mask of the source bits of one footprint."""
+    """Bit mask of a footprint's samples at bit 0 of a word; also the value of unknown sources."""
     return wp.uint32(0xFFFFFFFF) >> wp.uint32(SOURCE_BITS * (WORD_SAMPLES - samples))
 
 
 @wp.func
-def footprint_word(footprint: int, samples: int) -> int:
-    """Word of `KeptSources` with the samples of a footprint."""
-    return footprint // (WORD_SAMPLES // samples)
-
-
-@wp.func
-def footprint_shift(footprint: int, samples: int) -> int:
-    """Place of the samples of a footprint in their word [bits]."""
-    return SOURCE_BITS * samples * (footprint % (WORD_SAMPLES // samples))
+def locate_sources(footprint: int, samples: int) -> tuple[int, wp.uint32]:
+    """Index of the word that holds a footprint's samples, and of their lowest bit in it."""
+    share = WORD_SAMPLES // samples
+    return footprint // share, wp.uint32(SOURCE_BITS * samples * (footprint % share))
 
 
 @wp.func
 def read_sources(kept: KeptSources, history: int, footprint: int, samples: int) -> wp.uint32:
-    """Source bits of a footprint, all 1 if they are unknown."""
-    shift = wp.uint32(footprint_shift(footprint, samples))
-    return (kept.word[history, footprint_word(footprint, samples)] >> shift) & footprint_mask(samples)
+    """Read the source bits of a footprint; `footprint_mask` if they are unknown."""
+    word, shift = locate_sources(footprint, samples)
+    return (kept.word[history, word] >> shift) & footprint_mask(samples)
 
 
 @wp.func
 def clear_sources(kept: KeptSources, history: int, footprint: int, samples: int):
-    """Set the source bits of a footprint to 0: each sample takes the radiance of its own pixel."""
-    bits = footprint_mask(samples) << wp.uint32(footprint_shift(footprint, samples))
-    wp.atomic_and(kept.word, history, footprint_word(footprint, samples), ~bits)
+    """Set the source bits of a footprint to 0, so that each sample takes the radiance of its own pixel."""
+    word, shift = locate_sources(footprint, samples)
+    wp.atomic_and(kept.word, history, word, ~(footprint_mask(samples) << shift))
 
 
 @wp.kernel
 def forget_sources_kernel(grid: ImageGrid, flags: TileFlags, samples: int, kept_inout: KeptSources):
-    """Set the source bits of all footprints that have a corner in a damaged tile to unknown.
+    """Cache invalidation: set the sources of all footprints with a corner pixel in a damaged tile to unknown.
 
-    The pixels of a tile are corners of one footprint more in each direction; in a row, their bits are consecutive. Launched over view,
-    tile, row of footprints.
+    A tile of H x W pixels touches (H + 1) x (W + 1) footprints; the bits of those in one row are consecutive. Launched over view, tile, row
+    of footprints.
     """
     view, tile, down = wp.tid()
     if (int(flags.dirty[view, tile]) & DAMAGED) == 0:

@@ -32,7 +32,7 @@ class Boundaries:
 
 @wp.struct
 class BoundaryCounts:
-    """Run boundaries of each column of the ids and of each of its bands, and of each lane of a mask. Scratch between the two passes."""
+    """Number of run boundaries in each column of the ids, each band of a column, and each lane of a mask. Scratch of both passes."""
 
     column_count: wp.array2d[int]
     """(view, column)."""
@@ -52,7 +52,7 @@ def read_id(instance_image: wp.array3d[wp.uint8], view: int, row: int, column: i
 
 @wp.func
 def band_rows(rows: int, bands: int) -> int:
-    """Rows of a band, where an image of `rows` rows, and the one below it, is divided into `bands`."""
+    """Height of a band [rows], if the rows of an image, and one row more below it, are divided into `bands` bands."""
     return rows // bands + 1
 
 

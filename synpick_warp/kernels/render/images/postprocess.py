@@ -75,8 +75,8 @@ def postprocess_kernel(
 ):
     """Radiance to sRGB without camera effects: exposure (the map's factor times 2 to the episode's exposure value), tone map, transfer.
 
-    `color_inout` receives red, green, blue bytes of tiles of COLOR_PASS, at the view's index in `rows`. Launched over view, pixel (tile
-    order, from flat index `first` on).
+    `color_inout` receives red, green, blue bytes of tiles of COLOR_PASS, at the view's index in `rows`; without `rows`, at the view.
+    Launched over view, pixel (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
     if not in_image(shot.grid, row, column) or not needs(shot.grid, image.passes, COLOR_PASS, view, row, column):
@@ -86,7 +86,10 @@ def postprocess_kernel(
         lights.exposure[snapshot.light[world]] * wp.pow(2.0, snapshot.light_exposure[world]) * resolve_radiance(image, view, row, column)
     )
     color = wp.vec3ub(encode_display(value[0], tone), encode_display(value[1], tone), encode_display(value[2], tone))
-    color_inout[rows[view], row, column] = color
+    place = view
+    if rows:
+        place = rows[view]
+    color_inout[place, row, column] = color
 
 
 @wp.kernel

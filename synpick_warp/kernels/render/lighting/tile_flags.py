@@ -11,7 +11,7 @@ RATIO_STAGE, CHOICE_STAGE, BLOCK_STAGE, LIGHT_STAGE = wp.constant(1), wp.constan
 ALL_STAGES = int(RATIO_STAGE) | int(CHOICE_STAGE) | int(BLOCK_STAGE) | int(LIGHT_STAGE)
 
 DAMAGED, RELIT = wp.constant(1), wp.constant(2)
-"""Values of a dirty tile: its bodies changed; only its light or shadows did."""
+"""Reasons why a tile is dirty: its bodies changed; only its light or shadows changed."""
 
 
 @wp.struct
@@ -27,7 +27,7 @@ class TileFlags:
     shadowed: wp.array2d[wp.uint8]
     """(view, shadow_tile): 1: a shadow ray of the tile's pixels of the shadow grid changed."""
     dirty: wp.array2d[wp.uint8]
-    """(view, tile): DAMAGED or RELIT: a pixel of the tile may have changed."""
+    """(view, tile): why pixels of the tile may differ from the previous frame: DAMAGED or RELIT; 0: all are equal."""
     bodies: wp.array3d[wp.uint64]
     """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
 
