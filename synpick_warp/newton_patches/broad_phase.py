@@ -9,8 +9,12 @@ import warp as wp
 
 from synpick_warp.kernels.newton_patches import broad_phase
 
-BLOCK = 128
+BLOCK = 512
 """Threads per world that list overlapping bounding boxes; on a CPU one."""
+SHAPE_BLOCK = 128
+"""Block size of a launch with a thread for each shape."""
+SEPARATION_BLOCK = 32
+"""Block size of the test of separating axes, whose threads wait for the vertices of their hulls: few worlds use all multiprocessors so."""
 SEPARATION_THREADS = 128
 """Threads per world that test separating axes, about one per overlap (130 per world in real piles); a grid-stride loop over all worlds'."""
 MANY_SHAPES = 256
@@ -70,7 +74,9 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
             dim = worlds, shapes.count
             wp.launch(broad_phase.list_occupied_kernel, dim=dim, inputs=boxes, outputs=lists, device=device)
             inputs = [*boxes, *lists]
-            wp.launch(broad_phase.list_overlaps_of_shapes_kernel, dim=dim, inputs=inputs, outputs=overlaps, block_dim=BLOCK, device=device)
+            wp.launch(
+                broad_phase.list_overlaps_of_shapes_kernel, dim=dim, inputs=inputs, outputs=overlaps, block_dim=SHAPE_BLOCK, device=device
+            )
         else:
             wp.launch_tiled(
                 broad_phase.list_overlaps_kernel,
@@ -88,7 +94,7 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
             dim=threads,
             inputs=inputs,
             outputs=[candidate_pair, candidate_pair_count],
-            block_dim=BLOCK,
+            block_dim=SEPARATION_BLOCK,
             device=device,
         )
 

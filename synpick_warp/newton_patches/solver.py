@@ -1,5 +1,6 @@
 """Kernel fusion for Newton's SolverSteel: one kernel for all iterations of a substep instead of ten kernels per iteration."""
 
+import ctypes
 import inspect
 import sys
 from collections.abc import Iterable
@@ -12,6 +13,7 @@ import warp as wp
 
 from synpick_warp.kernels.newton_patches import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
 from synpick_warp.newton_patches import KNOWN_NEWTON
+from synpick_warp.newton_patches.friction_patches import sort_by_worlds
 
 RESIDENT_WORLDS = 10
 """Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 10 warps with up to 200 a thread. Where there are
@@ -21,6 +23,13 @@ PATCH_WARP_CONTACTS = 8
 same, in four fifths of the time (2,048 worlds, H200)."""
 TREE_BYTES = 2048
 """Shared memory of the functions of the gripper's tree, at most, and of what alignment leaves out: the assembler counts 1,634 bytes."""
+
+SERIAL_BLOCK = 32
+"""Block size of those kernels that have a thread for each tree or body, which walks it; Newton's is 256."""
+WORD = 4
+"""Length of a word [bytes]."""
+MAX_SMALL = 4096
+"""Length up to which a memset in a CUDA graph is no kernel [bytes], as seen in profiles."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
@@ -47,6 +56,11 @@ class FusedSteel(newton.solvers.SolverSteel):
         """Prepare a solver for a model; arguments as in SolverSteel."""
         share_patches()
         super().__init__(*args, **kwargs)
+        self._serial_kernel_block_dim = SERIAL_BLOCK
+        if self.model.device.is_cuda:
+            clear_by_kernels(self.model.device)
+            if self._friction_anchors_enabled:
+                sort_by_worlds(self._friction_patches, self.model)
 
     def _launch_propagation_solve(
         self,
@@ -113,7 +127,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         return wp.zeros(shape, dtype=wp.float32, device=self.model.device)
 
     def _apply_propagation_warmstart_velocity(self) -> None:
-        """Turn the impulses of the warm start into velocities, with a thread for each component of each body instead of each world."""
+        """Turn the impulses of the warm start into velocities, by a warp a body instead of a thread for each component of a world."""
         if not (self._is_fusable and self._ordered_rows):
             super()._apply_propagation_warmstart_velocity()
             return
@@ -130,13 +144,8 @@ class FusedSteel(newton.solvers.SolverSteel):
             self._propagation_impulses,
         ]
         outputs, device = [self._propagation_body_qd, self._propagation_body_impulses], self.model.device
-        dim = self._world_count, self._max_propagation_bodies
-        if self._sweep_warps == 1:
-            dim = *dim, int(solver_iterations.TWIST)
-            wp.launch(warm_start.apply_warm_start_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
-        else:
-            block, kernel = int(solver_iterations.WARP), warm_start.apply_warm_start_of_many_kernel
-            wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block, device=device)
+        dim, block = (self._world_count, self._max_propagation_bodies), int(solver_iterations.WARP)
+        wp.launch_tiled(warm_start.apply_warm_start_kernel, dim=dim, inputs=inputs, outputs=outputs, block_dim=block, device=device)
         self._propagation_propagate_impulses()
 
     @cached_property
@@ -263,6 +272,24 @@ def share_patches() -> None:
     patches: Any = sys.modules[steel._FrictionPatchState.__module__]
     if not patches._build.module.execs:
         patches._FLOOD_MIN_CONTACTS = PATCH_WARP_CONTACTS
+
+
+def clear_by_kernels(device: Any) -> None:
+    """Have `zero_` of a GPU's arrays clear up to `MAX_SMALL` bytes by a kernel, in any thread.
+
+    CUDA turns longer memsets of a graph into kernels itself. Shorter ones are commands of another kind, before and after which a graph
+    waits: 19 of them take 100 us of a substep of 48 worlds on an H200.
+    """
+    memset, zero = device.memset, ctypes.pointer(ctypes.c_int32(0))
+
+    def clear(pointer: int, value: int, size: int) -> None:
+        if value == 0 and size <= MAX_SMALL and size % WORD == 0 and pointer % WORD == 0:
+            device.memtile(pointer, zero, WORD, size // WORD)
+        else:
+            memset(pointer, value, size)
+
+    if memset.__name__ != clear.__name__:
+        device.memset = clear
 
 
 def find_unsupported(solver: Any) -> list[str]:

@@ -20,7 +20,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.newton_patches import broad_phase as kernels
 from synpick_warp.kernels.newton_patches import contact_sweep, world_order
-from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel, apply_warm_start_of_many_kernel
+from synpick_warp.kernels.newton_patches.warm_start import apply_warm_start_kernel
 from synpick_warp.newton_patches import broad_phase
 from synpick_warp.newton_patches import solver as fused_solver
 from synpick_warp.newton_patches.narrow_phase import BLOCK
@@ -180,7 +180,7 @@ def test_warm_start_sums_impulses_as_newton_does(device):
         ]
         floats = [wp.array(values, dtype=float, device=device) for values in (*jacobians, impulse)]
         inputs = [*ints, *floats, *last]
-        if kernel is apply_warm_start_of_many_kernel:
+        if kernel is apply_warm_start_kernel:
             wp.launch_tiled(kernel, dim=dim, inputs=inputs, outputs=out, block_dim=32 if device.is_cuda else 1, device=device)
         else:
             wp.launch(kernel, dim=dim, inputs=inputs, outputs=out, device=device)
@@ -188,8 +188,8 @@ def test_warm_start_sums_impulses_as_newton_does(device):
 
     expected = run(accumulate_propagation_warmstart_body_impulses_ordered, (worlds, 6), last=(rows,))
     assert not np.array_equal(expected[0], expected[1])
-    for kernel, dim in ((apply_warm_start_kernel, (worlds, bodies, 6)), (apply_warm_start_of_many_kernel, (worlds, bodies))):
-        np.testing.assert_array_equal(run(kernel, dim, np.full(worlds, bodies), listed), expected)
+    found = run(apply_warm_start_kernel, (worlds, bodies), np.full(worlds, bodies), listed)
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_worlds_with_the_most_colors_come_first(device):

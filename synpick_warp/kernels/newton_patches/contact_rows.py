@@ -32,7 +32,7 @@ MASS, MU = wp.constant(24), wp.constant(25)
 """Index of the word of a packed row that holds the effective mass, and of the one that holds the friction coefficient."""
 WARP = wp.constant(32)
 """Number of threads of a warp; each copies one word of a row."""
-THREADS = wp.constant(512)
+THREADS = wp.constant(1024)
 """Number of threads that pack the rows of a world."""
 
 

@@ -6,6 +6,8 @@ wp.set_module_options({"enable_backward": False})
 
 TWIST = wp.constant(6)
 """Components of a twist."""
+BATCH = wp.constant(4)
+"""Number of rows of a body whose loads are in flight together."""
 
 
 @wp.func_native("""
@@ -32,7 +34,7 @@ def first_lane(bits: wp.uint32) -> int:
     ...
 
 
-@wp.kernel
+@wp.kernel(enable_backward=False, module="unique")
 def apply_warm_start_kernel(
     # State:
     row_count: wp.array[int],  # (world)
@@ -50,69 +52,36 @@ def apply_warm_start_kernel(
 ):
     """Warm start: add the impulses λ of the last substep to the bodies, M⁻¹Jᵀλ of their rows to `twist_inout`, Jᵀλ to `body_impulse_inout`.
 
-    Launched over world, body with contacts, twist component; each thread sums its rows in their order. SolverSteel has one thread for each
-    world and component, which walks all rows and waits for each sum. Both sum in the same order, so that results are bitwise identical.
-    """
-    world, slot, axis = wp.tid()
-    if slot >= body_count[world]:
-        return
-    body = body_list[world, slot]
-    velocity = twist_inout[body, axis]
-    total = body_impulse_inout[body, axis]
-    for row in range(wp.min(row_count[world], impulse.shape[1])):
-        strength = impulse[world, row]
-        a = body_a[world, row]
-        b = body_b[world, row]
-        if strength != 0.0:
-            if a == body:
-                velocity = velocity + response_a[world, row, axis] * strength
-                total = total + jacobian_a[world, row, axis] * strength
-            if b == body:
-                velocity = velocity + response_b[world, row, axis] * strength
-                total = total + jacobian_b[world, row, axis] * strength
-    twist_inout[body, axis] = velocity
-    body_impulse_inout[body, axis] = total
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def apply_warm_start_of_many_kernel(
-    # State:
-    row_count: wp.array[int],  # (world)
-    body_count: wp.array[int],  # (world)
-    body_list: wp.array2d[int],  # (world, slot)
-    body_a: wp.array2d[int],  # (world, row)
-    body_b: wp.array2d[int],  # (world, row)
-    jacobian_a: wp.array3d[float],  # (world, row, 6) [1, m]
-    jacobian_b: wp.array3d[float],  # (world, row, 6) [1, m]
-    response_a: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
-    response_b: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
-    impulse: wp.array2d[float],  # (world, row) [N s]
-    twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
-    body_impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
-):
-    """Warm start of worlds of many rows: as `apply_warm_start_kernel`, bit by bit, with a warp a body that votes on 32 rows at a time.
-
-    Launched over world, body with contacts, lane: a block of one warp for each body, on a CPU of one thread.
+    Launched over world, body with contacts, lane: a block of one warp for each body, on a CPU of one thread. The lanes vote on 32 rows at a
+    time, and each of the first six sums one component over the rows of its body, in their order: as SolverSteel, bit by bit, which has one
+    thread for each world and component, that walks all rows and waits for each sum.
     """
     world, slot, lane = wp.tid()
     if slot >= body_count[world]:
         return
     body = body_list[world, slot]
     count = wp.min(row_count[world], impulse.shape[1])
-    for start in range(0, count, wp.block_dim()):
-        mine = start + lane
-        touches = bool(False)
-        if mine < count:
-            touches = impulse[world, mine] != 0.0 and (body_a[world, mine] == body or body_b[world, mine] == body)
-        touching = ballot(touches)
-        while touching != wp.uint32(0):
-            row = start + first_lane(touching)
-            touching = touching & (touching - wp.uint32(1))
-            strength = impulse[world, row]
-            for axis in range(lane, TWIST, wp.block_dim()):
-                if body_a[world, row] == body:
-                    twist_inout[body, axis] = twist_inout[body, axis] + response_a[world, row, axis] * strength
-                    body_impulse_inout[body, axis] = body_impulse_inout[body, axis] + jacobian_a[world, row, axis] * strength
-                if body_b[world, row] == body:
-                    twist_inout[body, axis] = twist_inout[body, axis] + response_b[world, row, axis] * strength
-                    body_impulse_inout[body, axis] = body_impulse_inout[body, axis] + jacobian_b[world, row, axis] * strength
+    for first in range(0, TWIST, wp.block_dim()):
+        axis = wp.min(first + lane, TWIST - 1)
+        velocity = twist_inout[body, axis]
+        total = body_impulse_inout[body, axis]
+        for start in range(0, count, wp.block_dim()):
+            # Choices by `where` instead of branches: no load waits for another.
+            mine = wp.min(start + lane, count - 1)
+            of_body = wp.where(body_a[world, mine] == body, True, body_b[world, mine] == body)
+            touching = ballot(wp.where(impulse[world, mine] != 0.0, of_body, False) and start + lane < count)
+            while touching != wp.uint32(0):
+                for _ in range(BATCH):
+                    # The last batch repeats a row without adding it.
+                    row = start + wp.max(first_lane(touching), 0)
+                    strength = impulse[world, row]
+                    of_a = wp.where(touching != wp.uint32(0), body_a[world, row] == body, False)
+                    of_b = wp.where(touching != wp.uint32(0), body_b[world, row] == body, False)
+                    velocity = wp.where(of_a, velocity + response_a[world, row, axis] * strength, velocity)
+                    total = wp.where(of_a, total + jacobian_a[world, row, axis] * strength, total)
+                    velocity = wp.where(of_b, velocity + response_b[world, row, axis] * strength, velocity)
+                    total = wp.where(of_b, total + jacobian_b[world, row, axis] * strength, total)
+                    touching = touching & (touching - wp.uint32(1))
+        if first + lane < TWIST:
+            twist_inout[body, axis] = velocity
+            body_impulse_inout[body, axis] = total

@@ -16,7 +16,7 @@ from synpick_warp.kernels.sim import arrangement, gripper, rest
 from synpick_warp.kernels.state import Contacts
 from synpick_warp.newton_patches import KNOWN_NEWTON
 from synpick_warp.newton_patches.broad_phase import replace_broad_phase
-from synpick_warp.newton_patches.narrow_phase import complete_matching, resize_blocks
+from synpick_warp.newton_patches.narrow_phase import complete_matching, resize_blocks, small_blocks
 from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import bundle
@@ -233,29 +233,31 @@ class Physics:
         current, following = self.state, self._other
         physics, observables = self.settings, self._observables if watcher is not None else None
         for step, substep in itertools.product(range(physics.steps_per_tick), range(physics.substeps)):
-            if substep == 0:
+            with small_blocks():
+                if substep == 0:
+                    if watcher is not None:
+                        watcher.begin_step()
+                    before_step(current)
+                self.pipeline.collide(current, self.contacts)
+                self.flag_lost()
+                if self.sleepers is not None:
+                    self.sleepers.touch()
+                if after_collide is not None:
+                    after_collide()
+                duration = physics.step / physics.substeps
+                with wp.ScopedStream(solver_stream, sync_exit=True):
+                    self.solver.step(current, following, self.control, self.contacts, duration, observables=observables)
+                if self.sleepers is not None:
+                    self.sleepers.hold(current, following)
+                current, following = following, current
+                ends_step = substep + 1 == physics.substeps
+                if ends_step and current is not self.state:
+                    self.state.assign(current)
+                    current, following = self.state, self._other
                 if watcher is not None:
-                    watcher.begin_step()
-                before_step(current)
-            self.pipeline.collide(current, self.contacts)
-            self.flag_lost()
-            if self.sleepers is not None:
-                self.sleepers.touch()
-            if after_collide is not None:
-                after_collide()
-            with wp.ScopedStream(solver_stream, sync_exit=True):
-                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
-            if self.sleepers is not None:
-                self.sleepers.hold(current, following)
-            current, following = following, current
-            ends_step = substep + 1 == physics.substeps
-            if ends_step and current is not self.state:
-                self.state.assign(current)
-                current, following = self.state, self._other
-            if watcher is not None:
-                watcher.after_solve(self._observables.contact_f)
-                if ends_step:
-                    watcher.end_step(step, current)
+                    watcher.after_solve(self._observables.contact_f)
+                    if ends_step:
+                        watcher.end_step(step, current)
             yield
 
 

@@ -1,0 +1,54 @@
+"""Friction patches of contacts: order of the contacts by pairs of bodies, in place of a radix sort of Newton's."""
+
+import warp as wp
+
+from synpick_warp.kernels.newton_patches.broad_phase import synchronize_block
+
+wp.set_module_options({"enable_backward": False})
+
+FIRST_BODY = wp.constant(wp.int64(32))
+"""Bits of a key below its first body, which counts from 1."""
+
+
+@wp.func
+def find_first(keys: wp.array[wp.int64], count: int, limit: wp.int64) -> int:
+    """Binary search: number of the first `count` keys that are below `limit`; they come first."""
+    low = int(0)
+    high = count
+    while low < high:
+        middle = (low + high) // 2
+        if keys[middle] < limit:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def sort_contacts_kernel(
+    # Scene:
+    bodies: int,  # of a world
+    # Out:
+    key_inout: wp.array[wp.int64],  # (2 * contact): first body << FIRST_BODY | second body or shape, then scratch
+    contact_inout: wp.array[int],  # (2 * contact): index, then scratch
+):
+    """Sort the contacts of each world by their keys, in place: a stable counting sort, by ranks of contacts among those of their world.
+
+    Contacts come world by world, those without a key, the highest number, last. Launched over world, thread: a block of threads per world.
+    """
+    world, thread = wp.tid()
+    capacity = key_inout.shape[0] // 2
+    first = find_first(key_inout, capacity, wp.int64(world * bodies + 1) << FIRST_BODY)
+    end = find_first(key_inout, capacity, wp.int64((world + 1) * bodies + 1) << FIRST_BODY)
+    for contact in range(first + thread, end, wp.block_dim()):
+        key = key_inout[contact]
+        rank = first
+        for other in range(first, end):
+            before = key_inout[other]
+            rank += wp.where(before < key or (before == key and other < contact), 1, 0)
+        key_inout[capacity + rank] = key
+        contact_inout[capacity + rank] = contact_inout[contact]
+    synchronize_block()
+    for place in range(first + thread, end, wp.block_dim()):
+        key_inout[place] = key_inout[capacity + place]
+        contact_inout[place] = contact_inout[capacity + place]
