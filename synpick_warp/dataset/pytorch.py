@@ -33,6 +33,7 @@ def _corners(boxes: np.ndarray) -> np.ndarray:
 FIELDS: Mapping[str, Callable[[View], np.ndarray]] = {
     "rgb": lambda view: np.ascontiguousarray(view.rgb.transpose(2, 0, 1)),
     "depth": lambda view: view.depth[None],
+    "points": lambda view: np.ascontiguousarray(view.points().transpose(2, 0, 1)),
     "masks": lambda view: view.masks,
     "amodal_masks": lambda view: view.amodal_masks,
     "boxes": lambda view: _corners(view.visible_boxes),
@@ -47,11 +48,12 @@ FIELDS: Mapping[str, Callable[[View], np.ndarray]] = {
     "pick_success": lambda view: mean_by_candidate(view.picks)[1].astype(np.float32),
     "pick_weights": lambda view: candidates(view.picks)["weight"],
 }
-"""Contents of a sample. Images: rgb (3, H, W) uint8, depth (1, H, W) float32 [m]. One row per instance of the sample: masks (N, H, W) bool,
-boxes (N, 4) float32 [px] of the visible part, as x_min, y_min, x_max, y_max, object_ids and instance_ids (N,) int64, visibility (N,)
-float32, poses (N, 4, 4) float32, object to camera [m]. Cameras: intrinsics (3, 3) [px], world_to_camera (4, 4) [m], float32. One row per
-grasp candidate of the format picks: pick_pixels (C, 2) int64, column and row, pick_success (C,) float32, the share of successful trials,
-and pick_weights (C,) float32, the inverse of the sampling probability (0: the episode's own grasp)."""
+"""Contents of a sample. Images: rgb (3, H, W) uint8, depth (1, H, W) float32 [m], points (3, H, W) float32 in the camera frame [m], NaN
+where there is no surface. One row per instance of the sample: masks (N, H, W) bool, boxes (N, 4) float32 [px] of the visible part, as
+x_min, y_min, x_max, y_max, object_ids and instance_ids (N,) int64, visibility (N,) float32, poses (N, 4, 4) float32, object to camera [m].
+Cameras: intrinsics (3, 3) [px], world_to_camera (4, 4) [m], float32. One row per grasp candidate of the format picks: pick_pixels (C, 2)
+int64, column and row, pick_success (C,) float32, the share of successful trials, and pick_weights (C,) float32, the inverse of the sampling
+probability (0: the episode's own grasp)."""
 _PER_INSTANCE = ("masks", "amodal_masks", "boxes", "amodal_boxes", "object_ids", "instance_ids", "visibility", "poses")
 _PER_CANDIDATE = ("pick_pixels", "pick_success", "pick_weights")
 

@@ -6,7 +6,7 @@ OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,10 @@ _ORTHOGONAL = 1e-3
 """Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 PIXEL_CENTERS = {"synpick": 0.5, "opencv": 0.0, "open3d": 0.0}
 """Image coordinates of the centre of the first pixel [px], by convention."""
+
+
+_FRAMES = ("camera", "world")
+"""Frames of a point cloud."""
 
 
 class CameraMatrix(np.ndarray):
@@ -259,12 +263,50 @@ class View:
         image = points @ self.intrinsics.T
         return image[..., :2] / image[..., 2:]
 
+    def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Back-projection: points (..., 3) in the camera frame [m] at image positions (..., 2) [px], as `project` has them, and of planar
+        depth (...) [m]."""
+        pixels = np.asarray(pixels, np.float64)
+        if self.lens is not None:
+            rays = self.lens.unproject(pixels)
+        else:
+            rays = np.insert(pixels, 2, 1.0, axis=-1) @ np.linalg.inv(self.intrinsics).T
+            rays = rays[..., :2] / rays[..., 2:]
+        return np.insert(rays, 2, 1.0, axis=-1) * np.asarray(depth, np.float64)[..., None]
+
+    def points(self, frame: str = "camera", depth: np.ndarray | None = None) -> np.ndarray:
+        """Organized point cloud: the point at each pixel's centre (H, W, 3) float32 [m], NaN where there is no surface.
+
+        Args:
+            frame: Frame of the points, "camera" or "world".
+            depth: Planar depth (H, W) [m], 0 without a surface, such as the layer of a simulated sensor; None: `depth`.
+
+        Raises ValueError: there is no such frame."""
+        if frame not in _FRAMES:
+            raise ValueError(f"there is no frame {format_value(frame)}; frames: {', '.join(_FRAMES)}")
+        depth = self.depth if depth is None else depth
+        width, height = self.size
+        if self.lens is not None:
+            points = np.insert(_find_rays(self.lens), 2, 1.0, axis=-1) * depth[..., None]
+        else:
+            points = self.unproject(np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1), depth)
+        if frame == "world":
+            transform = np.linalg.inv(self.world_to_camera)
+            points = points @ transform[:3, :3].T + transform[:3, 3]
+        return np.where(depth[..., None] > 0, points, np.nan).astype(np.float32)
+
     def __len__(self) -> int:
         """Number of instances N."""
         return len(self.records.gt)
 
     def __repr__(self) -> str:
         return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
+
+
+@lru_cache(maxsize=8)
+def _find_rays(lens: LensMap) -> np.ndarray:
+    """Rays of all pixels, `LensMap.rays`, which views of a camera share."""
+    return lens.rays()
 
 
 def read_layer(files: SceneFiles, name: str, frame: int) -> np.ndarray:

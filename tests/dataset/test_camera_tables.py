@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 import zarr
@@ -113,6 +114,12 @@ def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rec
         lines = (tmp_path / "set" / card).read_text().splitlines()
         (first,) = (lines[index + 2] for index, line in enumerate(lines) if line.startswith("# "))
         assert first.startswith("**Pictures are rectified**" if rectified else "**Pictures are distorted** by the lens of bent:")
+    view = synpick_warp.open(tmp_path / "set")[0].view(0, camera=0)
+    rows, columns = np.nonzero(view.depth)
+    points, pixels = view.points()[rows, columns].astype(float), np.stack((columns, rows), axis=-1)
+    there = cv2.projectPoints(points, np.zeros(3), np.zeros(3), view.intrinsics("opencv"), np.array(bent.get("cam_dist", [0.0] * 4)))[0]
+    np.testing.assert_allclose(there[:, 0], pixels, atol=2e-3)
+    np.testing.assert_allclose(view.unproject(pixels + 0.5, view.depth[rows, columns]), points, atol=1e-6)
 
 
 # ---- files of some images only ----
@@ -363,17 +370,13 @@ def test_flow_through_the_moving_camera_leads_to_the_frame_before(drawn_cell):
     scene, checked = synpick_warp.open(drawn_cell)[0], 0
     for frame in range(1, len(scene)):
         now, before = scene.view(frame, 2), scene.view(frame - 1, 2)
-        height, width = now.depth.shape
-        columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = np.stack([columns, rows, np.ones_like(rows)], -1) @ np.linalg.inv(now.intrinsics).T
-        points = rays * now.depth[..., None]
+        points = now.points()
         to_before = before.world_to_camera @ np.linalg.inv(now.world_to_camera)
         then = points @ to_before[:3, :3].T + to_before[:3, 3]
         flow, scene_flow = now.layer("flow"), now.layer("scene_flow")
         # What has no instance stands still, but for the gripper, which is nearer.
-        still = ~now.masks.any(axis=0) & np.isfinite(flow).all(axis=-1) & (points[..., 2] > 0) & (now.depth > 0.48)
-        pixels = then @ before.intrinsics.T
-        expected = pixels[..., :2] / pixels[..., 2:] - np.stack([columns, rows], -1)
+        still = ~now.masks.any(axis=0) & np.isfinite(flow).all(axis=-1) & (now.depth > 0.48)
+        expected = before.project(then) - now.project(points)
         assert still.sum() > 200
         # Depth has steps of 0.1 mm, and flow of 1/64 px.
         assert np.abs(flow - expected)[still].max() < 0.05

@@ -198,6 +198,28 @@ def test_projected_boxes_surround_the_amodal_masks(data):
     )
 
 
+@pytest.mark.parametrize("frame", ["camera", "world"])
+def test_points_lie_on_the_surfaces_of_their_boxes(data, frame):
+    """Largest distance of a visible point to its box is the depth image's rounding; points of the world are the same in all cameras."""
+    for camera in range(len(LENSES)):
+        view = data[0].view(1, camera)
+        points, poses = view.points(frame), view.object_to_camera if frame == "camera" else view.object_to_world
+        assert points.shape == (*view.depth.shape, 3)
+        assert points.dtype == np.float32
+        np.testing.assert_array_equal(np.isnan(points), np.repeat(view.depth[..., None] == 0, 3, axis=-1))
+        for object_id, pose, mask in zip(view.object_ids, poses, view.masks, strict=True):
+            local = (points[mask] - pose[:3, 3]) @ pose[:3, :3]
+            outside = np.abs(local) - np.array(SIZES[int(object_id)]) / 2
+            assert np.abs(outside.max(axis=1)).max() < 1e-4
+        seen = view.masks.any(axis=0)
+        if frame == "camera":
+            rows, columns = np.nonzero(seen)
+            np.testing.assert_allclose(view.project(points[seen]), np.stack((columns, rows), axis=-1) + 0.5, atol=2e-3)
+            np.testing.assert_array_equal(view.points(depth=2 * view.depth)[seen], 2 * points[seen])
+    with pytest.raises(ValueError, match='no frame "object"; frames: camera, world'):
+        view.points("object")
+
+
 def test_cameras_and_intrinsics_for_opencv_with_pixel_centres_at_integers(data):
     """Points that OpenCV projects are half a pixel before ours; arithmetic gives plain arrays."""
     for camera, lens in enumerate(LENSES):
@@ -336,6 +358,7 @@ def test_samples_are_views_in_order_with_what_is_visible_enough(training):
         assert (sample["episode"], sample["camera"], sample["frame"]) == (episode, camera, frame)
         np.testing.assert_array_equal(sample["rgb"], view.rgb.transpose(2, 0, 1))
         np.testing.assert_array_equal(sample["depth"], view.depth[None])
+        np.testing.assert_array_equal(sample["points"], view.points().transpose(2, 0, 1))
         np.testing.assert_array_equal(sample["classes"], view.layer("classes"))
         kept = (view.visibility >= 0.8) & view.masks.any(axis=(1, 2))
         dropped += int((~kept).sum())
