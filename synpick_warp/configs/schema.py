@@ -45,7 +45,7 @@ COLUMN, LAYERED, SCATTERED = "column", "layers", "scattered"
 """Stacks from which objects begin to fall."""
 FILLS = (EXCEED, WITHIN)
 """Rules that end the draw of an episode's objects at the volume budget."""
-OWN_FORMATS = ("bop", "shards", "usd", "zarr", "picks", "lerobot", "coco", "yolo")
+OWN_FORMATS = ("bop", "shards", "usd", "zarr", "picks", "lerobot", "coco", "yolo", "points")
 FORMATS = (*OWN_FORMATS, *plugin_names("formats", OWN_FORMATS))
 """Output formats: of this package, and of others."""
 

@@ -6,7 +6,7 @@ OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -284,12 +284,11 @@ class View:
         Raises ValueError: there is no such frame."""
         if frame not in _FRAMES:
             raise ValueError(f"there is no frame {format_value(frame)}; frames: {', '.join(_FRAMES)}")
+        from synpick_warp.configs.calibration.lens import pixel_rays
+
         depth = self.depth if depth is None else depth
-        width, height = self.size
-        if self.lens is not None:
-            points = np.insert(_find_rays(self.lens), 2, 1.0, axis=-1) * depth[..., None]
-        else:
-            points = self.unproject(np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1), depth)
+        rays = pixel_rays(tuple(self.intrinsics.ravel().tolist()), self.lens, self.size)
+        points = np.insert(rays, 2, 1.0, axis=-1) * depth[..., None]
         if frame == "world":
             transform = np.linalg.inv(self.world_to_camera)
             points = points @ transform[:3, :3].T + transform[:3, 3]
@@ -301,12 +300,6 @@ class View:
 
     def __repr__(self) -> str:
         return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
-
-
-@lru_cache(maxsize=8)
-def _find_rays(lens: LensMap) -> np.ndarray:
-    """Rays of all pixels, `LensMap.rays`, which views of a camera share."""
-    return lens.rays()
 
 
 def read_layer(files: SceneFiles, name: str, frame: int) -> np.ndarray:

@@ -40,6 +40,8 @@ _NOTES = r"camera(?:_[a-z][a-z0-9_]{0,31})?\.json|dataset_info\.md"
 _SCENE_CONSTANTS = rf"{_MODELS}|{_NOTES}|bop_dataset_params\.py"
 _ZARR_ARRAY = r"[a-z_]+/(?:zarr\.json|c(?:\.[0-9]+)*)"
 _STORE = r"trajectory\.zarr"
+POINT_BYTES = 23.0
+"""Size of a point of the format points [B]."""
 
 
 class PartFiles(NamedTuple):
@@ -134,6 +136,12 @@ def _yolo(layout: DataLayout, episode: int) -> str:
     return rf"yolo/(?:(?:{{0}})\.txt|{files})".replace("{0}", _scenes(layout, episode))
 
 
+def _points(layout: DataLayout, episode: int) -> str:
+    """Regular expression that matches the paths of an episode's clouds and lists in the folder of point clouds."""
+    scenes = _scenes(layout, episode)
+    return rf"points/(?:(?:{scenes})\.txt|{re.escape(layout.folder(episode))}/(?:{scenes})/{_INDEX}\.ply)"
+
+
 def _scenes(layout: DataLayout, episode: int) -> str:
     """Alternatives of an episode's scene_ids, one per camera, for a regular expression."""
     return "|".join(f"{scene:06d}" for scene in range(layout.cameras * episode, layout.cameras * (episode + 1)))
@@ -210,6 +218,15 @@ FORMAT_TABLE: dict[str, Format] = {
         sources=lambda _: ("views", "masks"),
         part=PartFiles("yolo", ".txt", 35, per_scene=True),  # A line: an image's name.
         view_bytes=480e3,
+    ),
+    "points": Format(
+        ".bop.points.exporter",
+        "PointsExporter",
+        _NOTES,
+        _points,
+        sources=lambda _: ("views", "masks"),
+        part=PartFiles("points", ".txt", 22, per_scene=True),  # A line: a cloud's name.
+        view_bytes=POINT_BYTES * 1920 * 1080,
     ),
 }
 """Format of this package -> its row."""

@@ -43,7 +43,7 @@ def settings(*formats: str, jpg: bool = False, keypoints: int = 0) -> Config:
 
 WANTED = {
     "source": settings("bop", "zarr"),
-    **{name: settings(name) for name in ("shards", "bop", "lerobot", "usd", "coco", "yolo")},
+    **{name: settings(name) for name in ("shards", "bop", "lerobot", "usd", "coco", "yolo", "points")},
     "keypoints": settings("bop", keypoints=8),
     "keypoints shards": settings("shards", keypoints=8),
     "keypoints coco": settings("coco", keypoints=8),
@@ -84,8 +84,8 @@ def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
 
 
 BAKED = {
-    "source": ("shards", "lerobot", "usd", "coco", "yolo"),
-    "shards": ("bop", "coco", "yolo"),
+    "source": ("shards", "lerobot", "usd", "coco", "yolo", "points"),
+    "shards": ("bop", "coco", "yolo", "points"),
     "keypoints": ("keypoints coco",),
     "keypoints shards": ("keypoints coco", "keypoints"),
     "jpg": ("jpg shards",),
@@ -112,7 +112,7 @@ def test_several_formats_are_converted_at_once(sets, tmp_path):
         assert (tmp_path / "out" / name).read_bytes() == (baked / name).read_bytes()
 
 
-@pytest.mark.parametrize("name", ["lerobot", "coco", "yolo"])
+@pytest.mark.parametrize("name", ["lerobot", "coco", "yolo", "points"])
 def test_sets_without_views_have_episodes_and_attempts(sets, name):
     data = synpick_warp.open(sets[name])
     assert {split: list(part) for split, part in data.splits.items()} == {"train": [0], "test": [1]}
@@ -147,7 +147,7 @@ def test_episodes_that_delivered_nothing_stay_in_the_lists(source, tmp_path):
 @pytest.mark.parametrize(
     ("name", "formats", "error", "message"),
     [
-        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot, coco, yolo; no other format has the physics"),
+        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot, coco, yolo, points; no other format has the physics"),
         ("source", ("hdf5",), ConfigError, "--to names hdf5; allowed"),
         ("source", ("bop",), ConfigError, "has already"),
         ("usd", ("shards",), DatasetError, "has no images"),

@@ -11,6 +11,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+import trimesh
 import zarr
 from pxr import Usd, UsdGeom
 from scipy.spatial.transform import Rotation
@@ -104,7 +105,7 @@ BENT = make_camera("bent", **SIDE, matrix=MATRICES[0].tolist(), distortion=[-0.3
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rectified):
-    bake_cell(tmp_path / "set", cell_config(BENT, **{"bop.rectified": rectified, "bake.formats": ["bop", "shards"]}))
+    bake_cell(tmp_path / "set", cell_config(BENT, **{"bop.rectified": rectified, "bake.formats": ["bop", "shards", "points"]}))
     bent, flat = (json.loads((tmp_path / f"set/train/{scene:06d}/scene_camera.json").read_text())["0"] for scene in (0, 1))
     assert bent["cam_K"] == np.ravel(MATRICES[0]).tolist()
     assert (bent.get("cam_dist"), flat.get("cam_dist")) == (None if rectified else [-0.3, 0.08, 0.0005, -0.0003], None)
@@ -119,6 +120,8 @@ def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rec
     points, pixels = view.points()[rows, columns].astype(float), np.stack((columns, rows), axis=-1)
     there = cv2.projectPoints(points, np.zeros(3), np.zeros(3), view.intrinsics("opencv"), np.array(bent.get("cam_dist", [0.0] * 4)))[0]
     np.testing.assert_allclose(there[:, 0], pixels, atol=2e-3)
+    cloud = trimesh.load(str(tmp_path / "set/points/train/000000/000000.ply")).vertices
+    np.testing.assert_allclose(cloud, view.points("world")[rows, columns], atol=1e-6)
     np.testing.assert_allclose(view.unproject(pixels + 0.5, view.depth[rows, columns]), points, atol=1e-6)
 
 
@@ -134,7 +137,7 @@ CHOSEN = (
 KINDS = ({"depth", "mask", "mask_visib"}, {"rgb", "normals"})
 EPISODES = 2
 GIVEN = {"bake.episodes": EPISODES, "bake.worlds": 2}
-MANY = {"bake.formats": ["bop", "shards", "coco", "yolo", "usd", "zarr"]}
+MANY = {"bake.formats": ["bop", "shards", "coco", "yolo", "points", "usd", "zarr"]}
 LAYERS = {"bake.formats": ["bop", "shards", "zarr"], "render.layers": ["normals", "nocs"]}
 SENSORS = {"bop.layout": "multisensor", "bake.formats": ["bop", "zarr"]}
 SETS = {

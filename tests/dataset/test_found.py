@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 import synpick_warp
 from synpick_warp.dataset.bop.foreign import measure_info
@@ -225,11 +226,14 @@ def test_converted_views_are_those_of_the_source(folders, tmp_path, name, to):
 
 
 def test_each_sensor_becomes_a_scene(folders, tmp_path):
-    convert(folders["multisensor"], "shards,coco,yolo", tmp_path / "out")
+    convert(folders["multisensor"], "shards,coco,yolo,points", tmp_path / "out")
     source, made = synpick_warp.open(folders["multisensor"]), synpick_warp.open(tmp_path / "out")
     assert list(made) == [0, 1, 2]
     for theirs in source.views():
         check_same(theirs, made[theirs.camera].view(theirs.frame))
+        cloud = trimesh.load(str(tmp_path / f"out/points/test/{theirs.camera:06d}/{theirs.frame:06d}.ply"))
+        frame = "world" if "cam_R_w2c" in theirs.records.camera else "camera"
+        np.testing.assert_allclose(cloud.vertices, theirs.points(frame)[theirs.depth > 0], atol=1e-6)
     assert "those of scene s and its sensors " in (tmp_path / "out/dataset_info.md").read_text()
     assert run("validate", tmp_path / "out")[0] == 0
 

@@ -45,7 +45,7 @@ JPEG: dict[str, object] = {"bop.color_format": "jpg", "bop.split": "train_pbr"}
 SETS: dict[str, dict[str, object]] = {
     "smoke": {},
     "picks": {**PICKING, "bake.formats": ["bop", "zarr"], "bop.keypoints": 4},
-    "all": {**JPEG, "bake.formats": ["bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo"], "render.layers": LAYERS},
+    "all": {**JPEG, "bake.formats": ["bop", "shards", "usd", "zarr", "lerobot", "coco", "yolo", "points"], "render.layers": LAYERS},
     "sensors": {**TINY, **JPEG, **EFFECTS, "bake.formats": ["bop", "zarr"], "bop.layout": "multisensor"},
     "reference": {**TINY, "render.mode": "reference", "render.samples": 4, "bake.models": "smoke/models", "arrangement.fill": "within"},
     "unoccluded": {**PICKING, **TINY, "bake.formats": ["shards", "zarr"], "render.mode": "unoccluded", "bake.seed": 7},

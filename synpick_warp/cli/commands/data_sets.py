@@ -118,8 +118,8 @@ def convert(
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
     Formats of images need bop or shards in the data set, those of motion alone (usd) zarr, and lerobot both. Files are those that a bake
-    would have written, but for LeRobot's videos from JPEG images. BOP data sets from other sources become bop, shards, coco or yolo, with
-    their own ids; interrupted, they are converted again from the start. Exit codes: 0, converted; 2, an error.
+    would have written, but for LeRobot's videos from JPEG images. BOP data sets from other sources become bop, shards, coco, yolo or
+    points, with their own ids; interrupted, they are converted again from the start. Exit codes: 0, converted; 2, an error.
     """
     check_range("--threads", threads, 0, MAX_THREADS)
     from synpick_warp.apps.conversion.run import convert as run_conversion

@@ -147,6 +147,18 @@ def make_lens_map(
     return LensMap(Lens(model, coefficients), intrinsics, size)
 
 
+@functools.lru_cache(maxsize=4)
+def pixel_rays(matrix: tuple[float, ...], lens: LensMap | None, size: tuple[int, int]) -> np.ndarray:
+    """Ray (x, y, 1) of each pixel's centre: (height, width, 2) float32, for a camera matrix, row by row [px], unless there is a lens, and
+    an image's width and height [px]."""
+    if lens is not None:
+        return lens.rays()
+    fx, skew, cx, _, fy, cy, *_ = matrix
+    x, y = np.moveaxis(_pixel_centers(size), -1, 0)
+    y = (y - cy) / fy
+    return np.stack(((x - cx - skew * y) / fx, y), axis=-1).astype(np.float32)
+
+
 def with_matrix(lens: LensMap | None, matrix: np.ndarray, size: tuple[int, int] | None = None) -> LensMap | None:
     """The same lens before a sensor with another camera matrix (3, 3) [px], and of another size [px] unless None; None: a pinhole. Raises
     ConfigError: the lens does not cover the image."""

@@ -164,6 +164,8 @@ def _modalities(key: str, chosen: tuple[str, ...], formats: tuple[str, ...], lay
         yield key, f"names of layers that are in render.layers, as {missing[0]} is not"
     if COLOR not in chosen and (found := [name for name in ("lerobot", "coco", "yolo") if name in formats]):
         yield key, f"color among them with the format {found[0]}, which consists of colour images"
+    if DEPTH not in chosen and "points" in formats:
+        yield key, "depth among them with the format points, which is made of it"
 
 
 def _every(key: str, formats: tuple[str, ...], layers: Sequence[str]) -> Iterator[Conflict]:
