@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from trimesh import Trimesh
 from trimesh.intersections import mesh_plane
 
-from synpick_warp.scenes.bin_meshes.inside import HOLE, MIN_DEPTH, BinSurface, spread_points
+from synpick_warp.scenes.bin_meshes.inside import HOLE, MIN_DEPTH, BinSurface
 from synpick_warp.system.linear_algebra import DECIMALS, dot, lstsq
 
 MIN_SIDE = 0.03
@@ -83,7 +83,7 @@ def _measure(surface: BinSurface, opening: np.ndarray, cells: np.ndarray, level:
     plane = (0.0, 0.0, height) if height is not None else _fit_plane(surface, to_rectangle(floor))
     if leans:
         a, b, c = plane
-        feet = spread_points(surface.walls, 0.9 * surface.cell)[0]
+        feet = surface.feet
         feet = feet[feet[:, 2] >= a * feet[:, 0] + b * feet[:, 1] + c - 2.0 * surface.cell * math.hypot(a, b) - BELOW]
         span = _stretch(surface, floor, flat, feet)
         floor = _widen(floor, feet, surface.cell)

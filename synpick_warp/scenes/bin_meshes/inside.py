@@ -5,7 +5,6 @@ where it would spill. Holes of the floor and of the walls do not matter, since n
 where wall: `scenes.bin_meshes.compartments`.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -66,6 +65,8 @@ class BinSurface:
     """Cells whose highest point lies on a leaning wall (nx, ny) bool."""
     walls: np.ndarray
     """Triangles of walls, leaning or upright (F, 3, 3)."""
+    feet: np.ndarray
+    """Sample points of these, less than a cell apart (N, 3)."""
     rim: float
     """Height of the rim."""
     floor: float
@@ -96,41 +97,42 @@ class BinSurface:
 
 def subdivide(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Longest-edge bisection of triangles (F, 3, 3) until no edge exceeds `longest`: the triangles, and the input triangle of each (N,)."""
-    parts = [(batch[..., small], owner[small]) for batch, owner, small, _, _ in _bisect(corners, longest)]
+    parts = _bisect(corners, longest, left=True)
     return np.concatenate([part for part, _ in parts], axis=2).transpose(2, 0, 1), np.concatenate([owner for _, owner in parts])
 
 
 def spread_points(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
     """Sample points (N, 3): triangle corners, midpoints of the edges that `subdivide` splits; and the triangle of each point (N,)."""
-    parts = [(middle, owner) for _, _, _, middle, owner in _bisect(corners, longest)]
+    parts = _bisect(corners, longest)
     points = np.concatenate([corners.reshape(-1, 3).T, *(middle for middle, _ in parts)], axis=1).T
     return points, np.concatenate([np.repeat(np.arange(len(corners)), 3), *(owner for _, owner in parts)])
 
 
-def _bisect(corners: np.ndarray, longest: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Longest-edge bisection (Rivara, 1984), in batches that fit into the processor's cache. Yields for each batch its triangles
-    (corner, coordinate, N) and the indices of their input triangles (N); a mask of those whose edges are at most `longest` (N) bool; for
-    all others the midpoints of their longest edges (3, M) and the indices of their input triangles (M)."""
-    corners = np.ascontiguousarray(corners.transpose(1, 2, 0))
-    edges = np.stack([_distance(corners[k], corners[(k + 1) % 3]) for k in range(3)])
-    waiting = [(corners, edges, np.arange(corners.shape[2]))]
-    while waiting:
-        corners, edges, owner = waiting.pop()
-        if len(owner) > BATCH:
-            waiting += [(corners[..., part], edges[:, part], owner[part]) for part in (slice(BATCH), slice(BATCH, None))]
-            continue
-        first = np.where(edges.max(axis=0) > longest, edges.argmax(axis=0), 3)
-        groups = [np.flatnonzero(first == k) for k in range(3)]
+def _bisect(corners: np.ndarray, longest: float, left: bool = False) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Longest-edge bisection (Rivara, 1984), in batches that fit into the processor's cache. Returns for each batch midpoints of edges that
+    are split (3, N), or with `left` triangles that are not (corner, coordinate, N); and the indices of their input triangles (N)."""
+    a, b, c = np.ascontiguousarray(corners.transpose(1, 2, 0))
+    parts, waiting, found = [(a, b, c, _distance(a, b), _distance(b, c), _distance(c, a), np.arange(len(corners)))], [], []
+    while True:
+        long = [np.maximum(np.maximum(ab, bc), ca) > longest for _, _, _, ab, bc, ca, _ in parts]
+        if left:
+            found += [(np.stack(part[:3])[..., ~mask], part[6][~mask]) for part, mask in zip(parts, long, strict=True)]
+        rows = [np.flatnonzero(mask) for mask in long]
+        fields = [np.concatenate([part[k].take(row, -1) for part, row in zip(parts, rows, strict=True)], -1) for k in range(7)]
+        waiting += [[field[..., first : first + BATCH] for field in fields] for first in range(0, len(fields[6]), BATCH)]
+        if not waiting:
+            return found
+        *points, ab, bc, ca, owner = waiting.pop()
+        other, last, parts = (bc > ab) | (ca > ab), ca > bc, []
         # From the longest edge on: its ends a and b, the third corner c, and the lengths of the other edges.
-        a, b, c = (np.concatenate([corners[k - j].take(rows, axis=1) for k, rows in enumerate(groups)], axis=1) for j in (0, 2, 1))
-        bc, ca = (np.concatenate([edges[k - j].take(rows) for k, rows in enumerate(groups)]) for j in (2, 1))
-        middle, cut = (a + b) / 2.0, owner.take(np.concatenate(groups))
-        yield corners, owner, first == 3, middle, cut
-        if len(cut):
+        for k, mask in enumerate((~other, other & ~last, other & last)):
+            row = np.flatnonzero(mask)
+            a, b, c = (points[(k + j) % 3].take(row, axis=1) for j in range(3))
+            near, far = ((ab, bc, ca)[(k + j) % 3].take(row) for j in (1, 2))
+            middle, cut = (a + b) / 2.0, owner.take(row)
             across = _distance(middle, c)
-            halves = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=2)
-            edges = np.concatenate([np.stack([_distance(a, middle), across, ca]), np.stack([_distance(middle, b), bc, across])], axis=1)
-            waiting.append((halves, edges, np.concatenate([cut, cut])))
+            parts += [(a, middle, c, _distance(a, middle), across, far, cut), (middle, b, c, _distance(middle, b), near, across, cut)]
+            found += [] if left else [(middle, cut)]
 
 
 def _distance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -150,7 +152,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> BinSurface | None:
     start = (low + high)[:2] / 2.0 - np.array(shape) * cell / 2.0
     points, owner = spread_points(corners, 0.9 * cell)
     height, solid = np.full(shape, low[2]), np.zeros(shape, bool)
-    x, y = np.floor((points[:, :2] - start) / cell).astype(int).T
+    x, y = ((points[:, :2] - start) / cell).astype(int).T
     np.maximum.at(height, (x, y), points[:, 2])
     solid[x, y] = True
     level = _flood(height)
@@ -180,7 +182,7 @@ def find_inside(corners: np.ndarray, count: int = CELLS) -> BinSurface | None:
     near = (steepness > 0.5)[owner] & ndimage.binary_dilation(inside)[x, y] & (points[:, 2] >= floor - cell)
     floor = float(points[near, 2].min(initial=floor))
     rim = float(level[inside].max())
-    return BinSurface(start, cell, height, inside, ground, solid, wall, corners[steep], rim, floor, bool(has_floor))
+    return BinSurface(start, cell, height, inside, ground, solid, wall, corners[steep], points[steep[owner]], rim, floor, bool(has_floor))
 
 
 def _close_gaps(height: np.ndarray, solid: np.ndarray, inside: np.ndarray, cell: float) -> np.ndarray:
