@@ -6,6 +6,7 @@ condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -111,7 +112,7 @@ def find_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, to
             return Symmetries(np.zeros((0, 4, 4)), np.zeros(0), _ball(surface, tolerance) or (first,), None)
         flips = sorted((_flip(surface, first, turn) for turn in turns if turn.fold == 2), key=lambda turn: turn.deviation)
         confirmed = (_confirmed(surface, flip, tolerance) for flip in flips if flip.deviation <= tolerance)
-        found = [_confirmed(surface, flip, np.inf) for flip in confirmed if flip.deviation <= tolerance][:1]
+        found = [_confirmed(surface, flip, np.inf) for flip in islice((flip for flip in confirmed if flip.deviation <= tolerance), 1)]
         return Symmetries(
             np.array([turn.matrix() for turn in found]).reshape(-1, 4, 4), np.array([turn.deviation for turn in found]), (first,), missed
         )
