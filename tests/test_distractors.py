@@ -234,7 +234,7 @@ def test_distractors_that_look_like_a_labelled_object_are_left_out(tmp_path):
             mesh.export(tmp_path / folder / f"{name}.stl")
     given = {"randomize.distractors": 1, "bake.models": str(tmp_path / "labelled"), "randomize.distractor_models": str(tmp_path / "others")}
     told: list[str] = []
-    loaded = load_catalog(load_config("smoke", given | {"objects.concave_ratio": 0.0}), tmp_path / "cache", told.append)
+    loaded = load_catalog(load_config("smoke", given | {"objects.concavity": 1.0, "objects.pieces": 1}), tmp_path / "cache", told.append)
     assert [body.name for body in loaded.distractors] == ["carton"]
     said = [line.removeprefix("left out: the distractor ") for line in told if "labelled" in line and "left out" in line]
     pairs = [("drill", "drill"), ("fruit", "banana"), ("tool", "drill")]

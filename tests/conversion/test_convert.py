@@ -333,24 +333,6 @@ np.testing.assert_allclose(view.layer("range"), 1e3 * view.depth * np.linalg.nor
 """
 
 
-def run_with(packages: Path, folder: Path, program: str) -> subprocess.CompletedProcess[str]:
-    """Run a Python program in a folder, with the packages of a second folder installed."""
-    environment = checkout_environment()
-    environment["PYTHONPATH"] += f":{packages}"
-    return subprocess.run([sys.executable, "-c", program], cwd=folder, env=environment, capture_output=True, text=True, check=False)
-
-
-def test_a_package_of_others_bakes_its_format_with_its_gripper_and_layer(tmp_path):
-    settings = PICKING | {"gripper.kind": "triangle", "render.layers": ["range"], "bop.masks": False, "cameras.resolution": [96, 54]}
-    options = ("--formats", "boxes,bop,zarr", "--device", "cpu", *assignments(settings))
-    commands = [["bake", "--config", "smoke", *options, "--out", "DATA"], ["verify", "DATA"]]
-    done = run_with(PLUGINS, tmp_path, f"{RUN_COMMANDS.format(commands)}{READ_RANGE}")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.endswith("[0, 0]\n"), done.stderr
-    assert len(list((tmp_path / "DATA" / "boxes").glob("*/*.json"))) > 10
-    assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
-
-
 BROKEN = {
     ("formats", "absent"): (None, "cannot be loaded: ModuleNotFoundError"),
     ("formats", "wrong"): ("FORMAT =", "cannot be loaded: SyntaxError"),
@@ -360,7 +342,7 @@ BROKEN = {
 """Group and name of what a package adds: its module, and what is said of it."""
 
 
-def test_packages_of_others_that_are_broken_harm_only_what_uses_them(tmp_path, sets):
+def test_packages_of_others_bake_their_format_with_their_gripper_and_layer_and_broken_ones_harm_only_what_uses_them(tmp_path):
     folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
     folder.mkdir(parents=True)
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: broken-extras\nVersion: 1.0\n")
@@ -370,11 +352,19 @@ def test_packages_of_others_that_are_broken_harm_only_what_uses_them(tmp_path, s
         if module is not None:
             (folder.parent / f"broken_{name}.py").write_text(module)
     (folder / "entry_points.txt").write_text("\n".join(itertools.chain.from_iterable(lines.values())))
-    bake = ["bake", "--config", "smoke", "--dry-run"]
+    given = PICKING | {"gripper.kind": "triangle", "render.layers": ["range"], "bop.masks": False, "cameras.resolution": [96, 54]}
+    options = ("--formats", "boxes,bop,zarr", "--device", "cpu", *assignments(given | {"bake.episodes": 1}))
+    bake = ["bake", "--config", "smoke", "--out"]
     uses = [["--formats", name] if group == "formats" else ["--set", f'render.layers=["{name}"]'] for group, name in BROKEN]
-    commands = [["verify", str(sets["source"])], bake, *(bake + use for use in uses)]
-    done = run_with(folder.parent, tmp_path, RUN_COMMANDS.format(commands))
+    commands = [[*bake, "DATA", *options], ["verify", "DATA"], *([*bake, "NONE", *use] for use in uses)]
+    environment = checkout_environment()
+    environment["PYTHONPATH"] += f":{PLUGINS}:{folder.parent}"
+    program = [sys.executable, "-c", f"{RUN_COMMANDS.format(commands)}{READ_RANGE}"]
+    done = subprocess.run(program, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("[0, 0, 2, 2, 2, 2]\n"), done.stderr
+    assert len(list((tmp_path / "DATA" / "boxes").glob("*/*.json"))) > 10
+    assert "triangle" in (tmp_path / "DATA" / "config.toml").read_text()
     errors = [line for line in done.stderr.splitlines() if "error: " in line]
     assert len(errors) == len(BROKEN)
     for (_, name), (_, said), error in zip(BROKEN, BROKEN.values(), errors, strict=True):

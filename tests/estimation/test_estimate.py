@@ -1,10 +1,8 @@
 """Poses by GICP: observed points of boxes lie on the model, disturbed poses come back; and the command, whose files `eval` scores."""
 
 import json
-import os
 import re
 import shutil
-import signal
 import sys
 from pathlib import Path
 
@@ -32,6 +30,7 @@ from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.testing.box_views import SIZES
 from tests.builders import mistake, refusal, run
+from tests.harness.processes import crash
 from tests.worlds.box_sets import write_set
 
 PLAN = ScenePlan(0, 0, 0, (0, 1))
@@ -198,7 +197,7 @@ def test_some_images_have_a_target_list(folder, tmp_path):
 def test_modes_and_episodes_choose(folder, tmp_path):
     out = tmp_path / "pick.csv"
     for options, scenes in ((("--every", 1, "--modes", "pick"), "678"), (("--episodes", "0-0", "--threads", 2, "--seed", 5), "012")):
-        estimated(folder, "--method", "single", *options, "--out", out)
+        estimated(folder, "--method", "refine", *options, "--out", out)
         assert {line.split(",")[0] for line in poses_in(out)[1:]} == set(scenes)
     assert parse_indices("--cameras", "2, 0-1,1") == (0, 1, 2)
     for text in ("", "a", "2-1", "0-99999999", "-1", "1,,2"):
@@ -250,15 +249,10 @@ def test_mistakes_are_one_line(folder, tmp_path, arguments, message):
     assert sorted((*folder.rglob("*"), *tmp_path.rglob("*"))) == before
 
 
-def crash(path: Path, unit: float) -> None:
-    """Stands in for a decoder of images that a model's texture crashes."""
-    os.kill(os.getpid(), signal.SIGSEGV)
-
-
 def test_damaged_sets_and_a_missing_library_are_one_line(bop, tmp_path, monkeypatch):
     def refuse(message: str, folder: Path = bop) -> None:
         out = tmp_path / "out.csv"
-        assert re.search(message, mistake("estimate", "--data", folder, "--method", "single", "--every", 1, "--out", out))
+        assert re.search(message, mistake("estimate", "--data", folder, "--method", "refine", "--every", 1, "--out", out))
         assert not out.exists()
         assert not list(tmp_path.glob("*.json"))
 

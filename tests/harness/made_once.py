@@ -4,6 +4,7 @@ import functools
 import hashlib
 import os
 import pickle
+import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -23,6 +24,8 @@ from tests.harness.charts import render_here
 
 MOST_MAPS = 50
 """Environment maps whose tables are kept."""
+MOST_FILES = 1000
+"""Files of settings whose content is kept."""
 KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_kernel")
 """Functions by which Newton generates kernels anew for each collision pipeline."""
 
@@ -44,7 +47,7 @@ def remembered(make: Callable[..., object]) -> Callable[..., object]:
 
 @contextmanager
 def made_once() -> Iterator[None]:
-    """Tables of environment maps, and Newton's kernels of the narrow phase, are made once a process and its forks.
+    """Tables of environment maps, content of TOML, and Newton's kernels of the narrow phase are made once a process and its forks.
 
     Files are not synchronized with the disk, as no test cuts the power: killed processes leave what they wrote.
     """
@@ -53,6 +56,8 @@ def made_once() -> Iterator[None]:
             patch.setattr(module, name, remembered(getattr(module, name)))
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
+        read = functools.lru_cache(maxsize=MOST_FILES)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))
+        patch.setattr(tomllib, "loads", lambda text: pickle.loads(read(text)))
         patch.setattr(os, "fsync", lambda handle: None)
         patch.setattr(isolation, "IDLE_TIME", 600.0)  # Between two tests that read files half a minute may pass.
         yield

@@ -44,3 +44,8 @@ def _runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def crash(*_: object) -> None:
+    """Stands in for a decoder that a file crashes; here, since the process of an isolated call imports the function's module."""
+    os.kill(os.getpid(), signal.SIGSEGV)

@@ -22,8 +22,9 @@ from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.bin_meshes.loading import load_settings
 from synpick_warp.scenes.bins import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide_walls, make_bins, rim_height, tote_colliders, tote_fixture
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.grippers import HEADS, check_reach, finger_collider, finger_fixture, make_head, measure_tool
+from synpick_warp.scenes.grippers import HEADS, check_reach, finger_collider, finger_fixture, make_head
 from synpick_warp.scenes.modelling import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
+from synpick_warp.scenes.tool_bodies import measure_tool
 from synpick_warp.stages.sim.behavior import BEHAVIORS
 from tests.harness.pieces import assert_closed, felt, filled, is_convex
 from tests.twins.raycast import edges_match, first_hit

@@ -82,9 +82,8 @@ def _measure(surface: BinSurface, opening: np.ndarray, cells: np.ndarray, level:
     span, leans = floor, bool((np.abs(opening - floor) > 0.5 * surface.cell).any())
     plane = (0.0, 0.0, height) if height is not None else _fit_plane(surface, to_rectangle(floor))
     if leans:
-        a, b, c = plane
-        feet = surface.feet
-        feet = feet[feet[:, 2] >= a * feet[:, 0] + b * feet[:, 1] + c - 2.0 * surface.cell * math.hypot(a, b) - BELOW]
+        (x, y, z), (a, b, c) = surface.feet.T, plane
+        feet = surface.feet[z >= a * x + b * y + c - 2.0 * surface.cell * math.hypot(a, b) - BELOW]
         span = _stretch(surface, floor, flat, feet)
         floor = _widen(floor, feet, surface.cell)
         opening = _widen(opening, _cross_section(surface, level - BELOW), surface.cell)
