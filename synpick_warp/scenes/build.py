@@ -152,7 +152,8 @@ def count_distractor_slots(most: int, catalog: Catalog, arrangement: Arrangement
 
 def _count_by_type(drawn: np.ndarray, compound: np.ndarray) -> np.ndarray:
     """Numbers of drawn objects by slot type, single and compound (trial, 2), from catalog indices (trial, capacity), -1: none."""
-    return np.stack([((drawn >= 0) & (compound[drawn] == is_compound)).sum(axis=1) for is_compound in (False, True)], axis=1)
+    compounds = ((drawn >= 0) & compound[drawn]).sum(axis=1)
+    return np.stack([(drawn >= 0).sum(axis=1) - compounds, compounds], axis=1)
 
 
 def _slots_of_trials(drawn: np.ndarray, compound: np.ndarray, shortfall: float) -> tuple[int, int]:

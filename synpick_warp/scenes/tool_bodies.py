@@ -11,16 +11,12 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.meshes import read_cell_mesh, read_measured
 from synpick_warp.scenes.types import TriangleMesh
 
-BODY_SIDES = (0.01, 2.0)
-"""Least and largest longest side of a body [m]."""
-LIKELY_SIDES = (0.03, 1.0)
-"""Of most bodies [m]."""
-ROOM = 0.44
-"""Height above the lips that cups need for their bellows, as a fraction of the cup's length."""
+BODY_SIDES, LIKELY_SIDES = (0.01, 2.0), (0.03, 1.0)
+"""Least and largest longest side of a body, and of most bodies [m]."""
 RIM = 8
 """Points of a cup's rim at which the room is measured."""
-ROOM_TOLERANCE = 1e-5
-"""By which a body may be lower than that [m]: meshes have single precision."""
+ROOM, ROOM_TOLERANCE = 0.44, 1e-5
+"""Height above the lips that cups need for their bellows, in cup lengths; by what a body may be lower [m], as its precision is single."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,9 +23,7 @@ from synpick_warp.system.processes import isolation
 from tests.harness.charts import render_here
 
 MOST_MAPS = 50
-"""Environment maps whose tables are kept."""
-MOST_FILES = 1000
-"""Files of settings whose content is kept."""
+"""Environment maps whose tables, and TOML files whose contents, are kept."""
 KERNELS = ("create_narrow_phase_kernel_gjk_mpr", "create_narrow_phase_primitive_kernel")
 """Functions by which Newton generates kernels anew for each collision pipeline."""
 
@@ -56,7 +54,7 @@ def made_once() -> Iterator[None]:
             patch.setattr(module, name, remembered(getattr(module, name)))
         for name in KERNELS:
             patch.setattr(narrow_phase, name, functools.cache(getattr(narrow_phase, name)))
-        read = functools.lru_cache(maxsize=MOST_FILES)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))
+        read = functools.lru_cache(maxsize=MOST_MAPS)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))
         patch.setattr(tomllib, "loads", lambda text: pickle.loads(read(text)))
         patch.setattr(os, "fsync", lambda handle: None)
         patch.setattr(isolation, "IDLE_TIME", 600.0)  # Between two tests that read files half a minute may pass.

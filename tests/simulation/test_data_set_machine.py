@@ -337,4 +337,4 @@ def _move(source: Path, target: Path) -> None:
 def test_a_planted_bug_of_data_sets_is_found(bug, examples, monkeypatch):
     BUGS[bug](monkeypatch)
     with pytest.raises((AssertionError, SynpickError, pytest.fail.Exception)):
-        run(examples, 12, phases=[Phase.generate])
+        run(examples, 8, phases=[Phase.generate])
