@@ -106,18 +106,20 @@ def test_needs_are_those_of_all_formats(formats):
     assert (needs.slot_bytes == 0) == (formats == ("usd",))
 
 
-TICKS = 100
+TICKS = 40
 """A short soak; `python -m tests.harness.soak` runs 10,000. One writer, so that it has run every type of task by half time."""
+GROWTH = 1.005
+"""Largest growth of memory in the second half; measured: 1.0003."""
 
 
-@pytest.mark.slow(minutes=1)
+@pytest.mark.slow
 def test_memory_and_open_files_stay_constant():
     command = [sys.executable, "-m", "tests.harness.soak", "--ticks", str(TICKS), "--writers", "1"]
     process = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
     samples = json.loads(process.stdout)
     late = slice(len(samples["memory"]) // 2, None)
     assert len(set(samples["files"][late])) == 1
-    assert max(samples["memory"][late]) < 1.02 * min(samples["memory"][late])
+    assert max(samples["memory"][late]) < GROWTH * min(samples["memory"][late])
 
 
 README = Path(synpick_warp.exporters.__file__).with_name("README.md")

@@ -33,7 +33,7 @@ from synpick_warp.views.frames import EpisodeEnd, FrameBatch, TickBatch
 from tests.worlds import trajectories
 
 WORLDS = 2
-FRAMES = 25
+FRAMES = 10
 """Number of frames of an episode."""
 REPEATED = 8
 """Number of distinct frames, which repeat."""

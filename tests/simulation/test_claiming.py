@@ -15,7 +15,7 @@ from tests.simulation.claiming import Schedule, without_formats
 from tests.simulation.scheduler import HungError, Process, Simulation
 
 SCHEDULES, MOST_SCHEDULES = 200, 2000
-"""Schedules of a test, and those in which a planted bug must show."""
+"""Schedules of a test, and those in which a planted bug must show; the rarest does in one of 250."""
 
 
 @pytest.fixture(autouse=True)
