@@ -9,21 +9,25 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import synpick_warp
 from synpick_warp.cli.main import EXIT_MISTAKE
+from synpick_warp.configs.files.write import config_to_toml
 from synpick_warp.dataset.commit import writing
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
+from synpick_warp.factory import pipeline
 from synpick_warp.testing.exporters import digests
 from tests.builders import mistake, run
+from tests.harness import scripted_bake
 from tests.harness.bake_server import TINY, BakeServer
 from tests.harness.processes import kill_after, wait_for
 
@@ -74,22 +78,34 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
 
 
 @pytest.fixture
-def splits(tmp_path) -> str:
-    """Settings with the episodes of `whole` in two splits."""
-    path = tmp_path / "splits.toml"
-    path.write_text('preset = "smoke"\n[splits.train]\nepisodes = 3\n[splits.test]\nepisodes = 1\n')
-    return str(path)
+def scripted(tmp_path, monkeypatch) -> Callable[..., str]:
+    """Function that runs the command `bake` without simulation, for seconds less, and returns what it reports as an error."""
+    monkeypatch.setattr(pipeline, "_fill", scripted_bake.fill)
+
+    def bake(out: Path, *arguments: str, splits: str = "", **given: Any) -> str:
+        config = scripted_bake.settings(EPISODES, tuple(TINY["bake.formats"])).with_values(
+            {"bake.mode": "move", "bop.split": "train", "bop.color_format": "png"} | given
+        )
+        (tmp_path / "scripted.toml").write_text(config_to_toml(config) + splits)
+        ran = run("bake", "--config", tmp_path / "scripted.toml", "--out", out, *arguments)
+        assert (ran.code == 0) == ("error: " not in ran.err), ran.err
+        return ran.err.partition("error: ")[2]
+
+    return bake
+
+
+SPLITS = "\n[splits.train]\nepisodes = 3\n[splits.test]\nepisodes = 1\n"
 
 
 @pytest.mark.slow
-def test_splits_fill_one_folder_in_any_order(server, splits, expected, tmp_path):
+def test_splits_fill_one_folder_in_any_order(scripted, tmp_path):
     """Split by split and shard by shard or all at once: the same files, and the episodes are those of the same indices without splits."""
-    once, parts = tmp_path / "once", tmp_path / "parts"
-    assert server.bake(once, config=splits) == 0
+    once, parts, plain = tmp_path / "once", tmp_path / "parts", tmp_path / "plain"
+    assert (scripted(once, splits=SPLITS), scripted(plain)) == ("", "")
     for arguments in (["--split", "test"], ["--split=train", "--shard=0/2"], ["--split", "train,test"]):
-        assert server.bake(parts, config=splits, arguments=arguments) == 0
+        assert scripted(parts, *arguments, splits=SPLITS) == ""
         assert verify(parts).finished
-    files = digests(once)
+    files, expected = digests(once), digests(plain)
     assert digests(parts) == files
     moved = {name.replace("test_web/", "train_web/").replace("test/", "train/"): digest for name, digest in files.items()}
     images = [name for name in expected if name.endswith((".png", ".tar")) or name.startswith("train/")]
@@ -112,16 +128,14 @@ def test_splits_fill_one_folder_in_any_order(server, splits, expected, tmp_path)
         assert {int(key[:6]) for key in json.loads((once / f"{name}_web" / "key_to_shard.json").read_text())} == set(scenes)
 
 
-@pytest.mark.usefixtures("whole")  # Which has loaded the kernels.
-def test_a_data_set_of_splits_grows_at_its_end_only(server, splits, tmp_path):
-    out, log = tmp_path / "set", tmp_path / "log"
-    settings = {"bake.episodes": 3, "splits.train.episodes": 2, "splits.test.first": 3, "bake.formats": ["zarr"]}
-    assert server.bake(out, config=splits, settings=settings) == 0
+def test_a_data_set_of_splits_grows_at_its_end_only(scripted, tmp_path):
+    out, few, more = tmp_path / "set", *(SPLITS.replace("= 3", f"= {count}") + "first = 3\n" for count in (2, 3))
+    given = {"bake.episodes": 3, "bake.formats": ["zarr"]}
+    assert scripted(out, splits=few, **given) == ""
     assert committed_episodes(out) == [0, 1, 3]
-    assert server.bake(out, config=splits, settings=settings | {"bake.episodes": 4, "splits.train.episodes": 3}) == 0
+    assert scripted(out, splits=more, **given | {"bake.episodes": 4}) == ""
     assert committed_episodes(out) == [0, 1, 2, 3]
-    assert server.bake(out, config=splits, settings=settings, log=str(log)) == EXIT_MISTAKE
-    assert "splits.train.episodes is 2, but" in log.read_text()
+    assert scripted(out, splits=few, **given).startswith("splits.train.episodes is 2, but")
 
 
 def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):
@@ -138,35 +152,40 @@ def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expec
     assert digests(whole) == expected
 
 
-SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
+SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bop.coco": False, "bake.formats": ["bop"], "bake.episodes": 2}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "settings", "options"),
+    ("splits", "given", "options"),
     [
-        ("splits", {"bake.formats": ["bop"]}, (["--split", "train"], ["--split", "test"])),
-        ("sensors", SENSORS, (["--shard", "0/2"], ["--shard", "1/2"])),
+        (SPLITS, {"bake.formats": ["bop"]}, (["--split", "train"], ["--split", "test"])),
+        ("", SENSORS, (["--shard", "0/2"], ["--shard", "1/2"])),
     ],
+    ids=["splits", "sensors"],
 )
-def test_parts_of_splits_and_of_several_sensors_are_merged(server, splits, tmp_path, kind, settings, options):
-    config, parts = splits if kind == "splits" else "smoke", [tmp_path / "first", tmp_path / "second"]
+def test_parts_of_splits_and_of_several_sensors_are_merged(scripted, tmp_path, splits, given, options):
+    parts = [tmp_path / "first", tmp_path / "second"]
     for part, arguments in zip([*parts, tmp_path / "once"], [*options, []], strict=True):
-        assert server.bake(part, config=config, arguments=arguments, settings=settings) == 0
+        assert scripted(part, *arguments, splits=splits, **given) == ""
     assert merge(parts, tmp_path / "merged").missing == []
     assert digests(tmp_path / "merged") == digests(tmp_path / "once")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, number):
+def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log), settings={"bake.worlds": 1})
     wait_for(lambda: len(committed_episodes(out)) >= 1)
-    os.kill(process, number)
-    assert server.wait() == 128 + number
+    os.kill(process, signal.SIGTERM)
+    assert server.wait() == 128 + signal.SIGTERM
     assert "stopping after this tick" in log.read_text()
-    there = stays_whole(server, out, expected)
-    assert f"interrupted: {there} of {EPISODES} episodes are complete" in log.read_text()
+    there = committed_episodes(out)
+    assert 1 <= len(there) < EPISODES
+    assert f"interrupted: {len(there)} of {EPISODES} episodes are complete" in log.read_text()
+    assert (verify(out).problem, verify(out).finished) == ("", False)
+    assert not (out / PARTIAL).exists()
+    assert server.bake(out) == 0
+    assert digests(out) == expected
 
 
 @pytest.mark.slow
@@ -182,48 +201,23 @@ def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
     assert digests(out) == expected
 
 
-# ---- when something fails ----
-
-
-def stays_whole(server: BakeServer, out: Path, expected: dict[str, str]) -> int:
-    """Whole episodes stay of a bake that was stopped, and the next goes on; returns their number."""
-    there = committed_episodes(out)
-    assert 1 <= len(there) < EPISODES
-    assert (verify(out).problem, verify(out).finished) == ("", False)
-    assert not (out / PARTIAL).exists()
-    assert server.bake(out) == 0
-    assert digests(out) == expected
-    return len(there)
-
-
-def fails(server: BakeServer, log: Path, said: str) -> None:
-    """The bake that runs ends with exit code 2, and one line."""
-    assert server.wait() == 2
-    assert log.read_text().splitlines()[-1].startswith(f"synpick-warp: error: {said}")
-
-
 @pytest.mark.slow
-def test_the_folder_is_removed(server, expected, tmp_path):
-    out, log = tmp_path / "set", tmp_path / "log"
-    server.start(out, log=str(log))
-    wait_for(lambda: len(committed_episodes(out)) >= 1)
-    out.rename(tmp_path / "moved")
-    fails(server, log, f"{out} was removed while the bake wrote to it")
+def test_the_folder_is_removed(scripted, tmp_path, monkeypatch):
+    """After the first of four episodes."""
+    out, moved, write = tmp_path / "set", tmp_path / "moved", scripted_bake._write_episode
+
+    def write_elsewhere(*arguments: Any) -> Any:
+        monkeypatch.setattr(scripted_bake, "_write_episode", write)
+        row = write(*arguments)
+        out.rename(moved)
+        return row
+
+    monkeypatch.setattr(scripted_bake, "_write_episode", write_elsewhere)
+    assert scripted(out).startswith(f"{out} was removed while the bake wrote to it")
     assert not out.exists()
-    assert server.bake(tmp_path / "moved") == 0
-    assert digests(tmp_path / "moved") == expected
-
-
-@pytest.mark.slow
-def test_a_file_that_cannot_be_written(server, expected, tmp_path):
-    """The size of files is limited, as on a full disk: pictures can be written, an episode's lists cannot. The set, begun with other worlds
-    and writers, grows."""
-    out, log = tmp_path / "set", tmp_path / "log"
-    assert server.bake(out, settings={"bake.episodes": 2, "bake.worlds": 1, "bake.writers": 2, "render.views_per_batch": 2}) == 0
-    assert verify(out).finished
-    server.start(out, log=str(log), alone=True, most_bytes=10_000)
-    fails(server, log, "cannot write ")
-    stays_whole(server, out, expected)
+    assert committed_episodes(moved) == [0]
+    assert (scripted(moved), scripted(tmp_path / "whole")) == ("", "")
+    assert digests(moved) == digests(tmp_path / "whole")
 
 
 # ---- verify ----

@@ -9,7 +9,6 @@ import contextlib
 import ctypes
 import json
 import os
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -77,7 +76,7 @@ class BakeServer:
         self._process.wait(300)
 
     def start(self, out: Path, **options: object) -> int:
-        """Start a bake; returns its process id. Options: settings, arguments, and the fault injections of `_prepare`."""
+        """Start a bake; returns its process id. Options: config, settings, arguments, log, and allocated, a byte."""
         if self._running:
             self.wait()  # A test failed before it waited for its bake.
         self._send({"out": str(out), **options})
@@ -135,33 +134,14 @@ def _serve() -> None:
             continue
         child = os.fork()
         if child == 0:
-            _prepare(request)
+            if "allocated" in request:
+                _fill_allocations(request["allocated"])
             with open(request.get("log", os.devnull), "a") as log:
                 os.dup2(log.fileno(), 2)
             os._exit(commands.main(arguments(request)))
         os.write(answer, f"{child}\n".encode())
         _, status = os.waitpid(child, 0)
         os.write(answer, f"{os.waitstatus_to_exitcode(status)}\n".encode())
-
-
-def _prepare(request: dict) -> None:
-    """Inject the faults that a request names."""
-    from synpick_warp.exporters.writing.pool import WriterPool
-    from synpick_warp.factory import picks, pipeline
-
-    if "rounds" in request:
-        picks.BATCH_ROUNDS = request["rounds"]
-    if "alone" in request:
-        # Write files in the bake's own process.
-        def make_inline_pool(_: int, slot_bytes: int, inherited_handle: int) -> WriterPool:
-            pool = WriterPool(0, slot_bytes, inherited_handle)
-            if "most_bytes" in request:
-                resource.setrlimit(resource.RLIMIT_FSIZE, (request["most_bytes"],) * 2)
-            return pool
-
-        pipeline.WriterPool = make_inline_pool
-    if "allocated" in request:
-        _fill_allocations(request["allocated"])
 
 
 def _fill_allocations(value: int) -> None:

@@ -72,29 +72,44 @@ def bake_episodes(
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
-        if output.is_finished:
-            return summary
-        with WriterPool(0, needs.slot_bytes, output.lock) as pool:
-            exporters = Exporters(needs.classes, ExportContext(out, ExportSettings.of(config), box_views.catalog(), _LENSES, skies(), pool))
-            output.prepare(exporters, INPUTS, pool)
-            queue = output.remaining[:stop_after]
-            while queue:
-                episode = queue.pop(0)
-                if progress is not None:
-                    progress.stage(f"episode {episode}")
-                summary.episodes.append(_write_episode(output, exporters, pool, episode, picks))
-                if grows:
-                    assert isinstance(episodes, EpisodeSource)
-                    found = episodes.more(not queue)
-                    queue += found
-                    summary.total += len(found)
-            pool.wait()
-            exporters.close()
-            if deliver is not None:
-                deliver()
-            elif stop_after is None:
-                finalize_data_set(out, ExportSettings.of(config), needs.classes, pool)
+        if not output.is_finished:
+            fill(output, episodes if grows else (), needs, (), summary, progress, deliver, stop_after=stop_after, picks=picks)
     return summary
+
+
+def fill(
+    output: OutputFolder,
+    source: object,
+    needs: Needs,
+    _: Sequence[str],
+    summary: BakeSummary,
+    progress: Progress | None,
+    deliver: Callable[[], None] | None = None,
+    *__: object,
+    stop_after: int | None = None,
+    picks: bool = False,
+) -> None:
+    """Write the remaining episodes, and those of the source, in place of `factory.pipeline._fill`."""
+    settings = ExportSettings.of(output.config)
+    with WriterPool(0, needs.slot_bytes, output.lock) as pool:
+        exporters = Exporters(needs.classes, ExportContext(output.out, settings, box_views.catalog(), _LENSES, skies(), pool))
+        output.prepare(exporters, INPUTS, pool)
+        queue = output.remaining[:stop_after]
+        while queue:
+            episode = queue.pop(0)
+            if progress is not None:
+                progress.stage(f"episode {episode}")
+            summary.episodes.append(_write_episode(output, exporters, pool, episode, picks))
+            if isinstance(source, EpisodeSource):
+                found = source.more(not queue)
+                queue += found
+                summary.total += len(found)
+        pool.wait()
+        exporters.close()
+        if deliver is not None:
+            deliver()
+        elif stop_after is None:
+            finalize_data_set(output.out, settings, needs.classes, pool)
 
 
 def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> EpisodeOutcome:
