@@ -61,11 +61,12 @@ def blocks(document: str) -> list[tuple[str, str]]:
 
 def run_blocks(document: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **quick: object) -> str:
     """Execute the code blocks of a document in a folder; returns their output. Commands and Python code run in this process, which has the
-    kernels loaded, except for PyTorch's data loader, which forks. `quick`: settings that are added to `bake`."""
+    kernels loaded, except for PyTorch's data loader, which forks. `quick`: settings that are added to bakes."""
     stubs = [] if importlib.util.find_spec("torch") else [str(ROOT / "tests" / "stubs")]
     paths = os.pathsep.join([*stubs, *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]))
     monkeypatch.chdir(folder)
+    monkeypatch.setattr(synpick_warp, "bake", lambda *given, real=synpick_warp.bake: real(*given[:2], quick | given[2]))
     said = ""
     for language, text in blocks(document):
         parts = [text] if language == "python" else re.split(r"^(synpick-warp .*)\n", text, flags=re.MULTILINE)
@@ -90,7 +91,7 @@ def run_blocks(document: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **q
 @pytest.mark.slow(minutes=1)
 def test_the_lines_of_the_readme_run_as_written(tmp_path, monkeypatch):
     assert [language for language, _ in blocks(README)].count("python") == 3
-    run_blocks(README, tmp_path, monkeypatch, **STIRRING)
+    run_blocks(README, tmp_path, monkeypatch, **STIRRING | {"cameras.resolution": [160, 90]})
     assert (tmp_path / "DATA.png").stat().st_size > 10_000
     assert (tmp_path / "view.png").stat().st_size > 10_000
 

@@ -194,7 +194,7 @@ def test_without_a_gpu_all_is_the_cpu(machine, monkeypatch):
 
 # ---- bakes on several devices, here processes of the CPU ----
 
-EPISODES = 4
+EPISODES = 3
 SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": ["bop"], "arrangement.max_objects": 2, "render.layers": []}
 SETTINGS |= TINY_PICKS
 """Objects are the embedded ones: each process loads them for itself."""
@@ -211,14 +211,13 @@ def bake(out: Path, *arguments: str) -> int:
 
 @pytest.mark.slow
 def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path, capsys, monkeypatch):
-    """Begun on one device, continued on two, of which one is killed with an episode left, and finished on one."""
+    """Begun on two devices, of which one is killed with an episode left, and finished on one."""
     one, several = tmp_path / "one", tmp_path / "several"
     assert bake(one, "--device", "cpu") == 0
-    assert bake(several, "--device", "cpu", "--episodes", "1") == 0
     monkeypatch.setattr(pipeline, "_DEVICE_PROGRAM", program("lose_one"))
     assert bake(several, "--devices", "cpu,cpu") == EXIT_MISTAKE
     there = committed_episodes(several)
-    assert 2 <= len(there) < EPISODES
+    assert 1 <= len(there) < EPISODES
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("synpick-warp: error: ")]
     assert "lost cpu: its process was ended by SIGKILL" in line
     assert f"{len(there)} of {EPISODES} episodes are complete; the same command resumes" in line

@@ -228,7 +228,8 @@ def test_a_gpu_gets_worlds_enough_that_their_number_does_not_matter(cuda, asked,
 # ---- graph capture ----
 
 CUBES, TICKS = 8, 5
-MAX_TICKS = 60
+MAX_TICKS = 24
+"""Ticks in which one object is picked: both worlds lift it from tick 13 on."""
 
 
 @pytest.fixture(autouse=True)
