@@ -182,8 +182,7 @@ def stream(
         SynpickError: An error that the user can correct, before the first batch or while one is made.
     """
     with collection_paused():
-        from synpick_warp.online.settings import resolve_settings
-        from synpick_warp.online.stream import Selection, open_stream
+        from synpick_warp.online.stream import Selection, open_stream, resolve_settings
         from synpick_warp.system.progress import LoggedProgress
 
     given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
@@ -365,7 +364,7 @@ def evaluate(
     """
     import json
 
-    from synpick_warp.apps.evaluation.run import score_files
+    from synpick_warp.apps.evaluation.results import score_files
     from synpick_warp.apps.evaluation.tables import render as render_table
     from synpick_warp.apps.evaluation.tracking import check_alpha
     from synpick_warp.cli.commands.evaluate import check_options

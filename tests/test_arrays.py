@@ -19,7 +19,7 @@ from synpick_warp.stages.host_copies import TransferSettings
 from synpick_warp.stages.launch import launch
 from synpick_warp.stages.online.batches import allocate_slot
 from synpick_warp.stages.perception.images import allocate_batch, count_views
-from synpick_warp.stages.perception.plan import allocate_votes
+from synpick_warp.stages.perception.perceive import allocate_votes
 from synpick_warp.stages.render.denoised import scratch_sizes
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.sampling_rates import FIRST_FRAME_PATHS, first_frame_paths, paths_per_coarse_pixel

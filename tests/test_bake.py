@@ -18,7 +18,7 @@ from synpick_warp.cli import main as commands
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError, OutputError
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.factory import picks, pipeline
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake

@@ -27,7 +27,7 @@ import warp as wp
 
 import synpick_warp
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.stages.launch import launch
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing import box_views

@@ -19,7 +19,7 @@ from synpick_warp.stages import host_copies, view_ring
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.host_copies import HostCopy
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.render.mask_runs import FIELDS, boundary_sizes
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds

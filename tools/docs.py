@@ -15,9 +15,8 @@ from synpick_warp.configs.calibration.tables import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import Setting, settings_of
-from synpick_warp.configs.files.load import sections, table_lists
+from synpick_warp.configs.files.load import format_toml, sections, table_lists
 from synpick_warp.configs.files.table_lists import SPLITS
-from synpick_warp.configs.files.write import format_toml
 from synpick_warp.configs.schema import Split
 from tools.figures import figures_tables, read_runs
 
@@ -60,12 +59,10 @@ def _sensors() -> list[str]:
 
 
 def _anchor(title: str) -> str:
-    """Anchor of a section's heading in the generated page."""
     return f"section-{title.strip('[]').partition('.')[0].replace('_', '-')}"
 
 
 def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
-    """Rows of a section: its title and meaning, then its settings."""
     lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | **{" ".join((kind.__doc__ or "").split())}**']
     for name, item in settings_of(kind).items():
         if name == _MEASURED:

@@ -20,8 +20,7 @@ import numpy as np
 from PIL import Image as PillowImage
 
 import synpick_warp
-from synpick_warp.apps.viz.drawing import FONT, instance_color, put_text, write_picture
-from synpick_warp.apps.viz.false_colors import color_depth, draw_layer
+from synpick_warp.apps.viz.drawing import FONT, color_depth, draw_layer, instance_color, put_text, write_picture
 from synpick_warp.dataset.reading import Episode
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import SynpickError

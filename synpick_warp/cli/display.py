@@ -209,7 +209,6 @@ def _listing(rows: Sequence[EpisodeOutcome]) -> Table:
 
 
 def _counts(summary: BakeSummary) -> Table:
-    """Table of episodes and frames by mode and ending."""
     table = Table("mode", "ending", "episodes", "frames")
     table.columns[2].justify = table.columns[3].justify = "right"
     episodes: Counter = Counter()

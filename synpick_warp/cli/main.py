@@ -12,19 +12,16 @@ from cyclopts import App, Parameter
 
 from synpick_warp._version import __version__
 from synpick_warp.cli import options
-from synpick_warp.cli.commands.data_sets import convert, show_statistics, write_page
-from synpick_warp.cli.commands.estimate import estimate
-from synpick_warp.cli.commands.evaluate import evaluate
+from synpick_warp.cli.commands.data_sets import convert, prove, show_statistics, validate, verify, write_page
+from synpick_warp.cli.commands.evaluate import estimate, evaluate
 from synpick_warp.cli.commands.new_cell import new_cell
 from synpick_warp.cli.commands.pictures import explain, preview
-from synpick_warp.cli.commands.validate import prove, validate, verify
-from synpick_warp.cli.folders import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
+from synpick_warp.cli.options import DEFAULT_NAME, check_output_file, drop_fetched, name_fetched
 from synpick_warp.cli.streams import StreamError, describe_fault, flush_output, safe_streams
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.fields import PATH_RULE, settings_of
-from synpick_warp.configs.files.load import COMMAND_LINE, DEFAULT_PRESET, describe_presets, parse_assignment, preset_names, sections
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files import load
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.scenes.bin_meshes.loading import load_settings
@@ -58,7 +55,7 @@ app = App(
 def _help(key: str, extra: str = "") -> str:
     """Help text of a setting from its declaration: meaning, range, default, unit and key."""
     section, name = key.split(".")
-    item = settings_of(sections()[section])[name]
+    item = settings_of(load.sections()[section])[name]
     unit = f" {item.unit}" if item.unit else ""
     default = "x".join(map(str, item.default)) if isinstance(item.default, tuple) else str(item.default) or "empty"
     rule = "" if item.kind is str and not item.choices else f"{describe_allowed(item)}; "
@@ -66,7 +63,7 @@ def _help(key: str, extra: str = "") -> str:
 
 
 ConfigOption = Annotated[
-    str | None, Parameter(name="--config", help=f"Preset ({', '.join(preset_names())}) or .toml file (default {DEFAULT_PRESET}).")
+    str | None, Parameter(name="--config", help=f"Preset ({', '.join(load.preset_names())}) or .toml file (default {load.DEFAULT_PRESET}).")
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -261,9 +258,9 @@ def show_config(
 ) -> int:
     """Print all settings as TOML with meaning, unit and range: a template for your own file."""
     if presets:
-        print(*(f"{name:18}{text}" for name, text in describe_presets().items()), sep="\n")
+        print(*(f"{name:18}{text}" for name, text in load.describe_presets().items()), sep="\n")
         return 0
-    print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
+    print(load.config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
     return 0
 
 
@@ -324,11 +321,11 @@ def _resolve(
     config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None, *, splits: bool = False
 ) -> Config:
     """Resolve settings from file and options; named options override --set."""
-    overrides = dict(parse_assignment(text) for text in assignments or [])
+    overrides = dict(load.parse_assignment(text) for text in assignments or [])
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
         overrides["cameras.resolution"] = options.parse_resolution(resolution)
-    return load_settings(config, overrides, source=COMMAND_LINE, splits=splits)
+    return load_settings(config, overrides, source=load.COMMAND_LINE, splits=splits)
 
 
 def check_trace_file(trace: Path, out: Path) -> None:

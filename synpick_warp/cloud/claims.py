@@ -272,7 +272,6 @@ class Chunks:
         return sum(end - start for number, (start, end) in enumerate(self.sizes.bounds()) if number in over)
 
     def _key(self, number: int) -> str:
-        """Key of a chunk's lease."""
         return f"{self._place}/{number:06d}"
 
     def _state(self) -> tuple[set[int], set[int]]:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from synpick_warp.configs.dataset import DataLayout
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,

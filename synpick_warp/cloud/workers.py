@@ -20,9 +20,9 @@ from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.devices import DeviceProcesses
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.order import deal_writers
+from synpick_warp.factory.forecast import deal_writers
+from synpick_warp.factory.memory_plan import count_writers, pick_processes
 from synpick_warp.factory.pipeline import bake_episodes, with_measures
-from synpick_warp.factory.sizes import count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
@@ -43,14 +43,8 @@ def start_bake(
     workers: int = 0,
     crew: Crew | None = None,
 ) -> BakeSummary:
-    """Bake a data set into an object store; other arguments as of `run.bake_into_store`.
-
-    Args:
-        job: What to bake.
-        splits: Those of the job.
-        engine: Cluster of claiming workers, as of `ray_engine.bake_with_ray`; empty: none.
-        workers: Number of the engine's workers.
-        crew: Receives number and time of the workers of an engine, or of claiming ones on these devices, for a display.
+    """Bake a data set into an object store; other arguments as of `synpick_warp.bake`. `crew` receives number and time of the workers of an
+    engine, or of claiming ones on these devices, for a display.
 
     Raises ConfigError: claims share out the episodes, and so does `shard`; a cluster's devices are its own; SynpickError: as
     `run.bake_into_store`."""

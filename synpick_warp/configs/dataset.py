@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from synpick_warp.configs.cell.bins import BinSizes
-from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.cell.sensors import effect_ranges
+from synpick_warp.configs.cell.cameras import Rig, effect_ranges
 from synpick_warp.configs.check import to_index
 from synpick_warp.configs.schema import CYCLE, MIXED, MODES, MULTISENSOR, Bake, Bop, Config, Gripper, Physics, Render, Split, Trajectory
 from synpick_warp.errors import ConfigError, format_value, suggest

@@ -91,7 +91,6 @@ def settings_of(kind: type[Any]) -> dict[str, Setting]:
 
 
 def _read(annotation: Any, item: dataclasses.Field[Any]) -> Setting:
-    """Setting of a field."""
     bounds = Bounds()
     if typing.get_origin(annotation) is Annotated:
         annotation, bounds = annotation.__origin__, Bounds.parse(annotation.__metadata__[0])

@@ -11,10 +11,8 @@ from typing import Annotated, Any
 
 from synpick_warp.codes import MAX_INSTANCES, Tone, names
 from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, Tote
-from synpick_warp.configs.cell.cameras import CameraRow, Cameras
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, DepthSensor, Effects, Rig
 from synpick_warp.configs.cell.gripper import Gripper, Suction
-from synpick_warp.configs.cell.rig import Rig
-from synpick_warp.configs.cell.sensors import DepthSensor, Effects
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize

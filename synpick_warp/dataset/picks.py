@@ -92,7 +92,6 @@ class PickTables:
 
 
 def _read(path: Path, columns: Sequence[PickColumn]) -> np.recarray:
-    """Read a table, and check it against its columns."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 from synpick_warp.configs.dataset import DataLayout, episode_range
 from synpick_warp.dataset import trajectory
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
-from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
-from synpick_warp.dataset.commit.plausibility import check_frames
+from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, check_frames, episode_entry, read_checksums
 from synpick_warp.dataset.picks import PickTables
 from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.errors import DatasetError, format_value
@@ -35,8 +34,7 @@ if TYPE_CHECKING:
 
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.bop.foreign import ForeignScenes
-    from synpick_warp.dataset.tracks import Track, Tracks
-    from synpick_warp.dataset.view import View
+    from synpick_warp.dataset.view import Track, Tracks, View
     from synpick_warp.dataset.view_files import SceneFiles
     from synpick_warp.scenes.types import Camera
 
@@ -70,7 +68,6 @@ class Episode(PickTables):
 
     @cached_property
     def _context(self) -> trajectory.GroupContext:
-        """Sizes and files that the arrays must agree with."""
         return trajectory.GroupContext(lambda: self._sizes, lambda: self._files)
 
     @cached_property
@@ -82,7 +79,6 @@ class Episode(PickTables):
 
     @cached_property
     def _files(self) -> frozenset[Path]:
-        """Paths of the episode's files, relative to the data set."""
         return self._data_set.listed_files(episode_entry(self.index))
 
     def _arrays(self, name: str) -> trajectory.Arrays:
@@ -156,7 +152,7 @@ class Episode(PickTables):
     def tracks(self) -> Tracks:
         """Every instance over cameras and time: poses, visibility and boxes as arrays, by instance id. Raises DatasetError if the data set
         has no images."""
-        from synpick_warp.dataset.tracks import Tracks
+        from synpick_warp.dataset.view import Tracks
 
         return Tracks(self.views(), self._data_set.camera_count, len(self))
 
@@ -274,7 +270,7 @@ class DataSet(Mapping[int, Episode]):
     def models_info(self) -> dict[int, dict[str, Any]]:
         """Object id -> its entry of BOP's models_info.json: diameter, box and symmetries [mm]. Raises DatasetError if the data set has no
         models, as it has neither the format bop nor shards."""
-        from synpick_warp.dataset.bop.models import INFO, models_folder
+        from synpick_warp.dataset.bop.layout import INFO, models_folder
 
         return read_checked(self.folder / models_folder(self.folder) / INFO, dict[Key, ModelInfo])
 

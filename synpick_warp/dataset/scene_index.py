@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.cell.cameras import Size
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE
 from synpick_warp.errors import DatasetError

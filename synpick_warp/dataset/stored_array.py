@@ -26,8 +26,8 @@ from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.trajectory import GROUP_FILE, MAX_METADATA, MAX_STEPS_PER_TICK, GroupContext
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.trajectory.arrays import LABELS, TrajectoryArray
+from synpick_warp.system.hardware.cores import ZARR_THREADS
 from synpick_warp.system.inputs.files import check_regular_file, describe_bytes
-from synpick_warp.system.processes.threads import ZARR_THREADS
 
 zarr.config.set(ZARR_THREADS)
 

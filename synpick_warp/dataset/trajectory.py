@@ -125,7 +125,6 @@ def read_cameras(store: Path, count: int | None, context: GroupContext | None = 
 
 
 def _read_columns(arrays: Arrays, schema: GroupSpec, folder: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of a table."""
     if missing := sorted(set(schema.arrays) - set(arrays)):
         raise DatasetError(f"{folder} has no array {missing[0]}; {ADVICE}")
     return {name: read_array(arrays[name]) for name in schema.arrays}

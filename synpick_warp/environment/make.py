@@ -14,9 +14,8 @@ from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.errors import ConfigError
 from synpick_warp.factory.assembly import build_online
 from synpick_warp.factory.memory_plan import explain_shortage
-from synpick_warp.online.settings import resolve_settings
-from synpick_warp.stages.environment.sight import Sight
-from synpick_warp.stages.environment.worlds import EnvironmentWorlds, TwistLaw
+from synpick_warp.online.stream import resolve_settings
+from synpick_warp.stages.environment.worlds import EnvironmentWorlds, Sight, TwistLaw
 from synpick_warp.stages.sim.trials import TrialLaw, make_course
 from synpick_warp.system.progress import LoggedProgress, Progress
 

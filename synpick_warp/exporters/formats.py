@@ -2,7 +2,7 @@
 
 How to add a format:
 
-1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (`staging.py`) stages and commits for it. A format of views is a
+1. Write a class that implements `Exporter` (`base.py`). `EpisodeExporter` (there) stages and commits for it. A format of views is a
    `SceneExporter` (`bop/scene_exporter.py`), which hands it encoded views, in a subpackage of `bop/`: follow `bop/yolo/`. A format of ticks
    is a subpackage beside it: follow `usd/exporter.py`. Views come in any order, from several processes: for one file a scene, append
    records, and sort and count them in the commit task, as `bop/coco/` does. Name the subpackage in the import contract of its folder in
@@ -13,7 +13,7 @@ How to add a format:
    Bake once, and run `verify`.
 
 Nothing else in the package lists formats: bakes, `convert`, `merge`, `verify`, the manifest and the reader take them from here. Tests of
-the table, of conversion and of the command line name what they expect, and `tools/compare/guard_steps.py` what it bakes. Imports no
+the table, of conversion and of the command line name what they expect, and `tools/compare/guard.py` what it bakes. Imports no
 format and no NumPy.
 """
 
@@ -149,7 +149,7 @@ def _scenes(layout: DataLayout, episode: int) -> str:
 
 FORMAT_TABLE: dict[str, Format] = {
     "bop": Format(
-        ".bop.exporter",
+        ".bop.scene_exporter",
         "BopExporter",
         _SCENE_CONSTANTS,
         _bop,

@@ -9,8 +9,7 @@ import pyarrow.parquet as pq
 
 from synpick_warp.codes import Ending, names
 from synpick_warp.configs.dataset import DataLayout
-from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
+from synpick_warp.exporters.base import EpisodeExporter, SharedFiles, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors, sync_file, sync_folder
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.views.frames import EpisodeEnd

@@ -14,19 +14,17 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Ending, Status
-from synpick_warp.configs.cell.cameras import COLOR
+from synpick_warp.configs.cell.cameras import COLOR, Rig
 from synpick_warp.configs.cell.gripper import describe_forces
-from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.factory.episodes import PLACES, EpisodeOutcome
-from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
-from synpick_warp.factory.order import order_longest_first
+from synpick_warp.factory.forecast import order_longest_first
+from synpick_warp.factory.memory_plan import check_memory, count_writers, explain_shortage, fit_to_device, plan_memory, without_pictures
 from synpick_warp.factory.picks import PickEngine, PickQueue
-from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.kernels.render.lighting.brdf import measure_albedo_kernel
 from synpick_warp.kernels.render.lighting.paths.coarse import trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel

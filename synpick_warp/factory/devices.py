@@ -31,9 +31,8 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.forecast import check_disk, forecast_bake
-from synpick_warp.factory.order import deal_episodes, deal_writers, order_longest_first
-from synpick_warp.factory.sizes import count_writers
+from synpick_warp.factory.forecast import check_disk, deal_episodes, deal_writers, forecast_bake, order_longest_first
+from synpick_warp.factory.memory_plan import count_writers
 from synpick_warp.scenes.build import REPEATS, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -41,11 +40,11 @@ from synpick_warp.scenes.looks import Looks, load_looks
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.render.lamp_variants import load_scene_lights
 from synpick_warp.stages.render.suction_surface import with_suctionable_area
-from synpick_warp.system.hardware.caches import KERNEL_VARIABLE
 from synpick_warp.system.hardware.device import describe_kinds, pick_device
+from synpick_warp.system.hardware.kernels import KERNEL_VARIABLE
 from synpick_warp.system.interpreter import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.processes.interrupt import StopRequest
-from synpick_warp.system.processes.worker import END_TIMEOUT, WorkerProcess, send, start_process
+from synpick_warp.system.processes.pool import END_TIMEOUT, WorkerProcess, send, start_process
 from synpick_warp.system.progress import Progress
 
 _INTERVAL = 0.1

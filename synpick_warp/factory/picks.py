@@ -15,10 +15,9 @@ from synpick_warp.codes import Outcome
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import Picks
 from synpick_warp.stages.perception.candidates import CandidateSampler
-from synpick_warp.stages.sim.choices import Choice, ChoiceReader, ChoiceRecorder
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.states import State
-from synpick_warp.stages.sim.trials import BATCH_ROUNDS, Trials, count_trial_worlds, trial_values
+from synpick_warp.stages.sim.trials import BATCH_ROUNDS, Choice, ChoiceReader, ChoiceRecorder, Trials, count_trial_worlds, trial_values
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.timing import scope
 from synpick_warp.views.picks import PickBatch

@@ -12,8 +12,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_entry
-from synpick_warp.dataset.commit.plausibility import describe_strays
+from synpick_warp.dataset.commit.manifest import committed_episodes, describe_strays, episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, digest_inputs, finalize_data_set
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.registry import Exporters, Needs
@@ -22,11 +21,9 @@ from synpick_warp.factory.assembly import Factory, build_factory, make_compiler
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.factory.devices import DeviceShare, bake_on_devices, load_assets, open_exporters, prepare_folder
 from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, is_resampled
-from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
-from synpick_warp.factory.memory_plan import check_episodes, explain_shortage
-from synpick_warp.factory.order import EpisodeSource
+from synpick_warp.factory.forecast import SAMPLED, EpisodeSource, check_disk, forecast_bake, predict_length
+from synpick_warp.factory.memory_plan import advise_processes, check_episodes, count_writers, explain_shortage, pick_processes
 from synpick_warp.factory.picks import PickQueue
-from synpick_warp.factory.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.scenes.bin_meshes.loading import measure_meshes
 from synpick_warp.stages.buffers import Snapshot

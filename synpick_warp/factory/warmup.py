@@ -14,9 +14,8 @@ from synpick_warp.factory.assembly import build_smallest, launch_all, make_compi
 from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.newton_patches.narrow_phase import take_shipped
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, CacheError, find_fault, kernel_cache, user_cache
+from synpick_warp.system.hardware import kernels
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.hardware.kernels import build_of, list_binaries
 from synpick_warp.system.progress import Progress
 
 
@@ -34,13 +33,13 @@ def check_caches() -> None:
     """Raise CacheError unless kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost
     at its end."""
     caches = (
-        ("kernel", kernel_cache(wp.config.version), KERNEL_VARIABLE),
-        ("shape", default_cache_dir() if user_cache() else None, USER_VARIABLE),
+        ("kernel", kernels.kernel_cache(wp.config.version), kernels.KERNEL_VARIABLE),
+        ("shape", default_cache_dir() if kernels.user_cache() else None, kernels.USER_VARIABLE),
     )
     for name, folder, variable in caches:
-        reason = "the user has no home" if folder is None else find_fault(folder)
+        reason = "the user has no home" if folder is None else kernels.find_fault(folder)
         if reason is not None:
-            raise CacheError(
+            raise kernels.CacheError(
                 f"the {name} cache {folder or '~/.cache'} cannot be written ({reason}), so that a warm-up would be lost; "
                 f"set {variable} to a folder that can be written"
             )
@@ -56,12 +55,12 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     device = pick_device(config.bake.device)
     with sole_compiler(progress):
         take_shipped(device)
-        before = list_binaries()
+        before = kernels.list_binaries()
         with make_compiler(device, progress) as compiler:
             submit_slow(compiler, device, config)
-            compiler.submit([build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
+            compiler.submit([kernels.build_of(gather_cameras_kernel, device)])  # The one module that only the online stream needs.
             factory = build_smallest(config, device, progress)
             stream = factory.stream if needs.views else None
             submit_launches(compiler, factory.simulation, stream)
         launch_all(factory.simulation, stream)
-    return WarmUp(len(list_binaries() - before), time.perf_counter() - started)
+    return WarmUp(len(kernels.list_binaries() - before), time.perf_counter() - started)

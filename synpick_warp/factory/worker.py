@@ -13,9 +13,9 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.errors import SynpickError
+from synpick_warp.system.hardware.cores import LINK
 from synpick_warp.system.interpreter import collection_paused
-from synpick_warp.system.processes.threads import LINK
-from synpick_warp.system.processes.worker import send
+from synpick_warp.system.processes.pool import send
 from synpick_warp.system.progress import SilentProgress
 
 if TYPE_CHECKING:

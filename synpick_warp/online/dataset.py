@@ -21,8 +21,7 @@ from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError
-from synpick_warp.online.settings import ARGUMENTS, Selection, choose_episodes, resolve_settings
-from synpick_warp.online.stream import open_stream
+from synpick_warp.online.stream import ARGUMENTS, Selection, choose_episodes, open_stream, resolve_settings
 from synpick_warp.stages.online.batches import ViewBatch
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import SilentProgress

@@ -73,7 +73,6 @@ def _world(rows: Sequence[int], poses: Sequence[Any], device: wp.Device) -> Snap
 
 
 def _entry(obj_id: int, mesh: Mesh, unit: float) -> CatalogEntry:
-    """Catalog entry of a mesh that is only drawn."""
     if isinstance(mesh, Path | str):
         shape, found, _ = read_mesh(Path(mesh), unit)
         return _drawn(obj_id, Path(mesh).stem, shape, found.complete(GREY.metallic, GREY.roughness))

@@ -80,7 +80,6 @@ def _make_bin(sizes: BinSizes) -> Bin:
 
 
 def _make_box(sizes: BinSizes, shell: Tote) -> Bin:
-    """Build an open box with dividers."""
     try:
         dividers = _dividers(sizes, shell)
         patches = [solid(np.stack(rings)) for rings in dividers]
@@ -123,7 +122,6 @@ def _make_pallet(sizes: BinSizes) -> Bin:
 
 
 def _box_patch(low: Point, high: Point) -> Patch:
-    """Closed surface of the box between two corners."""
     ring = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
     return solid(np.stack([at_height(ring, low[2]), at_height(ring, high[2])]))
 
@@ -291,5 +289,4 @@ def box_piece(low: tuple[float, float, float], high: tuple[float, float, float])
 
 
 def _piece(points: list[tuple[float, float, float]]) -> ConvexPiece:
-    """Convex hull of points, as a convex piece."""
     return simplify_hull(np.array(points), len(points))

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.codes import Stream
 from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cell.bins import BinSizes
-from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter
+from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter, Rig, lens_map
 from synpick_warp.configs.cell.gripper import Gripper
-from synpick_warp.configs.cell.rig import Rig, lens_map
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
@@ -38,7 +37,6 @@ def make_cameras(rig: Rig) -> tuple[Camera, ...]:
 
 
 def _make_camera(label: str, row: CameraRow) -> Camera:
-    """Camera of a row with a resolution."""
     width, height = row.resolution or (0, 0)
     if row.matrix is None:
         focal = width / 2 / round(float(np.tan(np.radians(row.fov or 0.0) / 2)), DECIMALS)

@@ -13,14 +13,13 @@ from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import FileMaterial
 from synpick_warp.scenes.assets.asset_files import asset_scope, ignore, list_names, read_isolated
-from synpick_warp.scenes.assets.cad import STEP_SUFFIXES
-from synpick_warp.scenes.assets.meshes import MeshOptions, connected_parts, merge_positions, read_mesh, solid_volume
+from synpick_warp.scenes.assets.meshes import STEP_SUFFIXES, MeshOptions, connected_parts, merge_positions, read_mesh, solid_volume
 from synpick_warp.scenes.assets.model_folders import ModelFile, list_models
 from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_mesh, read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size, is_concave, mass_properties
 from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects, solids
-from synpick_warp.scenes.symmetries.objects import add_symmetries
+from synpick_warp.scenes.symmetries.detection import add_symmetries
 from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, RawObject, TriangleMesh
 from synpick_warp.system.linear_algebra import norm
@@ -260,7 +259,6 @@ def _read_model(model: ModelFile, info: FileModelInfo, rules: _Rules) -> tuple[R
 
 
 def _unit(objects: Objects, model: ModelFile) -> str:
-    """Unit of a mesh file."""
     return objects.unit if objects.unit != AUTO_UNIT else "mm" if model.is_bop else "m"
 
 

@@ -13,7 +13,7 @@ from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, decode_texture
 from synpick_warp.scenes.assets.asset_files import check_file_name, read_isolated
-from synpick_warp.scenes.embedded.surfaces import surface_textures
+from synpick_warp.scenes.embedded.textures import surface_textures
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Limits
 

@@ -178,7 +178,6 @@ def allocate_like(array: wp.array, length: int, device: wp.Device, pinned: bool 
 
 
 def _allocate(owner: str, specs: Mapping[str, ArraySpec], sizes: dict[str, int], device: wp.Device) -> dict[str, Any]:
-    """Arrays by name."""
     return {
         name: _zeros(f"{owner}.{name}", spec, tuple(sizes[dimension] for dimension in spec.shape), device) for name, spec in specs.items()
     }

@@ -115,7 +115,6 @@ def make_scene_data(config: schema.Config, catalog: Catalog, built: build.BuiltM
 
 
 def _layout_data(layout: build.WorldLayout) -> structs.LayoutData:
-    """Fill `LayoutData` from the layout of the model."""
     return fill(
         structs.LayoutData,
         layout,
@@ -279,7 +278,6 @@ def _settle_data(settle: schema.Settle, tick: float) -> structs.SettleData:
 
 
 def _move_data(move: schema.Move, gripper: schema.Gripper, physics: schema.Physics) -> structs.MoveData:
-    """Fill `MoveData` from the settings."""
     return fill(
         structs.MoveData,
         move,
@@ -304,7 +302,6 @@ def _suction_data(suction: schema.Suction, gripper: schema.Gripper, step: float)
 
 
 def _cup_data(gripper: schema.Gripper, head: Head, device: wp.Device) -> structs.CupData:
-    """Fill `CupData` from the cups of the gripper head."""
     places = np.array([(x, y, -gripper.cup_length) for x, y in head.cups])
     place = wp.array(places, dtype=wp.vec3, device=device)
     return fill(structs.CupData, count=len(places), place=place, common_valve=head.has_common_valve)

@@ -12,8 +12,7 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
 from synpick_warp.stages.arrays import ArrayGroup, bundle
-from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.processes.threads import PIXELS
+from synpick_warp.system.hardware.cores import PIXELS, count_cores
 
 _limit = 0
 """Maximum number of threads that render pixels on the CPU, set by `limit_threads`; 0: one per usable core."""

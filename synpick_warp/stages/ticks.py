@@ -21,7 +21,7 @@ from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.stages.timing import scope
-from synpick_warp.system.hardware.green_contexts import count_reserved
+from synpick_warp.system.hardware.device import count_reserved
 from synpick_warp.system.interpreter import collection_paused
 
 PARTS_IN_FLIGHT = 24

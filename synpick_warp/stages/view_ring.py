@@ -16,15 +16,14 @@ import warp as wp
 
 from synpick_warp.codes import MASK_ROWS
 from synpick_warp.configs.calibration.lens import LensMap
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.visibility.camera import BOX_MARGIN, NEAR_PLANE
 from synpick_warp.scenes.cameras import CAMERA_KEYS
 from synpick_warp.scenes.types import Camera
+from synpick_warp.stages import encoding
 from synpick_warp.stages.arrays import allocate, dry_run
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.encoding.jpeg import Compressor, JpegBuffers, JpegScratch, jpeg_sizes
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, DepthScratch, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, TransferSettings
 from synpick_warp.stages.render.cameras import allocate_lenses, allocate_view_cameras, place_cameras
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
@@ -150,8 +149,8 @@ class BatchBuffers:
     images: ViewBuffers
     boundaries: BoundaryBuffers
     layers: LayerBuffers
-    jpeg: JpegBuffers | None
-    depth: DepthBuffers | None
+    jpeg: encoding.JpegBuffers | None
+    depth: encoding.DepthBuffers | None
 
     def copied(self, on_demand: Collection[str]) -> dict[str, wp.array]:
         """Arrays that are copied to the host, by name: all but `on_demand`."""
@@ -160,7 +159,7 @@ class BatchBuffers:
         return {name: array for name, array in arrays.items() if name not in on_demand and array is not None}
 
 
-Scratch = tuple[BoundaryScratch, JpegScratch | None, tuple[DepthScratch, Any, Any] | None]
+Scratch = tuple[BoundaryScratch, encoding.JpegScratch | None, tuple[encoding.DepthScratch, Any, Any] | None]
 """Scratch of run boundaries and encoders (see `allocate_depth_scratch`), which all batches of the ring share."""
 
 
@@ -174,13 +173,13 @@ def allocate_ring(
             allocate(ViewBuffers, sizes, device),
             allocate(BoundaryBuffers, boundaries, device),
             allocate(LayerBuffers, sizes, device, layers),
-            allocate(JpegBuffers, jpeg_sizes(*frame), device) if host.jpeg_quality else None,
-            allocate(DepthBuffers, depth_sizes(*frame), device) if host.depth_files else None,
+            allocate(encoding.JpegBuffers, encoding.jpeg_sizes(*frame), device) if host.jpeg_quality else None,
+            allocate(encoding.DepthBuffers, encoding.depth_sizes(*frame), device) if host.depth_files else None,
         )
         for _ in range(RING if device.is_cuda else 1)
     ]
-    jpeg = allocate(JpegScratch, jpeg_sizes(*frame), device) if host.jpeg_quality else None
-    depth = allocate_depth_scratch(*frame, device) if host.depth_files else None
+    jpeg = allocate(encoding.JpegScratch, encoding.jpeg_sizes(*frame), device) if host.jpeg_quality else None
+    depth = encoding.allocate_depth_scratch(*frame, device) if host.depth_files else None
     return ring, (allocate(BoundaryScratch, boundaries, device), jpeg, depth)
 
 
@@ -204,8 +203,8 @@ class ViewRing:
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
         self.slots, (self.boundary_scratch, jpeg, depth) = allocate_ring(sizes, layers, self.host, device)
         frame = (sizes["column"], sizes["row"])
-        self.compressor = Compressor(jpeg, *frame, self.host.jpeg_quality) if jpeg is not None else None
-        self.depth_encoder = DepthEncoder(depth, *frame) if depth is not None else None
+        self.compressor = encoding.Compressor(jpeg, *frame, self.host.jpeg_quality) if jpeg is not None else None
+        self.depth_encoder = encoding.DepthEncoder(depth, *frame) if depth is not None else None
         copied = [batch.copied(self.host.on_demand) for batch in self.slots]
         self.images = [name for name in copied[0] if name not in self.layers]
         self.copies = [HostCopy(list(arrays.values())) for arrays in copied]

@@ -9,7 +9,7 @@ To add a layer:
 2. write its value at a pixel in `kernels/render/images/layers.py`, and name its kernel in `KERNELS` (`stages/render/layers.py`);
 3. state the tolerance between CPU and GPU in `tools/compare/pictures.py`, and a sample value in `tests/dataset/test_layers.py`;
    tests fail until both are there. Known answers belong in `tests/render/images/test_layers.py`, a row in the table of
-   `exporters/README.md`; the former bakes it by itself. A drawing in `apps/viz/false_colors.py` is optional.
+   `exporters/README.md`; the former bakes it by itself. A drawing in `apps/viz/drawing.py` is optional.
 """
 
 from collections.abc import Iterator, Mapping

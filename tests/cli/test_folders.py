@@ -13,15 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from synpick_warp.cli.folders import beside
 from synpick_warp.cli.main import main
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.cli.options import beside
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.scenes.collision.shapes import _Saver
 from synpick_warp.scenes.types import ConvexPiece
-from synpick_warp.system.hardware.caches import link_files
+from synpick_warp.system.hardware.kernels import link_files
 from synpick_warp.system.inputs.files import make_folder
 from tests.builders import mistake
 from tests.harness.scripted_bake import bake, settings

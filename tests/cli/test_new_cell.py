@@ -12,7 +12,7 @@ import trimesh
 
 from synpick_warp.apps.viz.frusta import project
 from synpick_warp.cli.commands import new_cell
-from synpick_warp.configs.cell.rig import intrinsics
+from synpick_warp.configs.cell.cameras import intrinsics
 from synpick_warp.configs.episodes.objects import MATERIALS
 from synpick_warp.configs.files.cell_file import WIDTH
 from synpick_warp.configs.files.load import load_config

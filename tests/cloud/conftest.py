@@ -11,7 +11,7 @@ from uuid import uuid4
 
 import pytest
 
-from synpick_warp.system.processes.threads import SETUP
+from synpick_warp.system.hardware.cores import SETUP
 from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import CONTROL, open_store

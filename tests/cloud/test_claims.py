@@ -14,7 +14,7 @@ import msgspec
 import pytest
 
 import synpick_warp
-from synpick_warp.cloud import claims, finish, run
+from synpick_warp.cloud import claims, run
 from synpick_warp.cloud.claims import Chunk, Chunks, Claims, LeaseLostError, Sizes, default_chunk
 from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.cloud.run import Crew, Job, PlanProgress
@@ -197,7 +197,7 @@ def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypat
         run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
     assert "manifest/joined.json" not in stored(memory)
     ledger = Ledger(open_store(memory), tiny(), Probe(0.0, True))
-    gate, real, places = threading.Barrier(2), finish.finalize_data_set, [tmp_path / "one", tmp_path / "two"]
+    gate, real, places = threading.Barrier(2), run.finalize_data_set, [tmp_path / "one", tmp_path / "two"]
     alone = threading.Lock()
 
     def meet(*arguments):
@@ -205,10 +205,10 @@ def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypat
             real(*arguments)
         gate.wait(60)
 
-    monkeypatch.setattr(finish, "finalize_data_set", meet)
+    monkeypatch.setattr(run, "finalize_data_set", meet)
     for each in places:
         each.mkdir()
-    together(*(partial(finish.finalize_store, ledger, each) for each in places))
+    together(*(partial(run.finalize_store, ledger, each) for each in places))
     assert stored(memory) == local
 
 
@@ -219,19 +219,19 @@ def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local
     with monkeypatch.context() as patch:
         patch.setattr(run, "finalize_store", lambda *_: 0)
         run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
-    real = finish.send_file
+    real = run.send_file
     for each in places:
         each.mkdir()
 
     def send(*arguments):
         real(*arguments)
-        monkeypatch.setattr(finish, "send_file", real)
-        finish.finalize_store(small, places[1])
+        monkeypatch.setattr(run, "send_file", real)
+        run.finalize_store(small, places[1])
 
-    monkeypatch.setattr(finish, "send_file", send)
+    monkeypatch.setattr(run, "send_file", send)
     with pytest.raises(StoreError, match=r"another bake finalized s3://memory-.* for other episodes"):
-        finish.finalize_store(large, places[0])
-    assert store.get(finish.FINISHING, 1 << 30) == b""  # So the other would fail, too, if it still ran.
+        run.finalize_store(large, places[0])
+    assert store.get(run.FINISHING, 1 << 30) == b""  # So the other would fail, too, if it still ran.
     run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
     assert stored(memory) == local
 

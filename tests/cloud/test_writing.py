@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cloud import finish, run
+from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import FINISHED, Ledger
 from synpick_warp.configs.schema import FORMATS, Split
 from synpick_warp.dataset.commit.manifest import INPUTS, OBJECT, encode_manifest, make_manifest
@@ -142,7 +142,7 @@ def test_settings_that_another_worker_wrote_meanwhile_are_compared(memory):
 
 
 def test_a_damaged_or_deleted_index_file_is_named(memory, monkeypatch):
-    monkeypatch.setattr(finish, "AHEAD", 2)
+    monkeypatch.setattr(run, "AHEAD", 2)
     bake(memory)
     store, key = open_store(memory), ".store/index/000002.tar.gz"
     store.delete(FINISHED)

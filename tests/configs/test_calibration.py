@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from synpick_warp.configs.calibration.files import FISHEYE, PINHOLE, Calibration, read_calibration
 from synpick_warp.configs.calibration.lens import MAX_ANGLE, TOLERANCE, Lens, LensMap
 from synpick_warp.configs.calibration.tables import SENSORS, sensor_camera
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import make_cameras
 from tests.builders import refusal

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.cell.rig import Rig, intrinsics, resized, viewing_direction
-from synpick_warp.configs.files.load import COMMAND_LINE, load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.cell.cameras import Rig, intrinsics, resized, viewing_direction
+from synpick_warp.configs.files.load import COMMAND_LINE, config_to_toml, load_config
 from synpick_warp.configs.schema import Cameras, Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.cameras import describe_cameras, make_cameras

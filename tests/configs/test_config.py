@@ -13,8 +13,15 @@ from hypothesis import strategies as st
 
 from synpick_warp.configs.calibration.tables import SENSORS, sensor_settings
 from synpick_warp.configs.fields import Setting, settings_of
-from synpick_warp.configs.files.load import COMMAND_LINE, load_config, override_config, parse_assignment, preset_names, sections
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import (
+    COMMAND_LINE,
+    config_to_toml,
+    load_config,
+    override_config,
+    parse_assignment,
+    preset_names,
+    sections,
+)
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.hulls import hull_size

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Stream
 from synpick_warp.configs.dataset import DataLayout, episode_range, may_pick, mode_weights
 from synpick_warp.configs.fields import settings_of
-from synpick_warp.configs.files.load import load_config, preset_names, sections
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config, preset_names, sections
 from synpick_warp.configs.schema import Split
 from synpick_warp.dataset.commit.manifest import make_manifest
 from tests.builders import mistake

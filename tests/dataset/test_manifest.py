@@ -20,20 +20,18 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Ending
 from synpick_warp.configs.episodes.randomize import FIXED, Distribution
 from synpick_warp.configs.fields import settings_of
-from synpick_warp.configs.files.load import load_config, sections
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config, sections
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest, verify
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.writing import commit_episode, digest_inputs
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.exporters.writing.checksums import checksum, list_files, parse_checksums, write_manifest_entry
-from synpick_warp.exporters.writing.files import PARTIAL
+from synpick_warp.exporters.writing.files import PARTIAL, checksum, list_files, parse_checksums, write_manifest_entry
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
 from synpick_warp.system.processes import pool
-from synpick_warp.system.processes.worker import ProcessError
+from synpick_warp.system.processes.pool import ProcessError
 from synpick_warp.views.frames import EpisodeEnd
 from tests.builders import mistake
 from tests.harness import scripted_bake

@@ -21,12 +21,12 @@ from synpick_warp.apps.statistics.picks import ALL, FACED, SCORES, UNIFORM, eval
 from synpick_warp.apps.viz.picks import choose_trial, describe_trial, draw_pick_maps, spread_over_surface, write_pick_sheet
 from synpick_warp.cli.main import main
 from synpick_warp.codes import Ending, Outcome, Share
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset import picks as reader
 from synpick_warp.dataset.pytorch import Views
 from synpick_warp.dataset.view import find_pixels, mean_by_candidate
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.picks import FOLDER, PicksExporter, check_schema, from_table, make_table, pick_files
 from synpick_warp.testing.box_views import cameras, config
 from synpick_warp.testing.exporters import export

@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.pytorch import FIELDS, Views, collate
-from synpick_warp.dataset.tracks import Tracks
+from synpick_warp.dataset.view import Tracks
 from synpick_warp.dataset.webdataset import decode_view
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.testing import box_views
 from synpick_warp.testing.box_views import OBJECT_IDS, SIZES, batches, config

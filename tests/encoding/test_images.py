@@ -19,10 +19,19 @@ from synpick_warp.kernels.encoding import huffman, stuffing
 from synpick_warp.kernels.encoding import png as kernels
 from synpick_warp.kernels.encoding.dct import ZIGZAG, JpegData, quantize, transform_block
 from synpick_warp.kernels.encoding.stuffing import JpegFiles
+from synpick_warp.stages import encoding
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.encoding import png
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes, upload_huffman
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
+from synpick_warp.stages.encoding import (
+    DepthBuffers,
+    DepthEncoder,
+    JpegBuffers,
+    JpegEncoder,
+    JpegScratch,
+    allocate_depth_scratch,
+    depth_sizes,
+    jpeg_sizes,
+    upload_huffman,
+)
 from synpick_warp.system.codecs import depth_png, jpeg
 from synpick_warp.system.inputs.image_files import decode_image
 from tests.harness.hostile import fuzz_examples
@@ -398,14 +407,14 @@ def test_the_longest_codes_fit_slots_and_those_of_small_images_the_capacity(devi
 def test_codes_are_complete():
     for codes in (depth_png.code_lengths(), [int(digit) for digit in depth_png._DISTANCE_LENGTHS]):
         assert sum(2.0**-bits for bits in codes if bits) == 1.0
-    assert max(depth_png.code_lengths()) == png.CODE_BITS
-    assert max(depth_png.code_lengths()[: depth_png.END_OF_BLOCK]) == png.CODE_BITS
-    assert png.SEGMENT == SEGMENT
+    assert max(depth_png.code_lengths()) == encoding.CODE_BITS
+    assert max(depth_png.code_lengths()[: depth_png.END_OF_BLOCK]) == encoding.CODE_BITS
+    assert encoding.SEGMENT == SEGMENT
     for name in ("MIN_RUN", "MAX_RUN", "MAX_DISTANCE"):
         assert getattr(kernels, name) == getattr(depth_png, name)
     # A match takes no more than the literals of two samples may.
     longest = max(bits for _, bits in depth_png.run_codes()) + max(bits for _, bits in depth_png.distance_codes())
-    assert longest <= 4 * png.CODE_BITS
+    assert longest <= 4 * encoding.CODE_BITS
 
 
 def test_files_of_scenes_are_no_larger_than_those_of_other_encoders():

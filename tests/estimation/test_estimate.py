@@ -24,8 +24,8 @@ from synpick_warp.apps.estimation.run import (
     run_estimation,
 )
 from synpick_warp.apps.estimation.scenes import ScenePlan
-from synpick_warp.cli.commands.estimate import parse_indices
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.cli.commands.evaluate import parse_indices
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.testing.box_views import SIZES

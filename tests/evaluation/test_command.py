@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.apps.evaluation.results import write_results
-from synpick_warp.apps.evaluation.run import method_names
+from synpick_warp.apps.evaluation.results import method_names, write_results
 from synpick_warp.apps.evaluation.truth import read_truth
 from synpick_warp.cli.commands.evaluate import toolkit_command
 from synpick_warp.system.codecs.charts import SCALE, WIDTH

@@ -22,12 +22,12 @@ from synpick_warp.apps.evaluation.results import (
     encode_results,
     encode_targets,
     in_layout,
+    make_methods,
     read_results,
     read_targets,
     select_targets,
     write_results,
 )
-from synpick_warp.apps.evaluation.run import make_methods
 from synpick_warp.apps.evaluation.tracking import filter_poses
 from synpick_warp.apps.evaluation.truth import PoseTable, instance_speeds, read_truth
 from synpick_warp.errors import CatalogError, DatasetError, ResultError

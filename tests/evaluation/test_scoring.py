@@ -13,9 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.apps.evaluation import scoring
+from synpick_warp.apps.evaluation import errors as scoring
 from synpick_warp.apps.evaluation.errors import (
+    ALL,
     LIMIT,
+    METRICS,
+    PER_INSTANCE,
     VertexSearch,
     add_errors,
     adds_errors,
@@ -23,13 +26,15 @@ from synpick_warp.apps.evaluation.errors import (
     error_bands,
     exact_auc,
     expand_symmetries,
+    make_pairs,
+    match,
     read_models,
     recall_curve,
     rotation_errors,
+    score,
     translation_errors,
     vocap_auc,
 )
-from synpick_warp.apps.evaluation.scoring import ALL, METRICS, PER_INSTANCE, make_pairs, match, score
 from synpick_warp.apps.evaluation.tables import FORMATS, render, summarize
 from synpick_warp.apps.evaluation.truth import PoseTable
 from synpick_warp.scenes.assets.models_info import FileModelInfo

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from synpick_warp.errors import OutputError
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.worker import BakeLink
-from synpick_warp.system.processes.worker import WorkerProcess, start_process
+from synpick_warp.system.processes.pool import WorkerProcess, start_process
 from tests.harness.processes import wait_for
 
 FOREVER = 60.0

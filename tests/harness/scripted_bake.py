@@ -15,7 +15,7 @@ from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
-from synpick_warp.factory.order import EpisodeSource
+from synpick_warp.factory.forecast import EpisodeSource
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
 from synpick_warp.testing import box_views

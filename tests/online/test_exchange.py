@@ -14,8 +14,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
-from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
-from synpick_warp.stages.online.exchange import DeviceArray, Gate
+from synpick_warp.stages.online.batches import GPU_RING, BatchRing, DeviceArray, Gate, ViewBatch
 from synpick_warp.stages.render.cameras import VIEW_CAMERAS
 from synpick_warp.stages.view_ring import CameraGroup
 from tests.harness.spin import SPINS, spin_kernel

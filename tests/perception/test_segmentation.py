@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import MAX_INSTANCES, Segment
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception.components import STRIP

@@ -16,8 +16,8 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.kernels.perception import grasp
 from synpick_warp.stages.arrays import allocate, count_words
 from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
-from synpick_warp.stages.perception.plan import GraspPlanner
+from synpick_warp.stages.perception.images import Observation, PerceptionArrays, Plan
+from synpick_warp.stages.perception.perceive import GraspPlanner
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.probe import probe

@@ -8,8 +8,7 @@ import trimesh
 
 from synpick_warp.apps.viz.cell import lay_out
 from synpick_warp.configs.cell.bins import AXES, BinRow, BinSizes, MeasuredBin
-from synpick_warp.configs.files.load import load_config, override_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config, override_config
 from synpick_warp.dataset.commit.manifest import make_manifest
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes import reading

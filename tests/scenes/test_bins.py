@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.gripper import GRIPPERS
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.dataset.commit.manifest import describe_differences, make_manifest
 from synpick_warp.errors import ConfigError

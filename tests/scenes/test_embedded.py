@@ -19,8 +19,7 @@ from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.embedded import objects
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.parts import PIECES
-from synpick_warp.scenes.embedded.surfaces import KINDS, SIDE, surface_textures
-from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
+from synpick_warp.scenes.embedded.textures import KINDS, PADDING, SIDE, blank, pack, surface_textures
 from synpick_warp.scenes.symmetries.detection import find_symmetries
 from tests.harness.pieces import assert_closed
 from tests.twins.raycast import edges_match

@@ -11,8 +11,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.evaluation.errors import read_models
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import ObjectRow
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.shared.models import write_models

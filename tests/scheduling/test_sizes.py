@@ -12,14 +12,12 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
 from synpick_warp.configs.cell.bins import BinRow, BinSizes
-from synpick_warp.configs.files.load import load_config, parse_assignment
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config, parse_assignment
 from synpick_warp.configs.schema import Arrangement, Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory import memory_plan, order, sizes
-from synpick_warp.factory.memory_plan import check_memory, plan_memory
-from synpick_warp.factory.order import (
+from synpick_warp.factory import forecast, memory_plan
+from synpick_warp.factory.forecast import (
     DEVIATIONS,
     FRAMES_OF_MODE,
     SORTED_EPISODES,
@@ -28,16 +26,18 @@ from synpick_warp.factory.order import (
     deal_writers,
     order_longest_first,
 )
-from synpick_warp.factory.pipeline import bake_episodes
-from synpick_warp.factory.sizes import (
+from synpick_warp.factory.memory_plan import (
     HEADROOM,
     RUNTIME_BYTES,
     advise_processes,
+    check_memory,
     count_writers,
     fit_to_device,
     pick_processes,
+    plan_memory,
     without_pictures,
 )
+from synpick_warp.factory.pipeline import bake_episodes
 from synpick_warp.kernels.newton_patches import contact_sweep
 from synpick_warp.scenes import build, capacities
 from synpick_warp.scenes.bin_meshes.reading import measure_bins
@@ -143,9 +143,9 @@ def test_processes_share_the_hosts_memory(give):
 @pytest.fixture
 def cores(monkeypatch):
     """A machine of 16 cores and no GPU."""
-    monkeypatch.setattr(sizes, "count_cores", lambda: 16)
-    monkeypatch.setattr(sizes, "pick_devices", lambda names: ("cpu",) if list(names) == ["all"] else tuple(names))
-    monkeypatch.setattr(sizes, "pick_device", lambda name: CPU)
+    monkeypatch.setattr(memory_plan, "count_cores", lambda: 16)
+    monkeypatch.setattr(memory_plan, "pick_devices", lambda names: ("cpu",) if list(names) == ["all"] else tuple(names))
+    monkeypatch.setattr(memory_plan, "pick_device", lambda name: CPU)
 
 
 def test_without_a_gpu_all_is_a_process_per_core_within_memory_and_episodes(give, cores):
@@ -177,9 +177,9 @@ def test_a_bake_on_one_of_several_cores_is_told_of_the_others(give, cores, monke
     )
     assert advise_processes(config, ["cpu"], 1) == ""
     assert advise_processes(config, ["cpu", "cpu"], 3) == ""
-    monkeypatch.setattr(sizes, "pick_devices", lambda names: ("cuda:0",))
+    monkeypatch.setattr(memory_plan, "pick_devices", lambda names: ("cuda:0",))
     assert advise_processes(config, ["cpu"], 3) == ""
-    monkeypatch.setattr(sizes, "pick_device", lambda name: GPU)
+    monkeypatch.setattr(memory_plan, "pick_device", lambda name: GPU)
     assert advise_processes(config, ["auto"], 3) == ""
 
 
@@ -188,7 +188,7 @@ def writers_of(config: Config) -> int:
 
 
 def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
-    monkeypatch.setattr(sizes, "count_cores", lambda: 64)
+    monkeypatch.setattr(memory_plan, "count_cores", lambda: 64)
     config = load_config("synpick", {})
     assert writers_of(config) == 64
     give(host=8.0)
@@ -254,7 +254,7 @@ def test_only_the_episodes_that_are_sorted_are_sampled(device, monkeypatch):
         sampled.extend(episodes.tolist())
         return np.full(len(episodes), Mode.MOVE), np.zeros(len(episodes))
 
-    monkeypatch.setattr(order, "sample_episodes_ahead", sample)
+    monkeypatch.setattr(forecast, "sample_episodes_ahead", sample)
     found = order_longest_first(load_config("smoke", {}), OBJECTS, range(10**6), device)
     assert found == list(range(10**6))
     assert sampled == found[-SORTED_EPISODES:]

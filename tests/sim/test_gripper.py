@@ -17,7 +17,7 @@ from synpick_warp.kernels.sim.gripper import impedance_force
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import make_scene_data
-from synpick_warp.stages.perception.arrays import Plan
+from synpick_warp.stages.perception.images import Plan
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState, world_sizes

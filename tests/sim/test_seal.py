@@ -14,7 +14,7 @@ from synpick_warp.configs.files.load import load_config
 from synpick_warp.kernels.structs import SuctionData
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
-from synpick_warp.stages.sim.suction import ArrayHold, SuctionHold
+from synpick_warp.stages.sim.behavior import ArrayHold, SuctionHold
 from tests.sim.test_suction import ARM, SQUARE
 from tests.twins import suction as twin
 from tests.worlds.hanging import Hanging

@@ -21,7 +21,7 @@ from synpick_warp.stages.sim import physics as physics_module
 from synpick_warp.stages.sim.physics import VELOCITY_LIMIT_FRACTION, with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.sim.step_log import record_arrays
-from synpick_warp.system.hardware.green_contexts import SmPartition
+from synpick_warp.system.hardware.device import SmPartition
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import COARSE as STEPWISE
 from tests.worlds.small_worlds import ANGLE, BOX, COARSE, CUBE, SHORT, catalog, picking, place_cubes, report, run_ticks, settings

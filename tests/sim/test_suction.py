@@ -17,7 +17,7 @@ from synpick_warp.configs.files.load import load_config
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import build_meshes
-from synpick_warp.stages.sim.suction import SuctionHold
+from synpick_warp.stages.sim.behavior import SuctionHold
 from tests.twins import suction as twin
 from tests.twins.raycast import rotation_of
 from tests.worlds.hanging import Hanging

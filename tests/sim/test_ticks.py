@@ -21,7 +21,7 @@ from synpick_warp.factory import memory_plan
 from synpick_warp.stages import host_copies, ticks
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader

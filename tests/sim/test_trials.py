@@ -24,10 +24,9 @@ from synpick_warp.stages.launch import launch
 from synpick_warp.stages.perception.candidates import CandidateSampler
 from synpick_warp.stages.render.layers import LayerRenderer
 from synpick_warp.stages.render.view_setup import make_shot
-from synpick_warp.stages.sim.choices import ChoiceReader
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.sim.trials import Trials, check_grasps, find_choices, own_grasps, trial_values
+from synpick_warp.stages.sim.trials import ChoiceReader, Trials, check_grasps, find_choices, own_grasps, trial_values
 from synpick_warp.views.layers import LAYER_TABLE
 from tests.worlds.hanging import Hanging
 from tests.worlds.kernel_worlds import filled

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import pytest
 
-from synpick_warp.cloud import finish, ledger, run
+from synpick_warp.cloud import ledger, run
 from synpick_warp.cloud.claims import CLAIMS, Claims, LeaseLostError
 from synpick_warp.cloud.ledger import ENTRY, FINISHED, INDEX, Ledger
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, episode_entry, make_manifest
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
@@ -66,14 +66,14 @@ def without_formats(patch: pytest.MonkeyPatch) -> None:
 
 
 def _finalize(log: Ledger, folder: Path) -> int:
-    """As `finish.finalize_store`, of one index."""
+    """As `run.finalize_store`, of one index."""
     if log.finished():
         return 0
     if missing := sum(map(len, log.remaining(log.layout.plan()))):
         return missing
     clock.sleep(1.0)
     if not log.finished():
-        for key, data in ((finish.FINISHING, log.plan), ("episodes.jsonl", b"rows"), (FINISHED, log.plan)):
+        for key, data in ((run.FINISHING, log.plan), ("episodes.jsonl", b"rows"), (FINISHED, log.plan)):
             log.store.put(key, data)
     return 0
 

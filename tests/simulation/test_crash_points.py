@@ -13,12 +13,12 @@ import pytest
 
 from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import Ledger
-from synpick_warp.dataset.commit import writing
+from synpick_warp.dataset.commit import manifest
 from synpick_warp.dataset.commit.manifest import read_entry
 from synpick_warp.dataset.commit.merge import merge
 from synpick_warp.dataset.commit.verify import verify
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing import checksums
+from synpick_warp.exporters.writing import files as checksums
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import CONTROL, Probe
 from tests.builders import once
@@ -107,7 +107,7 @@ def test_a_merge_may_end_at_any_change_to_its_folder(tmp_path, expected, case, t
 BUGS = {
     "a mark is not synchronized": lambda patch: patch.setattr(checksums, "write_atomically", lambda path, data: path.write_bytes(data)),
     "a mark counts without its files": lambda patch: patch.setattr(
-        writing, "is_complete", lambda folder, entry: read_entry(folder, entry) is not None
+        manifest, "is_complete", lambda folder, entry: read_entry(folder, entry) is not None
     ),
 }
 """Planted bugs, by name."""

@@ -27,8 +27,7 @@ from synpick_warp.dataset.commit import manifest, merge, verify
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, CONSTANTS, INDICES, committed_episodes, episode_entry, is_complete
 from synpick_warp.dataset.commit.writing import OutputFolder
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.writing.checksums import parse_checksums
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, parse_checksums
 from tests.harness import scripted_bake
 from tests.harness.hostile import fuzz_examples
 from tests.simulation.crashing_disk import CrashingDisk

@@ -24,9 +24,9 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.factory import assembly, warmup
 from synpick_warp.factory.assembly import launch_all, make_compiler
 from synpick_warp.newton_patches.narrow_phase import SHIPPED, slow_builds
-from synpick_warp.system.hardware import green_contexts, kernels
-from synpick_warp.system.hardware.device import opening_context
-from synpick_warp.system.hardware.green_contexts import SmPartition
+from synpick_warp.system.hardware import device as hardware
+from synpick_warp.system.hardware import kernels
+from synpick_warp.system.hardware.device import SmPartition, opening_context
 from synpick_warp.system.hardware.kernels import Compiler, ModuleBuild, build_of, compilation_lock, dry_launches, split_modules
 from synpick_warp.system.progress import SilentProgress
 from tests.builders import boxes, mistake
@@ -331,7 +331,7 @@ def drive(monkeypatch):
             name: lambda *arguments, name=name: calls.append((name, arguments)) or code * (name == names[-1])  # type: ignore[func-returns-value]
             for name in names
         }
-        monkeypatch.setattr(green_contexts, "_load_driver", lambda: SimpleNamespace(**driver))
+        monkeypatch.setattr(hardware, "_load_driver", lambda: SimpleNamespace(**driver))
         return calls
 
     return install

@@ -17,8 +17,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.configs.fields import settings_of
-from synpick_warp.configs.files.load import load_config, parse_assignment, sections
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config, parse_assignment, sections
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png

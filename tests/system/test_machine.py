@@ -24,12 +24,11 @@ from hypothesis import strategies as st
 from synpick_warp.dataset.stored_array import open_array
 from synpick_warp.dataset.trajectory import GroupContext
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system.hardware import caches
-from synpick_warp.system.hardware.caches import CacheError, find_fault, kernel_cache, usable_kernel_cache, user_cache
+from synpick_warp.system.hardware import cores, kernels
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.free_memory import free_host_memory
+from synpick_warp.system.hardware.kernels import CacheError, find_fault, kernel_cache, usable_kernel_cache, user_cache
 from synpick_warp.system.interpreter import collection_paused
-from synpick_warp.system.processes import threads
 from tests.harness.hostile import fuzz_examples
 from tests.worlds.model_files import put
 
@@ -163,7 +162,7 @@ def test_a_home_that_cannot_be_used_is_replaced(home, capsys, monkeypatch, kind)
 
 def test_a_full_disk_is_replaced_and_its_kernels_are_linked(home, capsys, monkeypatch):
     """Fault 6."""
-    monkeypatch.setattr(caches, "MIN_FREE", 2**70)
+    monkeypatch.setattr(kernels, "MIN_FREE", 2**70)
     module = home / ".cache" / "warp" / "1.0" / "wp_a"
     module.mkdir(parents=True)
     (module / "a.o").write_text("code")
@@ -189,7 +188,7 @@ def test_no_temporary_folder_either_is_one_line(home, monkeypatch):
         raise OSError(28, "No space left on device")
 
     home.write_text("")
-    monkeypatch.setattr("synpick_warp.system.hardware.caches.tempfile.mkdtemp", full)
+    monkeypatch.setattr("synpick_warp.system.hardware.kernels.tempfile.mkdtemp", full)
     with pytest.raises(CacheError, match=r"^the kernel cache cannot be used \([^\n]*; set WARP_CACHE_PATH to a folder [^\n]*$"):
         usable_kernel_cache("1.0")
 
@@ -236,10 +235,10 @@ def waiting_thread(name: str) -> Iterator[None]:
     ],
 )
 def test_unknown_threads_may_launch_kernels(name, only):
-    assert threads.is_only_launcher()
+    assert cores.is_only_launcher()
     with waiting_thread(name):
-        assert threads.is_only_launcher() == only
-    assert threads.is_only_launcher()
+        assert cores.is_only_launcher() == only
+    assert cores.is_only_launcher()
 
 
 def test_reading_a_zarr_array_starts_harmless_threads(tmp_path):
@@ -247,30 +246,30 @@ def test_reading_a_zarr_array_starts_harmless_threads(tmp_path):
     zarr.create_array(tmp_path / "array", data=values, chunk_key_encoding={"name": "default", "separator": "."})
     assert open_array(tmp_path / "array", None, GroupContext())[5] == 5.0
     assert any(thread.name.startswith("zarr_") for thread in threading.enumerate())
-    assert threads.is_only_launcher()
+    assert cores.is_only_launcher()
 
 
 def test_progress_bars_launch_nothing_and_another_thread_sees_the_main_thread_as_a_launcher():
     with rich.progress.Progress(disable=False):
         assert threading.active_count() > 1
-        assert threads.is_only_launcher()
+        assert cores.is_only_launcher()
     with ThreadPoolExecutor(1) as other:
-        assert not other.submit(threads.is_only_launcher).result()
+        assert not other.submit(cores.is_only_launcher).result()
 
 
 def test_a_parallel_map_keeps_the_order_and_raises_the_first_items_error(monkeypatch):
-    monkeypatch.setattr(threads, "count_cores", lambda: 2)
+    monkeypatch.setattr(cores, "count_cores", lambda: 2)
     barrier = threading.Barrier(2, timeout=30.0)  # Both items must be in progress at once.
 
     def invert(number: int) -> float:
         barrier.wait()
         return 1.0 / number
 
-    assert threads.map_in_threads(invert, [4, 2]) == [0.25, 0.5]
+    assert cores.map_in_threads(invert, [4, 2]) == [0.25, 0.5]
     with pytest.raises(ZeroDivisionError):
-        threads.map_in_threads(lambda number: 1.0 / number, [0, 1, 2])
-    assert threads.map_in_threads(str, []) == []
-    assert threads.is_only_launcher()
+        cores.map_in_threads(lambda number: 1.0 / number, [0, 1, 2])
+    assert cores.map_in_threads(str, []) == []
+    assert cores.is_only_launcher()
 
 
 # ---- pausing the garbage collection ----

@@ -14,7 +14,7 @@ import warp as wp
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.exporters.writing.files import write_manifest_entry
 from synpick_warp.stages.render.renderer import Renderer
 from tests.harness.processes import wait_for
 from tests.tools.test_reports import SHORT_PICKS

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.testing.box_views import cameras, config
 from synpick_warp.testing.exporters import export
 from tests.validation.faults import GT, INFO, moved, pixels, whole
@@ -24,7 +24,7 @@ from tools.checks import dataset as tool
 from tools.checks.kernels import main
 from tools.clients import __main__ as clients
 from tools.clients import base, environments
-from tools.clients.process import NOT_INSTALLED
+from tools.clients.base import NOT_INSTALLED
 from tools.clients.reader import CLIENTS
 from tools.clients.trajectories import tone_map
 from tools.options import MeasuredRow

@@ -18,8 +18,7 @@ import zarr
 from pxr import Usd, UsdGeom
 
 import synpick_warp
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, RENDER_MODES
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
@@ -28,7 +27,7 @@ from tests.harness.environment import ROOT
 from tools.compare import guard, kernel_sources, pictures
 from tools.compare import runs as compared
 from tools.compare.__main__ import main
-from tools.compare.guard_steps import SETS, Step, cpu_steps
+from tools.compare.guard import SETS, Step, cpu_steps
 
 
 @pytest.fixture

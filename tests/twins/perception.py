@@ -9,13 +9,12 @@ import numpy as np
 import warp as wp
 from scipy.ndimage import distance_transform_edt
 
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.perception.arrays import Observation
-from synpick_warp.stages.perception.images import allocate_batch
+from synpick_warp.stages.perception.images import Observation, allocate_batch
 from synpick_warp.stages.perception.perceive import Segmenter
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.scene import build_grid

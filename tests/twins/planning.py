@@ -10,8 +10,8 @@ import numpy as np
 from synpick_warp.configs.schema import Perception
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate, allocate_struct, count_words, unpack_words
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
-from synpick_warp.stages.perception.plan import GraspPlanner
+from synpick_warp.stages.perception.images import Observation, PerceptionArrays, Plan
+from synpick_warp.stages.perception.perceive import GraspPlanner
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.scene import build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER

@@ -15,8 +15,7 @@ import pyarrow.parquet as pq
 import trimesh
 
 from synpick_warp.codes import Outcome, Share
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.dataset.reading import open_data_set
 from synpick_warp.exporters.picks import make_table, pick_files
 from synpick_warp.views.picks import COLUMNS

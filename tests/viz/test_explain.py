@@ -16,10 +16,10 @@ from synpick_warp.apps.viz.drawing import FONT, instance_color, shorten
 from synpick_warp.apps.viz.explain import load_chart, object_names, planning_camera, to_color_image, to_view, wrapped, write_explanation
 from synpick_warp.apps.viz.explain_record import choice_words, labels, seal_words
 from synpick_warp.cli.main import main
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config, Perception, Pick, Target
 from synpick_warp.dataset.view import View
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.scenes.types import Camera
 from synpick_warp.testing.box_views import config

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
-from synpick_warp.apps.validation.rules.graph import find_gap
+from synpick_warp.apps.validation.rules.cross_file import find_gap
 from synpick_warp.apps.viz.drawing import instance_color
 from synpick_warp.apps.viz.explain import draw_words, load_chart
 from synpick_warp.apps.viz.explain_record import (
@@ -34,7 +34,7 @@ from synpick_warp.apps.viz.explain_record import (
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.records import MAX_OBSERVED
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.graph import find_occlusions, find_supports, find_unstacking_order
+from synpick_warp.exporters.bop.scene import find_occlusions, find_supports, find_unstacking_order
 from synpick_warp.exporters.writing.rle import Masks, find_runs
 from tests.harness.charts import picture_of
 from tests.harness.hostile import LEAVES, fuzz_examples, hostile_contents, places, removed, replaced

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp.apps.viz.drawing import instance_color, short_labels
-from synpick_warp.apps.viz.false_colors import bin_scale, color_depth, pooled_scale
+from synpick_warp.apps.viz.drawing import bin_scale, color_depth, instance_color, pooled_scale, short_labels
 from synpick_warp.apps.viz.preview import (
     COLUMN,
     LINE,
@@ -27,10 +26,10 @@ from synpick_warp.apps.viz.preview import (
     write_contact_sheet,
 )
 from synpick_warp.cli.main import main
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import write_layer
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.view import write_rendered_layer
 from synpick_warp.testing.box_views import cameras, config
 from synpick_warp.testing.exporters import export

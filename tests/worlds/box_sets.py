@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.picks import PicksExporter
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.testing.box_views import config

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.evaluation.truth import PoseTable
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 
 FRAMES = 4

@@ -17,7 +17,7 @@ from synpick_warp.scenes.build import WorldPart
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.constants import SceneData, bin_data, fill, mode_data
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.render.looks import build_look_table
 from synpick_warp.stages.sim.worlds import CORNERS, AttemptState, SealState, WorldState, world_sizes
 

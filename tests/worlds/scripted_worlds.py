@@ -11,7 +11,7 @@ from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Ta
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.stages.arrays import allocate
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.stream import TickReport
 from tests.worlds.small_worlds import settings

@@ -33,9 +33,9 @@ from synpick_warp.dataset.commit.manifest import committed_episodes, episode_ent
 from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, shared_files
-from synpick_warp.factory.order import predict_frames
+from synpick_warp.factory.forecast import predict_frames
+from synpick_warp.factory.memory_plan import pick_processes
 from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.factory.sizes import pick_processes
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.stages.sim.arrange import sample_episodes_ahead
 from synpick_warp.system.hardware.cores import count_cores

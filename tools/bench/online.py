@@ -13,8 +13,7 @@ from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.environment.settings import make_choice
 from synpick_warp.factory.assembly import Factory, Stages
 from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.online.settings import Selection
-from synpick_warp.online.stream import Producer, ViewStream
+from synpick_warp.online.stream import Producer, Selection, ViewStream
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer

@@ -73,7 +73,6 @@ class SensorScene:
         return tuple(partial(self._render, replace(order, enable_textures=color, enable_shadows=color)) for order in ORDERS)
 
     def _render(self, render_config: Any) -> None:
-        """Update the BVH from the state and render all views."""
         self.model.bvh_refit_shapes(self.state)
         self.sensor.update(self.state, self.transforms, self.rays, world_indices=self.worlds, render_config=render_config, **self.images)
 
@@ -245,7 +244,6 @@ class RayScene:
         return (self._render,)
 
     def _render(self) -> None:
-        """Refit the tree to the geoms and render all views."""
         with wp.ScopedDevice(self.device):
             self.mjw.refit_bvh(self.device_model, self.data, self.context)
             self.mjw.render(self.device_model, self.data, self.context)

@@ -18,7 +18,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.schema import UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer

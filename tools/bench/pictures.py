@@ -129,7 +129,6 @@ def keep_tick(factory: Factory) -> KeptTick:
 
 
 def _tick(factory: Factory) -> TickReport:
-    """Simulate a tick, and wait for its report."""
     factory.simulation.tick()
     return read_tick(factory.simulation.record)
 

@@ -14,11 +14,9 @@ from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.codes import Phase, Status, Task
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.factory.assembly import Factory, build_factory
-from synpick_warp.stages import timing
+from synpick_warp.stages import encoding, timing
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
-from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegEncoder, JpegScratch, jpeg_sizes
-from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, allocate_depth_scratch, depth_sizes
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.stages.sim.physics import may_capture
@@ -296,20 +294,21 @@ def _measure_encoding(bench: Bench, factory: Factory) -> Iterator[MeasuredRow]:
         yield MeasuredRow(f"{name}: CPU time of a view by the CPU's encoder", 1e3 * _cpu_seconds(encode_on_cpu, len(depths)), "ms")
 
 
-def _jpeg_encoder(images: ViewBuffers, quality: int, count: int, device: wp.Device) -> tuple[Callable[[], None], JpegBuffers]:
-    """Encoder of the first `count` colour images, and its output."""
+def _jpeg_encoder(images: ViewBuffers, quality: int, count: int, device: wp.Device) -> tuple[Callable[[], None], encoding.JpegBuffers]:
     views, height, width = images.depth.shape
-    sizes = jpeg_sizes(views, width, height)
-    encoder, out = JpegEncoder(allocate(JpegScratch, sizes, device), width, height), allocate(JpegBuffers, sizes, device)
+    sizes = encoding.jpeg_sizes(views, width, height)
+    encoder, out = (
+        encoding.JpegEncoder(allocate(encoding.JpegScratch, sizes, device), width, height),
+        allocate(encoding.JpegBuffers, sizes, device),
+    )
     qualities = wp.full(views, quality, dtype=wp.int32, device=device)
     return lambda: encoder.encode(images.color, qualities, count, out), out
 
 
-def _depth_encoder(images: ViewBuffers, count: int, device: wp.Device) -> tuple[Callable[[], None], DepthBuffers]:
-    """Encoder of the first `count` depth images, and its output."""
+def _depth_encoder(images: ViewBuffers, count: int, device: wp.Device) -> tuple[Callable[[], None], encoding.DepthBuffers]:
     views, height, width = images.depth.shape
-    encoder = DepthEncoder(allocate_depth_scratch(views, width, height, device), width, height)
-    out = allocate(DepthBuffers, depth_sizes(views, width, height), device)
+    encoder = encoding.DepthEncoder(encoding.allocate_depth_scratch(views, width, height, device), width, height)
+    out = allocate(encoding.DepthBuffers, encoding.depth_sizes(views, width, height), device)
     return lambda: encoder.encode(images.depth, count, out), out
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import zarr
 
 from synpick_warp.errors import DatasetError
-from tools.checks.measures import MeasuredValue, run_check
+from tools.checks.dataset import MeasuredValue, run_check
 
 STORE = "trajectory.zarr"
 MAX_SPEED = 5.0

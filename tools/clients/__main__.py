@@ -18,8 +18,7 @@ import numpy as np
 
 import synpick_warp
 from synpick_warp.errors import SynpickError
-from tools.clients.base import PICTURE, PSNR, Client, Values
-from tools.clients.process import Result, finish, interpreters, run_module
+from tools.clients.base import PICTURE, PSNR, Client, Result, Values, finish, interpreters, run_module
 from tools.clients.reader import CLIENTS
 from tools.options import fail, make_names_parser, make_parser
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import synpick_warp
-from tools.clients.process import finish, interpreters, run_module
+from tools.clients.base import finish, interpreters, run_module
 from tools.options import fail, make_parser
 
 SMALL: dict[str, Any] = {

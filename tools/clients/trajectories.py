@@ -106,7 +106,6 @@ def read_blender(place: Path, data: Path, _: str) -> ClientReading:
 
 
 def _render(frame: int) -> np.ndarray:
-    """Linear radiance of a frame (H, W, 3) by Cycles on the CPU."""
     import bpy
 
     scene = bpy.context.scene

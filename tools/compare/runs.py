@@ -80,7 +80,6 @@ def compare(first: Path, second: Path) -> tuple[dict[str, LayerImages], str]:
 
 
 def _list_files(folder: Path) -> set[str]:
-    """Paths of all files below a folder, relative to it."""
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}")
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
@@ -155,13 +154,11 @@ def _array_folder(path: Path) -> Path | None:
 
 
 def _image(data: bytes) -> Any:
-    """Pixels of an image file."""
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     return "not an image" if pixels is None else pixels
 
 
 def _lines(data: bytes) -> dict[str, str]:
-    """Lines of a text, by their numbers."""
     return {f"line {number}": line.strip() for number, line in enumerate(data.decode(errors="replace").splitlines(), start=1)}
 
 

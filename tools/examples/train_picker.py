@@ -39,8 +39,8 @@ from synpick_warp.environment.picking import PickingEnvironment
 from synpick_warp.environment.settings import ATTEMPT, DISABLED, PICK, PIXEL, POINT, TARGET, TORCH, make_choice
 from synpick_warp.errors import ConfigError, DatasetError, SynpickError
 from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.system.hardware.cores import map_in_threads
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.processes.threads import map_in_threads
 from tools.options import configure, fail, make_parser, positive_count, write_json
 
 HELD_OUT = 5

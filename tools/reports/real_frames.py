@@ -20,7 +20,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synpick_warp.apps.validation.rendering import ObjectRenderer
+from synpick_warp.apps.validation.comparison import ObjectRenderer
 from synpick_warp.dataset.bop.foreign import measure_info
 from synpick_warp.dataset.bop.layout import Layout
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
@@ -80,7 +80,6 @@ def read_frames(folder: Path) -> list[RealFrame]:
 
 
 def _read_frame(folder: Path, name: str) -> RealFrame:
-    """Read the frame of a name."""
     path = folder / f"{name}-poses.json"
     content = decode_json(_read(path), dict[str, Any], path, DatasetError)
     try:
@@ -112,7 +111,6 @@ def _read(path: Path) -> bytes:
 
 
 def _image(path: Path) -> np.ndarray:
-    """Image of a file as OpenCV has it, unchanged."""
     return decode_image(_read(path), path, DatasetError)
 
 
@@ -140,7 +138,6 @@ def write_data_set(folder: Path, models: Path, out: Path) -> Path:
 
 
 def _write_json(path: Path, content: Any) -> None:
-    """Write a JSON file, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=1) + "\n")
 

@@ -22,8 +22,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
-from synpick_warp.factory.memory_plan import check_memory, explain_shortage, plan_memory
-from synpick_warp.factory.sizes import fit_to_device
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage, fit_to_device, plan_memory
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views

@@ -16,15 +16,13 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.apps.conversion.source import StoredSceneFiles, StoredViewFiles
-from synpick_warp.apps.validation.comparison import MEASURED_DEPTH
-from synpick_warp.apps.validation.rendering import DepthPatch, ObjectRenderer
+from synpick_warp.apps.validation.comparison import MEASURED_DEPTH, DepthPatch, ObjectRenderer
 from synpick_warp.codes import Ending
 from synpick_warp.configs.calibration.lens import read_lens
 from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.dataset.bop.foreign import ForeignScenes, measure_info
-from synpick_warp.dataset.bop.layout import TARGETS, Layout
-from synpick_warp.dataset.bop.models import models_folder, object_names
+from synpick_warp.dataset.bop.layout import TARGETS, Layout, models_folder, object_names
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
 from synpick_warp.errors import ConfigError, DatasetError

@@ -21,19 +21,8 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import ADVICE, Index, check_content
-from synpick_warp.dataset.bop.models import names_of
-from synpick_warp.dataset.commit.manifest import (
-    CONSTANTS,
-    INPUTS,
-    committed_episodes,
-    describe_inputs,
-    episode_entry,
-    read_checksums,
-    read_entry,
-    read_manifest,
-    read_settings,
-)
-from synpick_warp.dataset.commit.plausibility import check_file_names, check_frames
+from synpick_warp.dataset.bop.layout import names_of
+from synpick_warp.dataset.commit import manifest
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.dataset.trajectory import GROUP_FILE, Arrays, StoreAttributes, read_array
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
@@ -41,8 +30,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.formats import Content
 from synpick_warp.exporters.trajectory.arrays import STORE
-from synpick_warp.exporters.writing.checksums import open_regular
-from synpick_warp.exporters.writing.files import Buffer, remove_folder
+from synpick_warp.exporters.writing.files import Buffer, open_regular, remove_folder
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.exporters.writing.rle import Masks, Runs, find_runs
 from synpick_warp.scenes.looks import Looks
@@ -151,17 +139,17 @@ class ConversionSource:
     def __init__(self, folder: Path) -> None:
         """Open a data set; raises DatasetError if it is none, or has no episode."""
         self.folder = folder
-        self._manifest = read_manifest(folder)
-        self.config: Config = read_settings(folder, self._manifest)
+        self._manifest = manifest.read_manifest(folder)
+        self.config: Config = manifest.read_settings(folder, self._manifest)
         self.data = DataSet(folder)
-        self.episodes = committed_episodes(folder)
+        self.episodes = manifest.committed_episodes(folder)
         if not self.episodes:
             raise DatasetError(f"{folder} has no committed episode; finish its bake")
 
     @property
     def inputs(self) -> dict[str, str]:
         """Content digests of objects and lights, as the manifest records them."""
-        return self._manifest.get(INPUTS, {})
+        return self._manifest.get(manifest.INPUTS, {})
 
     @property
     def version(self) -> str:
@@ -211,11 +199,11 @@ class ConversionSource:
 
     def episode_end(self, index: int) -> EpisodeEnd:
         """How a committed episode ended; raises DatasetError if its manifest entry is missing or damaged."""
-        entry = read_entry(self.folder, episode_entry(index))
+        entry = manifest.read_entry(self.folder, manifest.episode_entry(index))
         if entry is None:
-            raise DatasetError(f"{self.folder / episode_entry(index)}.json is missing; resume the bake")
+            raise DatasetError(f"{self.folder / manifest.episode_entry(index)}.json is missing; resume the bake")
         row: dict[str, Any] = entry["row"]
-        check_frames(self.folder, DataLayout.of(self.config), index, row["frames"])
+        manifest.check_frames(self.folder, DataLayout.of(self.config), index, row["frames"])
         lines = tuple(json.dumps(attempt) + "\n" for attempt in entry["attempts"])
         return EpisodeEnd(index, row["arrangement"], row["frames"], int(Ending[row["ending"].upper()]), row, lines)
 
@@ -243,7 +231,7 @@ class StoredContext(ExportContext):
         catalog = load_catalog(config)
         lights = load_scene_lights(config.bake.lights, config.randomize, config.bake.seed, lambda line: None)
         looks = load_looks(config.randomize, lambda line: None)
-        if said := describe_inputs(digest_inputs(catalog, lights, looks), source.inputs):
+        if said := manifest.describe_inputs(digest_inputs(catalog, lights, looks), source.inputs):
             if source.version != __version__:
                 other = f"were digested by synpick-warp {source.version}, this is {__version__}; convert with that version"
                 raise DatasetError(f"{said} of {source.folder} are needed, but {other}")
@@ -272,8 +260,8 @@ class StoredContext(ExportContext):
         True. Raises DatasetError if a file is missing or no regular file, or the source has none of a name, and OSError if a file cannot be
         written."""
         folder = self._source.folder
-        known = read_checksums(folder, CONSTANTS)
-        check_file_names(folder, CONSTANTS, known, DataLayout.of(self._source.config))
+        known = manifest.read_checksums(folder, manifest.CONSTANTS)
+        manifest.check_file_names(folder, manifest.CONSTANTS, known, DataLayout.of(self._source.config))
         listed = [Path(name) for name in known]
         for name in names:
             files = [path for path in listed if path == name or name in path.parents]

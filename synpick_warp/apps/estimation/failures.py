@@ -11,8 +11,7 @@ from PIL import ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.apps.estimation.run import ObjectModel
-from synpick_warp.apps.evaluation.errors import LIMIT
-from synpick_warp.apps.evaluation.scoring import Scores
+from synpick_warp.apps.evaluation.errors import LIMIT, Scores
 from synpick_warp.apps.evaluation.truth import PoseTable, Truth
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.apps.estimation.scenes import EstimationScene, ScenePlan, read_scene
 from synpick_warp.apps.evaluation.results import TargetList, TargetRow, count_targets
 from synpick_warp.apps.evaluation.truth import PoseTable
-from synpick_warp.dataset.bop.models import find_models
+from synpick_warp.dataset.bop.layout import find_models
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import CatalogError, ConfigError, DatasetError
 from synpick_warp.scenes.assets.asset_files import read_isolated

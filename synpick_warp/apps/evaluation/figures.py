@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.apps.evaluation.errors import LIMIT, Model
-from synpick_warp.apps.evaluation.scoring import METRICS, Scores, score
+from synpick_warp.apps.evaluation.errors import LIMIT, METRICS, Model, Scores, score
 from synpick_warp.apps.evaluation.tables import summarize
 from synpick_warp.apps.evaluation.tracking import AlphaSweep, find_tracks, split_by_mode, sweep_alpha, track_of_instance
 from synpick_warp.apps.evaluation.truth import PoseTable, Truth
@@ -183,7 +182,6 @@ def _colors(count: int) -> list[str]:
 
 
 def _legend(names: Mapping[str, object]) -> Legend:
-    """Legend that gives each name its own colour, in their order."""
     return Legend(dict(zip(names, _colors(len(names)), strict=True)))
 
 

@@ -13,8 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from synpick_warp.apps.evaluation.errors import CONVENTIONS, LIMIT, band_indices, error_bands, recall_curve
-from synpick_warp.apps.evaluation.scoring import METRICS, Scores
+from synpick_warp.apps.evaluation.errors import CONVENTIONS, LIMIT, METRICS, Scores, band_indices, error_bands, recall_curve
 from synpick_warp.apps.evaluation.truth import Truth
 from synpick_warp.system.codecs.tables import Column, Table, to_csv, to_latex, to_text
 

@@ -40,8 +40,8 @@ from synpick_warp.apps.report.page import (
 )
 from synpick_warp.apps.statistics import Statistics, compute_statistics
 from synpick_warp.apps.statistics.picks import find_picks
-from synpick_warp.apps.viz.false_colors import bin_scale
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.apps.viz.drawing import bin_scale
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit.manifest import read_manifest
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError, OutputError

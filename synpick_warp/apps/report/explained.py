@@ -10,20 +10,8 @@ from synpick_warp.apps.report.charts import Chart
 from synpick_warp.apps.report.frames import Album, SampledEpisodes, Section, css_color, encode_photo, spread
 from synpick_warp.apps.report.page import Html, element, image, join, table_html
 from synpick_warp.apps.statistics.picks import SCORES, PickFigures, picks_tables
+from synpick_warp.apps.viz import explain_record
 from synpick_warp.apps.viz.explain import draw_observation, planning_camera
-from synpick_warp.apps.viz.explain_record import (
-    CANDIDATES,
-    KEPT,
-    SeenAttempt,
-    break_force,
-    choice_words,
-    clutter_edges,
-    labels,
-    lay_out,
-    parse_attempt,
-    seal_words,
-    suction_kind,
-)
 from synpick_warp.apps.viz.picks import draw_pick_maps
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.cell.gripper import Suction
@@ -69,7 +57,7 @@ def make_attempt(data_set: DataSet, found: Found, names: Mapping[int, str], albu
     """JSON of an attempt, whose picture is added to the album; None: it exceeds the budget, or there is no colour image. Raises
     DatasetError if the record or a file is missing or damaged."""
     config, episode = data_set.config, data_set[found.episode]
-    attempt = parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
+    attempt = explain_record.parse_attempt(episode.attempts[found.place], f"{data_set.folder / episode_entry(found.episode)}.json")
     if not attempt.frame < len(episode):
         raise DatasetError(f"attempt {attempt.attempt} of episode {found.episode} begins in frame {attempt.frame}; it has {len(episode)}")
     camera = config.rig.index(config.perception.camera)
@@ -90,16 +78,19 @@ def make_attempt(data_set: DataSet, found: Found, names: Mapping[int, str], albu
         "frame": attempt.frame,
         "picture": places[0],
         "size": [picture.shape[1], picture.shape[0]],
-        "words": [*choice_words(attempt, names, config.target, config.pick), *seal_words(attempt, names, config.suction)],
+        "words": [
+            *explain_record.choice_words(attempt, names, config.target, config.pick),
+            *explain_record.seal_words(attempt, names, config.suction),
+        ],
         "objects": _objects(attempt, names),
         "graph": _graph(attempt, config.perception.min_votes),
         "force": _force(attempt, config.suction, config.physics.tick_time),
     }
 
 
-def _objects(attempt: SeenAttempt, names: Mapping[int, str]) -> list[dict[str, Any]]:
+def _objects(attempt: explain_record.SeenAttempt, names: Mapping[int, str]) -> list[dict[str, Any]]:
     """Observed instances for the page, in the order in which the choice rule ranks them."""
-    short = labels(attempt)
+    short = explain_record.labels(attempt)
     return [
         {
             "label": short[one.instance],
@@ -108,19 +99,19 @@ def _objects(attempt: SeenAttempt, names: Mapping[int, str]) -> list[dict[str, A
             "above": len(one.ancestors),
             "visible": round(one.visible_fraction, 3),
             "pixels": one.visible,
-            "point": CANDIDATES[suction_kind(one)],
+            "point": explain_record.CANDIDATES[explain_record.suction_kind(one)],
             "target": one.instance == attempt.target,
         }
         for one in attempt.ranked()
     ]
 
 
-def _graph(attempt: SeenAttempt, min_votes: float) -> dict[str, Any] | None:
+def _graph(attempt: explain_record.SeenAttempt, min_votes: float) -> dict[str, Any] | None:
     """Clutter graph: nodes and curves [px]; None: nothing was seen."""
     if not attempt.seen:
         return None
-    edges = clutter_edges(attempt, min_votes)
-    layout, short = lay_out(attempt, edges, GRAPH_SIZE), labels(attempt)
+    edges = explain_record.clutter_edges(attempt, min_votes)
+    layout, short = explain_record.lay_out(attempt, edges, GRAPH_SIZE), explain_record.labels(attempt)
     nodes = [
         {
             "label": short[one.instance],
@@ -134,17 +125,17 @@ def _graph(attempt: SeenAttempt, min_votes: float) -> dict[str, Any] | None:
     curves = []
     for edge in edges:
         ends = layout.nodes[edge.upper], layout.nodes[edge.lower]
-        points = layout.routes[edge.upper, edge.lower] if edge.state == KEPT else np.array(ends)
+        points = layout.routes[edge.upper, edge.lower] if edge.state == explain_record.KEPT else np.array(ends)
         curves.append({"points": [_rounded(point) for point in points], "weight": round(edge.weight), "state": edge.state})
-    return {"size": list(GRAPH_SIZE), "nodes": nodes, "edges": curves, "kept": KEPT}
+    return {"size": list(GRAPH_SIZE), "nodes": nodes, "edges": curves, "kept": explain_record.KEPT}
 
 
-def _force(attempt: SeenAttempt, suction: Suction, tick_time: float) -> dict[str, Any] | None:
+def _force(attempt: explain_record.SeenAttempt, suction: Suction, tick_time: float) -> dict[str, Any] | None:
     """Seal force over time [s, N], and the force at which the seal breaks; None: nothing was engaged."""
     if not attempt.peak_force or not attempt.hits:
         return None
     values = [{"time": round(tick_time * number, 4), "force": round(force, 3)} for number, force in enumerate(attempt.peak_force)]
-    return {"values": values, "limit": break_force(attempt, suction)}
+    return {"values": values, "limit": explain_record.break_force(attempt, suction)}
 
 
 def _rounded(point: Any) -> list[float]:

@@ -187,7 +187,6 @@ def _coverage(figures: Figures) -> Rule:
 
 
 def _missing(figures: Figures) -> Rule:
-    """Note what the statistics could not read."""
     for sentence in figures.statistics.missing:
         title, _, detail = sentence.partition(": ")
         yield NOTE, title[:1].upper() + title[1:], f"{detail[:1].upper()}{detail[1:]}." if detail else ""

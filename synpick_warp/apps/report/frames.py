@@ -16,8 +16,7 @@ import numpy as np
 
 from synpick_warp.apps.statistics.columns import MAX_NAME, EpisodeFacts
 from synpick_warp.apps.statistics.compute import read_facts
-from synpick_warp.apps.viz.drawing import instance_color
-from synpick_warp.apps.viz.false_colors import DepthScale, color_depth, describe_depth, draw_layer, pooled_scale
+from synpick_warp.apps.viz.drawing import DepthScale, color_depth, describe_depth, draw_layer, instance_color, pooled_scale
 from synpick_warp.codes import Outcome
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.dataset.view import MILLIMETERS, View

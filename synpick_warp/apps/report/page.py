@@ -19,8 +19,7 @@ from synpick_warp.apps.report.findings import NOTE, WARNING, Remark, count_level
 from synpick_warp.apps.report.frames import SUCCESSES, Album
 from synpick_warp.apps.statistics import Statistics
 from synpick_warp.apps.statistics.tables import make_tables
-from synpick_warp.configs.files.load import load_config, sections, settings_of
-from synpick_warp.configs.files.write import format_toml
+from synpick_warp.configs.files.load import format_toml, load_config, sections, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.system.codecs.charts import ChartError, read_bundle
 from synpick_warp.system.codecs.tables import Table

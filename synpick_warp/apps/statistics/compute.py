@@ -25,7 +25,7 @@ from synpick_warp.configs.dataset import split_kind
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import check_content
 from synpick_warp.dataset.bop.arrays import read_arrays
-from synpick_warp.dataset.bop.models import object_names
+from synpick_warp.dataset.bop.layout import object_names
 from synpick_warp.dataset.commit.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
@@ -381,7 +381,6 @@ def _ranked(counts: Mapping[str, int]) -> dict[str, int]:
 
 
 def _histogram(counts: Mapping[int, int], size: int) -> tuple[int, ...]:
-    """Counts of bins 0 to `size` - 1."""
     return tuple(counts.get(index, 0) for index in range(size))
 
 

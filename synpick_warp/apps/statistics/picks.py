@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Outcome, Share
-from synpick_warp.dataset.bop.models import names_of
+from synpick_warp.dataset.bop.layout import names_of
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.system.codecs.tables import Table, parse_columns

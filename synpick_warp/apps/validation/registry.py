@@ -14,7 +14,7 @@ import numpy as np
 
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 
-MODULES = ("tree", "records", "images", "coco", "models", "cross_file", "graph", "poses", "trials")
+MODULES = ("tree", "records", "images", "coco", "models", "cross_file", "poses", "trials")
 """Modules in `validation.rules`, in the order of their rules."""
 UNITS = ("mm", "px")
 """Units of deviations."""

@@ -206,7 +206,7 @@ class TaskState:
     @cached_property
     def renderer(self) -> Any:
         """The `ObjectRenderer`; Warp is imported when the first view is rendered."""
-        from synpick_warp.apps.validation.rendering import ObjectRenderer
+        from synpick_warp.apps.validation.comparison import ObjectRenderer
 
         return ObjectRenderer(self.layout)
 

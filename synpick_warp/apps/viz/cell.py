@@ -15,8 +15,7 @@ from synpick_warp.apps.viz.drawing import GOLDEN, INK, WHITE, Image, blank, chec
 from synpick_warp.apps.viz.frusta import Canvas, Picture, draw_axes, draw_camera, project, rays
 from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cell.bins import Bins, BinSizes
-from synpick_warp.configs.cell.cameras import WORLD
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import WORLD, Rig
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.factory.assembly import compiling_if_cold, make_renderer
 from synpick_warp.scenes.bins import make_bins, make_fixtures
@@ -176,7 +175,6 @@ def lay_out(objects: Sequence[RawObject], sizes: BinSizes) -> Laid:
 
 
 def _entry(raw: RawObject) -> CatalogEntry:
-    """Entry of an object that is rendered and not simulated."""
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     shape = {"pieces": (), "volume": raw.hull.volume, "radius": radius, "mass": 1.0, "center_of_mass": np.zeros(3), "inertia": np.eye(3)}
     known = {name: getattr(raw, name) for name in ("obj_id", "name", "mesh", "material", "symmetries_discrete", "symmetries_continuous")}
@@ -304,7 +302,6 @@ def describe_camera(camera: Camera, name: str, bin: BinSizes) -> list[str]:
 
 
 def _facts(scene: CellScene, bins: Bins, index: int, title: str) -> Image:
-    """Column of text beside a view from outside."""
     sizes, laid = scene.sizes[index], scene.laid[index]
     lines = [title, ""] if title else []
     lines += [f"{sizes.noun} {sizes.name}" if sizes.name != sizes.noun else sizes.name]
@@ -340,7 +337,6 @@ def _millimetres(lengths: object) -> str:
 
 
 def _row(images: list[Image]) -> Image:
-    """Images beside each other, with gaps."""
     height = max(image.shape[0] for image in images)
     padded = [cv2.copyMakeBorder(image, 0, height - image.shape[0], 0, _GAP, cv2.BORDER_CONSTANT, value=WHITE) for image in images]
     return np.concatenate(padded, axis=1)[:, :-_GAP]

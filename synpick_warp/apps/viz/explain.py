@@ -7,46 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import (
-    FONT,
-    INK,
-    WHITE,
-    Image,
-    blank,
-    check_picture_name,
-    instance_color,
-    paste,
-    put_text,
-    readable_on,
-    shorten,
-    write_picture,
-)
-from synpick_warp.apps.viz.explain_record import (
-    CYCLIC,
-    GREY,
-    MODE_WORDS,
-    OUTVOTED,
-    RED,
-    SeenAttempt,
-    break_force,
-    choice_words,
-    choose_attempts,
-    clutter_edges,
-    disc,
-    draw_graph,
-    fixed,
-    labels,
-    put_boxed,
-    read_attempts,
-    seal_words,
-    suction_kind,
-)
+from synpick_warp.apps.viz import drawing, explain_record
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.cell.gripper import Suction
-from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import Pick, Target
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.dataset.bop.models import object_names
+from synpick_warp.dataset.bop.layout import object_names
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.dataset.scene_index import SceneIndex
 from synpick_warp.dataset.view import View
@@ -102,10 +69,14 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     PNG or JPEG file, whose folder is created. Raises ConfigError if the data set's config.toml is damaged, DatasetError if there is no such
     attempt, or a file is missing or damaged, OutputError if the image cannot be written, and ChartError if the charts' library cannot run.
     """
-    check_picture_name(out)
+    drawing.check_picture_name(out)
     if not dataset.is_dir():
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    attempts = choose_attempts(dataset, DEFAULT_ATTEMPTS) if episode is None else read_attempts(dataset, episode, attempt)
+    attempts = (
+        explain_record.choose_attempts(dataset, DEFAULT_ATTEMPTS)
+        if episode is None
+        else explain_record.read_attempts(dataset, episode, attempt)
+    )
     path = dataset / "config.toml"
     if not path.exists():
         raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
@@ -122,11 +93,11 @@ def write_explanation(dataset: Path, out: Path, episode: int | None, attempt: in
     charts = [load_chart(each, suction, tick_time, IMAGE_WIDTH, room) for each, (_, room) in zip(attempts, rows, strict=True)]
     for (sheet, _), data in zip(rows, render_charts(charts, scale=1.0), strict=True):
         plot = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
-        paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
-    return write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
+        drawing.paste(sheet, plot, MARGIN, len(sheet) - MARGIN - len(plot))
+    return drawing.write_picture(out, np.concatenate([sheet for sheet, _ in rows]))
 
 
-def _open_view(dataset: Path, scenes: SceneIndex, attempt: SeenAttempt, camera: int, every: int) -> View:
+def _open_view(dataset: Path, scenes: SceneIndex, attempt: explain_record.SeenAttempt, camera: int, every: int) -> View:
     """View of the camera of perception in which an attempt's choice was made, or the last before: it renders each `every`-th frame."""
     files, frame = scenes.files(attempt.episode, camera), attempt.frame - attempt.frame % every
     if frame not in files.frames():
@@ -164,36 +135,38 @@ def to_view(view: View, planned: Camera, places: list[tuple[float, float]]) -> l
     return [(x, y) for x, y in (view.project(points, view.world_to_camera) - 0.5).tolist()]
 
 
-def _row(attempt: SeenAttempt, view: View, planned: Camera | None, words: Image, min_votes: float) -> tuple[Image, int]:
+def _row(
+    attempt: explain_record.SeenAttempt, view: View, planned: Camera | None, words: drawing.Image, min_votes: float
+) -> tuple[drawing.Image, int]:
     """Draw one attempt: image, clutter graph, and text and table (`words`), with room at the lower left for the force's plot, whose height
     [px] is returned, too."""
     image = draw_observation(attempt, view, planned)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
-    sheet = blank(IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, HEAD + height + 2 * MARGIN)
+    sheet = drawing.blank(IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, HEAD + height + 2 * MARGIN)
     columns = MARGIN, 2 * MARGIN + IMAGE_WIDTH, 3 * MARGIN + IMAGE_WIDTH + _GRAPH_WIDTH
     top = MARGIN + HEAD
-    paste(sheet, image, columns[0], top)
+    drawing.paste(sheet, image, columns[0], top)
     _draw_key(sheet, columns[0], top + image.shape[0] + 24)
-    states = {edge.state for edge in clutter_edges(attempt, min_votes)}
+    states = {edge.state for edge in explain_record.clutter_edges(attempt, min_votes)}
     foot = _graph_foot(states) if attempt.seen else []
-    paste(sheet, draw_graph(attempt, min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    drawing.paste(sheet, explain_record.draw_graph(attempt, min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
     for number, (text, color) in enumerate(foot):
-        put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
-    paste(sheet, words, columns[2], top)
-    head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
-    put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
+        drawing.put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
+    drawing.paste(sheet, words, columns[2], top)
+    head = f"Episode {attempt.episode}, attempt {attempt.attempt} ({explain_record.MODE_WORDS[attempt.mode]}): {attempt.sentence}"
+    drawing.put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else explain_record.RED, 2)
     scene = Path(view.place)
     captions = [f"camera {view.camera}: {scene.parent.name}/{scene.name}, image {view.frame}", "clutter graph", "choice and outcome"]
     if not view.has("mask_visib"):
         captions[0] += "; no contours: this data set has no masks"
     for text, column in zip(captions, columns, strict=True):
-        put_text(sheet, text, (column, top - 9), TEXT, SOFT)
-    sheet[-1] = GREY
+        drawing.put_text(sheet, text, (column, top - 9), TEXT, SOFT)
+    sheet[-1] = explain_record.GREY
     return sheet, height - image.shape[0] - 2 * LINE - MARGIN
 
 
-def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -> Image:
+def draw_observation(attempt: explain_record.SeenAttempt, view: View, planned: Camera | None) -> drawing.Image:
     """Draw contours, if the data set has masks, and suction points on the colour image, which is darkened except for the target.
 
     `view` is the camera of perception at the observation, `planned` as of `planning_camera`. Raises DatasetError if a file is missing or
@@ -211,7 +184,7 @@ def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -
     for instance in order:
         mask = cv2.resize(255 * masks[instance].astype(np.uint8), size, interpolation=cv2.INTER_LINEAR) > 127
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
-    short = labels(attempt)
+    short = explain_record.labels(attempt)
     for one in attempt.seen:
         places = [to_color_image(point, attempt.observation.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
         if planned is not None:
@@ -220,25 +193,25 @@ def draw_observation(attempt: SeenAttempt, view: View, planned: Camera | None) -
         target = one.instance == attempt.target
         for kind, point in enumerate(points[:-1]):
             draw_mark(drawn, kind, point)
-        draw_chosen(drawn, points[-1], instance_color(one.instance), target)
-        _put_label(drawn, short[one.instance], points[-1], instance_color(one.instance), 1.3 * _LABEL if target else _LABEL)
+        draw_chosen(drawn, points[-1], drawing.instance_color(one.instance), target)
+        _put_label(drawn, short[one.instance], points[-1], drawing.instance_color(one.instance), 1.3 * _LABEL if target else _LABEL)
     return drawn
 
 
-def _draw_contours(drawn: Image, color: Image, mask: np.ndarray, instance: int, target: bool) -> None:
+def _draw_contours(drawn: drawing.Image, color: drawing.Image, mask: np.ndarray, instance: int, target: bool) -> None:
     """Draw contours of a mask's components and holes, in place; the target keeps its brightness, with tint and white outline."""
     lines = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
-    shade = instance_color(instance)
+    shade = drawing.instance_color(instance)
     if target:
         drawn[mask] = (0.72 * color[mask] + 0.28 * np.array(shade)).astype(np.uint8)
-        cv2.drawContours(drawn, lines, -1, WHITE, 3 * _HALO, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, drawing.WHITE, 3 * _HALO, cv2.LINE_AA)
         cv2.drawContours(drawn, lines, -1, shade, _HALO + 1, cv2.LINE_AA)
     else:
-        cv2.drawContours(drawn, lines, -1, INK, _HALO + 1, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, drawing.INK, _HALO + 1, cv2.LINE_AA)
         cv2.drawContours(drawn, lines, -1, shade, 2, cv2.LINE_AA)
 
 
-def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
+def draw_mark(picture: drawing.Image, kind: int, place: tuple[float, float]) -> None:
     """Draw a suction point candidate, white with a dark outline: pole of inaccessibility, ring; centroid, cross; half-way, diamond."""
     x, y = place
     reach = 5.0
@@ -246,81 +219,86 @@ def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
         1: [[(x - reach, y), (x + reach, y)], [(x, y - reach), (x, y + reach)]],
         2: [[(x - reach, y), (x, y - reach), (x + reach, y), (x, y + reach), (x - reach, y)]],
     }
-    for color, thickness in ((INK, 4), (WHITE, 2)):
+    for color, thickness in ((drawing.INK, 4), (drawing.WHITE, 2)):
         if kind == 0:
-            disc(picture, place, reach, color, thickness)
+            explain_record.disc(picture, place, reach, color, thickness)
         else:
             for line in shapes[kind]:
-                cv2.polylines(picture, [fixed(np.array(line))], False, color, thickness, cv2.LINE_AA, 4)
+                cv2.polylines(picture, [explain_record.fixed(np.array(line))], False, color, thickness, cv2.LINE_AA, 4)
 
 
-def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, int, int], target: bool) -> None:
+def draw_chosen(picture: drawing.Image, place: tuple[float, float], color: tuple[int, int, int], target: bool) -> None:
     """Draw a suction point: a disc in the object's colour; the target's has a ring."""
     if target:
-        disc(picture, place, 14, INK, 5)
-        disc(picture, place, 14, WHITE, 3)
-    disc(picture, place, 5.5, INK)
-    disc(picture, place, 4.0, color)
+        explain_record.disc(picture, place, 14, drawing.INK, 5)
+        explain_record.disc(picture, place, 14, drawing.WHITE, 3)
+    explain_record.disc(picture, place, 5.5, drawing.INK)
+    explain_record.disc(picture, place, 4.0, color)
 
 
-def _put_label(picture: Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
-    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
+def _put_label(picture: drawing.Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
+    (width, height), _ = cv2.getTextSize(text, drawing.FONT, size, 1)
     place = (point[0] + (22 if size > _LABEL else 13) + width / 2, point[1] - 8 - height / 2)
-    put_boxed(picture, text, place, size, readable_on(color), color)
+    explain_record.put_boxed(picture, text, place, size, drawing.readable_on(color), color)
 
 
-def _draw_key(sheet: Image, x: int, y: int) -> None:
-    """Draw the legend of the image's markers."""
+def _draw_key(sheet: drawing.Image, x: int, y: int) -> None:
     for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
         place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
         if kind < 3:
             draw_mark(sheet, kind, place)
         else:
             draw_chosen(sheet, place, (200, 200, 200), kind == 4)
-        put_text(sheet, text, (round(place[0]) + (26 if kind == 4 else 14), y), SMALL, SOFT)
-        x += 44 + cv2.getTextSize(text, FONT, SMALL, 1)[0][0]
+        drawing.put_text(sheet, text, (round(place[0]) + (26 if kind == 4 else 14), y), SMALL, SOFT)
+        x += 44 + cv2.getTextSize(text, drawing.FONT, SMALL, 1)[0][0]
 
 
 def _graph_foot(states: set[str]) -> Sequence[tuple[str, tuple[int, int, int]]]:
     lines = [("arrow: from the object on top to the one below, with its votes", SOFT), ("badge: number of objects above", SOFT)]
-    lines += [(f"dashed: {OUTVOTED}", GREY)] if OUTVOTED in states else []
-    return lines + ([(f"dashed: {CYCLIC}", RED)] if CYCLIC in states else [])
+    lines += [(f"dashed: {explain_record.OUTVOTED}", explain_record.GREY)] if explain_record.OUTVOTED in states else []
+    return lines + ([(f"dashed: {explain_record.CYCLIC}", explain_record.RED)] if explain_record.CYCLIC in states else [])
 
 
 # ---- panels ----
 
 
-def draw_words(attempt: SeenAttempt, names: Mapping[int, str], rules: tuple[Target, Pick], suction: Suction) -> Image:
+def draw_words(
+    attempt: explain_record.SeenAttempt, names: Mapping[int, str], rules: tuple[Target, Pick], suction: Suction
+) -> drawing.Image:
     """Draw the explanation in sentences, and below it the table of objects, ranked by the choice rule."""
-    lines = [(line, INK) for text in choice_words(attempt, names, *rules) for line in wrapped(text, TEXT, WORDS_WIDTH)]
-    lines += [(line, INK) for text in seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)]
+    lines = [
+        (line, drawing.INK) for text in explain_record.choice_words(attempt, names, *rules) for line in wrapped(text, TEXT, WORDS_WIDTH)
+    ]
+    lines += [
+        (line, drawing.INK) for text in explain_record.seal_words(attempt, names, suction) for line in wrapped(text, TEXT, WORDS_WIDTH)
+    ]
     outcome = attempt.sentence[:1].upper() + attempt.sentence[1:]
-    lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
-    canvas = blank(WORDS_WIDTH, LINE * (len(lines) + len(attempt.seen) + 3))
+    lines += [(line, GREEN if attempt.picked else explain_record.RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
+    canvas = drawing.blank(WORDS_WIDTH, LINE * (len(lines) + len(attempt.seen) + 3))
     for number, (text, color) in enumerate(lines):
-        put_text(canvas, text, (0, LINE * number + 16), TEXT, color)
+        drawing.put_text(canvas, text, (0, LINE * number + 16), TEXT, color)
     if attempt.seen:
         _draw_table(canvas, attempt, names, LINE * (len(lines) + 1))
     return canvas
 
 
-def _draw_table(canvas: Image, attempt: SeenAttempt, names: Mapping[int, str], top: int) -> None:
-    short = labels(attempt)
+def _draw_table(canvas: drawing.Image, attempt: explain_record.SeenAttempt, names: Mapping[int, str], top: int) -> None:
+    short = explain_record.labels(attempt)
     for x, text in _COLUMNS:
-        put_text(canvas, text, (x, top + 16), TEXT, SOFT)
-    cv2.line(canvas, (0, top + LINE + 1), (WORDS_WIDTH, top + LINE + 1), GREY, 1)
+        drawing.put_text(canvas, text, (x, top + 16), TEXT, SOFT)
+    cv2.line(canvas, (0, top + LINE + 1), (WORDS_WIDTH, top + LINE + 1), explain_record.GREY, 1)
     for number, one in enumerate(attempt.ranked()):
         y = top + LINE * (number + 1) + 18
         target = one.instance == attempt.target
         if target:
             canvas[y - 15 : y + 7] = (225, 240, 225) if attempt.picked else (228, 228, 245)
-        disc(canvas, (8, y - 5), 7, INK)
-        disc(canvas, (8, y - 5), 6, instance_color(one.instance))
-        name = shorten(f"{short[one.instance]} {names.get(one.object_id, '')}", _COLUMNS[1][0] - 30, TEXT)
-        kind = ("pole", "centr.", "half", "drawn")[suction_kind(one)]
+        explain_record.disc(canvas, (8, y - 5), 7, drawing.INK)
+        explain_record.disc(canvas, (8, y - 5), 6, drawing.instance_color(one.instance))
+        name = drawing.shorten(f"{short[one.instance]} {names.get(one.object_id, '')}", _COLUMNS[1][0] - 30, TEXT)
+        kind = ("pole", "centr.", "half", "drawn")[explain_record.suction_kind(one)]
         cells = ((22, name), (244, f"{len(one.ancestors)}"), (296, f"{one.visible_fraction:.2f}"), (356, f"{one.visible}"), (416, kind))
         for x, text in cells:
-            put_text(canvas, text, (x, y), TEXT, INK, 2 if target and x == 22 else 1)
+            drawing.put_text(canvas, text, (x, y), TEXT, drawing.INK, 2 if target and x == 22 else 1)
 
 
 def wrapped(text: str, size: float, width: int) -> list[str]:
@@ -329,7 +307,7 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
     current = ""
     for word in text.split():
         longer = f"{current} {word}" if current.strip() else current + word
-        if current.strip() and cv2.getTextSize(longer, FONT, size, 1)[0][0] > width:
+        if current.strip() and cv2.getTextSize(longer, drawing.FONT, size, 1)[0][0] > width:
             lines.append(current)
             current = f"    {word}"
         else:
@@ -337,7 +315,7 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
     return [*lines, current]
 
 
-def load_chart(attempt: SeenAttempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:
+def load_chart(attempt: explain_record.SeenAttempt, suction: Suction, tick_time: float, width: int, height: int) -> Spec:
     """Chart of the seal force over time, with the break force; size in pixels, whose height is kept in its limits.
 
     `tick_time`: time between two frames [s].
@@ -346,7 +324,7 @@ def load_chart(attempt: SeenAttempt, suction: Suction, tick_time: float, width: 
     size = {"width": width, "height": height, "autosize": {"type": "fit", "contains": "padding"}, "padding": 2, "background": "white"}
     text = {"color": _SOFT, "fontSize": _FONT}
     title = {**text, "text": "seal force [N] (the largest, if several)", "anchor": "start", "fontWeight": "normal"}
-    breaks = break_force(attempt, suction)
+    breaks = explain_record.break_force(attempt, suction)
     if not attempt.peak_force or not attempt.hits:
         said = {"type": "text", "text": "no force: nothing was engaged", **text}
         return {**size, "title": title, "data": {"values": [{}]}, "mark": said, "config": theme(_FONT)}

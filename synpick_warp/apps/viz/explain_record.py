@@ -418,7 +418,6 @@ def _draw_weight(canvas: Image, edge: Edge, route: np.ndarray) -> None:
 
 
 def _resample(route: np.ndarray) -> np.ndarray:
-    """Resample a polyline in steps of one pixel."""
     length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))))
     steps = np.linspace(0.0, length[-1], max(2, math.ceil(length[-1])))
     return np.stack([np.interp(steps, length, route[:, axis]) for axis in range(2)], axis=1)

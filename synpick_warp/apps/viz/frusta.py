@@ -9,9 +9,8 @@ import numpy as np
 
 from synpick_warp.apps.viz.drawing import Color, Image, put_text, text_size
 from synpick_warp.configs.cell.bins import BinSizes
-from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, Pose, Rig
 from synpick_warp.configs.cell.gripper import Gripper
-from synpick_warp.configs.cell.rig import Rig
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.scenes.cameras import is_in_way, make_cameras
 from synpick_warp.scenes.types import Camera

@@ -13,7 +13,7 @@ from synpick_warp.apps.viz.drawing import INK, WHITE, Image, blank, check_pictur
 from synpick_warp.apps.viz.explain import GREEN, LINE, TEXT, wrapped
 from synpick_warp.apps.viz.explain_record import disc, fixed
 from synpick_warp.codes import Ending, Outcome, Share
-from synpick_warp.dataset.bop.models import names_of
+from synpick_warp.dataset.bop.layout import names_of
 from synpick_warp.dataset.reading import DataSet, Episode
 from synpick_warp.dataset.view import View, mean_by_candidate
 from synpick_warp.errors import DatasetError

@@ -12,26 +12,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from synpick_warp.apps.viz.drawing import (
-    GOLDEN,
-    Image,
-    check_picture_name,
-    instance_color,
-    put_lines,
-    put_text,
-    readable_on,
-    short_labels,
-    shorten,
-    text_size,
-    write_picture,
-)
-from synpick_warp.apps.viz.false_colors import DepthScale, bin_scale, color_depth, describe_depth, layer_pictures, pooled_scale
+from synpick_warp.apps.viz import drawing
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.foreign import ForeignScenes
-from synpick_warp.dataset.bop.layout import NoLayoutError
-from synpick_warp.dataset.bop.models import object_names
+from synpick_warp.dataset.bop.layout import NoLayoutError, object_names
 from synpick_warp.dataset.commit.manifest import CONFIG_FILE, episode_entry, read_entry
 from synpick_warp.dataset.view_files import SceneFiles
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
@@ -81,20 +67,20 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     """Draw up to `views` views of a data set, one per row, spread over all its splits, cameras, scenes and time, and write a PNG or JPEG
     file, whose folder is created. Raises DatasetError if the folder is not a data set, or a file is missing or damaged, and OutputError if
     the image cannot be written, or has more than MAX_VIEWS views."""
-    check_picture_name(out)
+    drawing.check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
     config = dataset / CONFIG_FILE
     cameras = len(load_config(str(config), {}).rig) if config.exists() else 0
     shown = list(_read_views(sample(find_scenes(dataset), views, cameras)))
     baked = read_baked(dataset, {record["obj_id"] for view in shown for record, _ in view.truth})
-    scale = bin_scale(baked.config.cell.bins, [view.camera for view in shown]) if baked.config else None
-    scale = scale or pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
+    scale = drawing.bin_scale(baked.config.cell.bins, [view.camera for view in shown]) if baked.config else None
+    scale = scale or drawing.pooled_scale(depth for view in shown if (depth := _read_depth(view)) is not None)
     most = max(len(view.truth) for view in shown)
     rows = [_row(view, scale, baked, most) for view in shown]
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
-    return write_picture(out, sheet)
+    return drawing.write_picture(out, sheet)
 
 
 class Baked(NamedTuple):
@@ -179,7 +165,7 @@ def sample(scenes: list[SheetScene], views: int, cameras: int = 0) -> list[tuple
         group = groups[number % len(groups)]
         in_group = -(-(views - number % len(groups)) // len(groups))
         scene, frames = group[number // len(groups) * len(group) // in_group]
-        samples.add((scene, frames[int((0.5 + number * GOLDEN) % 1.0 * len(frames))]))
+        samples.add((scene, frames[int((0.5 + number * drawing.GOLDEN) % 1.0 * len(frames))]))
     return sorted(samples)
 
 
@@ -199,10 +185,10 @@ def _read_depth(view: _View) -> np.ndarray | None:
     return counts * float(view.camera["depth_scale"])
 
 
-def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -> Image:
+def _row(view: _View, depth_scale: drawing.DepthScale | None, baked: Baked, most: int) -> drawing.Image:
     """Draw all panels of a view side by side; `most` is the largest number of instances of all views."""
     depth = _read_depth(view)
-    colored = None if depth is None else color_depth(depth, depth_scale)
+    colored = None if depth is None else drawing.color_depth(depth, depth_scale)
     color = view.files.image("rgb", view.frame) if view.files.has("rgb") or colored is None else colored
     size = color.shape[1::-1]
     colored = _placeholder(color, "no depth in this data set") if colored is None else colored
@@ -212,57 +198,56 @@ def _row(view: _View, depth_scale: DepthScale | None, baked: Baked, most: int) -
     low = max(_MIN_LEGEND, round(size[1] * scale))
     panels = [
         (place, _fit(color, scale)),
-        (f"{describe_depth(depth_scale)}; one scale", _fit(colored, scale, smooth=False)),
+        (f"{drawing.describe_depth(depth_scale)}; one scale", _fit(colored, scale, smooth=False)),
         (f"instances: {len(view.truth)}, of which {seen} seen", _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick", _draw_boxes(view, _fit(color, scale), scale)),
         ("object: label, visible fraction, name", draw_legend((legend_width(low, most), low), facts, view.truth, baked.names)),
     ]
     count = float(view.camera.get("depth_scale", 1.0))
-    counts = depth_scale and DepthScale(*(each / count for each in depth_scale))
-    panels += [(caption, _fit(picture, scale, smooth=False)) for caption, picture in layer_pictures(view.files, view.frame, counts)]
+    counts = depth_scale and drawing.DepthScale(*(each / count for each in depth_scale))
+    panels += [(caption, _fit(picture, scale, smooth=False)) for caption, picture in drawing.layer_pictures(view.files, view.frame, counts)]
     if graph := view.files.graph(view.frame):
         panels.append(("arrows: lies on; numbers: unstacking order", _draw_graph(view, graph, _fit(color, scale), scale)))
     height = max(image.shape[0] for _, image in panels)
     return np.concatenate([_captioned(image, caption, height) for caption, image in panels], axis=1)
 
 
-def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
+def _fit(image: drawing.Image, scale: float, smooth: bool = True) -> drawing.Image:
     """Scale an image to the panel's width; nearest neighbour for ids, masks and colour maps."""
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     fitted = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth and scale < 1 else cv2.INTER_NEAREST)
     return np.pad(fitted, ((0, 0), (0, _PANEL_WIDTH - size[0]), (0, 0)))
 
 
-def _captioned(image: Image, caption: str, height: int) -> Image:
+def _captioned(image: drawing.Image, caption: str, height: int) -> drawing.Image:
     """Add a caption above an image, gaps around it, and space below it up to a height [px]."""
     head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
-    put_text(head, caption, (4, 14), 0.42, PAPER)
+    drawing.put_text(head, caption, (4, 14), 0.42, PAPER)
     return np.pad(np.concatenate((head, image)), ((0, height - image.shape[0] + _GAP), (0, _GAP), (0, 0)))
 
 
-def _color_instances(view: _View, color: Image) -> Image:
+def _color_instances(view: _View, color: drawing.Image) -> drawing.Image:
     """Visible masks in their instances' colours over the darkened grey image."""
     if not view.files.has("mask_visib"):
         return _placeholder(color, "no masks in this data set")
     drawn = _darkened_grey(color)
     for index, (record, _) in enumerate(view.truth):
-        drawn[view.files.mask("mask_visib", view.frame, index)] = instance_color(record.get("instance_id", index))
+        drawn[view.files.mask("mask_visib", view.frame, index)] = drawing.instance_color(record.get("instance_id", index))
     return drawn
 
 
-def _darkened_grey(color: Image) -> Image:
-    """Grey image at a third of its brightness."""
+def _darkened_grey(color: drawing.Image) -> drawing.Image:
     return np.repeat(cv2.cvtColor(color, cv2.COLOR_BGR2GRAY)[..., None] // 3, 3, axis=2)
 
 
-def _placeholder(color: Image, text: str) -> Image:
+def _placeholder(color: drawing.Image, text: str) -> drawing.Image:
     """Placeholder for a panel without data: a text on the darkened grey image."""
     drawn = _darkened_grey(color)
-    put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
+    drawing.put_text(drawn, text, (8, 24), 0.5, (230, 230, 230))
     return drawn
 
 
-def _draw_graph(view: _View, graph: Mapping[str, Any], image: Image, scale: float) -> Image:
+def _draw_graph(view: _View, graph: Mapping[str, Any], image: drawing.Image, scale: float) -> drawing.Image:
     """Draw the support graph over the darkened image: an arrow from each object to each that carries it, wider for a larger force, and the
     object's place in the unstacking order."""
     image //= 2
@@ -272,24 +257,24 @@ def _draw_graph(view: _View, graph: Mapping[str, Any], image: Image, scale: floa
         if info["px_count_visib"] > 0:
             x, y, width, height = info["bbox_visib"]
             points[index] = round(scale * (x + width / 2)), round(scale * (y + height / 2))
-            colors[index] = instance_color(record.get("instance_id", index))
+            colors[index] = drawing.instance_color(record.get("instance_id", index))
     for upper, lower, force in graph.get("support", ()):
         if upper in points and lower in points:
             thickness = 1 + min(_WIDEST_ARROW, round(force))
             cv2.arrowedLine(image, points[upper], points[lower], colors[upper], thickness, cv2.LINE_AA, tipLength=0.2)
     for index, (x, y) in points.items():
         cv2.circle(image, (x, y), 4, colors[index], -1, cv2.LINE_AA)
-        put_text(image, str(place.get(index, "")), (x + 5, y - 4), 0.42, PAPER)
+        drawing.put_text(image, str(place.get(index, "")), (x + 5, y - 4), 0.42, PAPER)
     return image
 
 
-def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
+def _draw_boxes(view: _View, image: drawing.Image, scale: float) -> drawing.Image:
     """Draw amodal and visible bounding boxes with labels, in place."""
     texts, boxes, labels, colors = label_texts(view.truth), [], [], []
     for index, (record, info) in enumerate(view.truth):
         if info["px_count_visib"] == 0:
             continue
-        color = instance_color(record.get("instance_id", index))
+        color = drawing.instance_color(record.get("instance_id", index))
         for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
             x, y, width, height = info[name]
             if width < 0:
@@ -379,14 +364,14 @@ def _places(box: Box, size: tuple[int, int], area: tuple[int, int]) -> Iterator[
 def label_texts(truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]]) -> list[str]:
     """Short label of each instance of a view: obj_id, with a letter where several share it."""
     instances = [record.get("instance_id", index) for index, (record, _) in enumerate(truth)]
-    labels = short_labels(zip(instances, (record["obj_id"] for record, _ in truth), strict=True))
+    labels = drawing.short_labels(zip(instances, (record["obj_id"] for record, _ in truth), strict=True))
     return [labels[instance] for instance in instances]
 
 
-def draw_labels(image: Image, boxes: Sequence[Box], texts: Sequence[str], colors: Sequence[tuple[int, int, int]]) -> None:
+def draw_labels(image: drawing.Image, boxes: Sequence[Box], texts: Sequence[str], colors: Sequence[tuple[int, int, int]]) -> None:
     """Draw labels of boxes on their instances' colours, in place; a line leads from a label outside its box to it. Those without room are
     left out."""
-    sizes = [(width + 2 * _PAD, height + 2 * _PAD) for width, height in (text_size(text, LABEL) for text in texts)]
+    sizes = [(width + 2 * _PAD, height + 2 * _PAD) for width, height in (drawing.text_size(text, LABEL) for text in texts)]
     for box, place, text, color in zip(boxes, place_labels(boxes, sizes, image.shape[1::-1]), texts, colors, strict=True):
         if place is None:
             continue
@@ -402,12 +387,12 @@ def _ground(color: tuple[int, int, int]) -> tuple[int, int, int]:
     return blue, green, red
 
 
-def _put_label(image: Image, text: str, place: Box, color: tuple[int, int, int]) -> None:
+def _put_label(image: drawing.Image, text: str, place: Box, color: tuple[int, int, int]) -> None:
     """Draw text on a filled rectangle of the darkened colour, in place."""
     low = round(place.x), round(place.y)
     high = round(place.x + place.width) - 1, round(place.y + place.height) - 1
     cv2.rectangle(image, low, high, _ground(color), -1)
-    put_text(image, text, (low[0] + _PAD, high[1] - _PAD), LABEL, readable_on(_ground(color)))
+    drawing.put_text(image, text, (low[0] + _PAD, high[1] - _PAD), LABEL, drawing.readable_on(_ground(color)))
 
 
 def legend_width(height: int, instances: int) -> int:
@@ -425,14 +410,14 @@ def draw_legend(
     facts: Sequence[str],
     truth: Sequence[tuple[Mapping[str, Any], Mapping[str, Any]]],
     names: Mapping[int, str],
-) -> Image:
+) -> drawing.Image:
     """Draw the legend of a view, a new image: facts, then label, name and visible fraction of each instance, the most visible first.
 
     `size` is width and height [px], and what does not fit is counted; `truth` has the records of scene_gt and scene_gt_info of each
     instance; `names` by obj_id may lack some.
     """
     panel = np.zeros((size[1], size[0], 3), np.uint8)
-    put_lines(panel, (shorten(fact, size[0] - 12, _TEXT) for fact in facts), (6, LINE - 3), LINE, _TEXT, PAPER)
+    drawing.put_lines(panel, (drawing.shorten(fact, size[0] - 12, _TEXT) for fact in facts), (6, LINE - 3), LINE, _TEXT, PAPER)
     texts = label_texts(truth)
     order = sorted(range(len(truth)), key=lambda index: (-np.nan_to_num(truth[index][1]["visib_fract"]), index))
     top, rows, columns = LINE * len(facts) + _SPACE, _rows(size[1], len(facts)), size[0] // COLUMN
@@ -440,15 +425,17 @@ def draw_legend(
     for place, index in enumerate(shown):
         record, info = truth[index]
         x, y = 6 + COLUMN * (place // rows), top + LINE * (place % rows)
-        color = instance_color(record.get("instance_id", index))
-        _put_label(panel, texts[index], Box(x, y, max(_SWATCH, text_size(texts[index], LABEL)[0] + 2 * _PAD), LINE - 3), color)
+        color = drawing.instance_color(record.get("instance_id", index))
+        _put_label(panel, texts[index], Box(x, y, max(_SWATCH, drawing.text_size(texts[index], LABEL)[0] + 2 * _PAD), LINE - 3), color)
         name = names.get(record["obj_id"], "") or f"object {record['obj_id']}"
         hidden = info["px_count_visib"] == 0
         unknown = math.isnan(info["visib_fract"])
         seen = "" if unknown else "hidden" if hidden else f"{info['visib_fract']:.2f}"
-        put_text(panel, seen, (x + _SWATCH + 8, y + LINE - 6), _TEXT, SOFT)
-        put_text(panel, shorten(name, COLUMN - _SWATCH - 58, _TEXT), (x + _SWATCH + 48, y + LINE - 6), _TEXT, SOFT if hidden else PAPER)
+        drawing.put_text(panel, seen, (x + _SWATCH + 8, y + LINE - 6), _TEXT, SOFT)
+        drawing.put_text(
+            panel, drawing.shorten(name, COLUMN - _SWATCH - 58, _TEXT), (x + _SWATCH + 48, y + LINE - 6), _TEXT, SOFT if hidden else PAPER
+        )
     if len(shown) < len(order):
         place = (6 + COLUMN * (columns - 1), top + LINE * rows - 6)
-        put_text(panel, f"and {len(order) - len(shown)} more", place, _TEXT, SOFT)
+        drawing.put_text(panel, f"and {len(order) - len(shown)} more", place, _TEXT, SOFT)
     return panel

@@ -118,7 +118,6 @@ def _splat(bodies: list[_Drawn], center: np.ndarray, scale: float, lift: float =
 
 
 def _draw_axis(image: Image, turn: Turn, center: np.ndarray, scale: float, diameter: float) -> None:
-    """Draw an axis as a line with its fold at one end."""
     middle = turn.point + turn.axis * (turn.axis @ (center - turn.point))
     ends, _ = _project(middle + 0.58 * diameter * np.array([[-1.0], [1.0]]) * turn.axis, center, scale)
     color = _AXIS if turn.fold else _ROUND

@@ -18,13 +18,11 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.forecast import GB, check_disk, forecast_settings
-from synpick_warp.factory.memory_plan import check_memory, plan_memory, split_memories
-from synpick_warp.factory.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.factory.memory_plan import check_memory, count_writers, fit_to_device, plan_memory, split_memories, without_pictures
 from synpick_warp.scenes.collision.shapes import default_cache_dir
-from synpick_warp.system.hardware.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.hardware.green_contexts import SmPartition, count_reserved
+from synpick_warp.system.hardware.device import SmPartition, count_reserved, pick_device
+from synpick_warp.system.hardware.kernels import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.system.inputs.urls import store_url
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
@@ -114,7 +112,6 @@ def _caches() -> list[tuple[str, str, str | None]]:
 
 
 def _describe_folder(folder: Path, noun: str) -> str:
-    """Number of entries and size of a cache."""
     size, entries = 0, 0
     for parent, folders, names in os.walk(folder):  # Unlike rglob, it passes over folders that another process renames meanwhile.
         entries += (len(folders) + len(names)) if parent == str(folder) else 0

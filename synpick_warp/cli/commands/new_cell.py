@@ -17,12 +17,10 @@ import numpy as np
 from cyclopts import Parameter
 
 from synpick_warp.cli.commands.pictures import draw_cell
-from synpick_warp.cli.folders import check_output_file
-from synpick_warp.cli.options import parse_resolution
+from synpick_warp.cli.options import check_output_file, parse_resolution
 from synpick_warp.configs.calibration.files import MAX_SIDE, MODELS, read_calibration
 from synpick_warp.configs.cell.bins import AXES, BOX, COLLISIONS, BinRow, BinSizes
-from synpick_warp.configs.cell.cameras import CameraRow
-from synpick_warp.configs.cell.rig import lens_map
+from synpick_warp.configs.cell.cameras import CameraRow, lens_map
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT, MASS_RANGE, MATERIALS, UNITS
 from synpick_warp.configs.files.cell_file import NewCell, bin_of_size, cell_toml
 from synpick_warp.configs.rules.camera_rules import NAME, RESERVED

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.folders import beside, check_output_file, find_data_set
-from synpick_warp.cli.options import DataSetArgument, WholeNumber
+from synpick_warp.cli.options import DataSetArgument, WholeNumber, beside, check_output_file, find_data_set
 from synpick_warp.configs.episodes.objects import AUTO_UNIT, DECLARED, DETECT
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.errors import ConfigError, escape

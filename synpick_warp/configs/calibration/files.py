@@ -189,7 +189,6 @@ def _bop(tree: Tree, model: str) -> Calibration:
 
 
 def _open3d(tree: Tree, model: str) -> Calibration:
-    """Open3D's PinholeCameraIntrinsic."""
     columns = _exactly(_numbers(tree["intrinsic_matrix"], "intrinsic_matrix"), 9, "intrinsic_matrix")
     return Calibration(*_size(tree), *_matrix([columns[3 * (index % 3) + index // 3] for index in range(9)]))
 
@@ -315,7 +314,6 @@ def _first(tree: Tree, names: Sequence[str], default: Any) -> Any:
 
 
 def _mapping(tree: Any, key: str) -> Tree:
-    """Mapping under a name."""
     value = tree.get(key) if isinstance(tree, dict) else None
     if not isinstance(value, dict):
         raise _FaultError(f"it has no {key}")

@@ -70,7 +70,6 @@ def fill_tables(tables: object, source: str) -> object:
 
 
 def _fill(key: str, table: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """One table with numbers."""
     rest = {name: value for name, value in table.items() if name not in ("file", "sensor", "pixel_center")}
     center = table.get("pixel_center")
     if center not in (None, INTEGERS, HALVES) or isinstance(center, bool):
@@ -107,7 +106,6 @@ def _fill(key: str, table: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _sensor(key: str, name: str, source: str) -> Calibration:
-    """Intrinsics of a sensor."""
     if found := sensor_camera(name):
         return found
     known = [each for each in SENSORS if sensor_camera(each)]

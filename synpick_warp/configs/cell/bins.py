@@ -217,7 +217,6 @@ class BinSizes:
 
     @property
     def _centers(self) -> list[Sides]:
-        """Centre of each compartment of a box, column by column."""
         columns, rows = (
             [-side / 2 + cell / 2 + index * (cell + DIVIDER) for index in range(count)] if count > 1 else [0.0]
             for side, cell, count in zip(self.floor, self.cell, self.compartments, strict=True)

@@ -13,9 +13,8 @@ from synpick_warp.configs.check import is_table
 from synpick_warp.configs.episodes.objects import MESH
 from synpick_warp.configs.episodes.randomize import ColorDistribution, Distribution
 from synpick_warp.configs.fields import settings_of
-from synpick_warp.configs.files.load import sections, table_lists
+from synpick_warp.configs.files.load import describe_setting, format_toml, sections, table_lists
 from synpick_warp.configs.files.table_lists import given_values
-from synpick_warp.configs.files.write import describe_setting, format_toml
 
 WIDTH = 120
 """Longest comment line [characters]."""
@@ -152,12 +151,10 @@ _DRAFT = 0.035
 
 
 def _title(text: str) -> list[str]:
-    """Heading of a part of the file."""
     return [f"# ---- {text} ----", ""]
 
 
 def _comment(text: str) -> list[str]:
-    """Text as comment lines."""
     return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False, break_on_hyphens=False)
 
 

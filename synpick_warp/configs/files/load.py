@@ -1,8 +1,10 @@
-"""Configuration loading: presets and TOML files, overridden by single settings, checked and resolved to a `Config`."""
+"""Configuration loading: presets and TOML files, overridden by single settings, checked and resolved to a `Config`; and its TOML."""
 
 import dataclasses
 import functools
+import json
 import os
+import re
 import typing
 from collections.abc import Callable, Mapping
 from itertools import takewhile
@@ -13,8 +15,9 @@ from synpick_warp.configs.calibration.tables import fill_tables, sensor_settings
 from synpick_warp.configs.cell.bins import BinRow, check_meshes
 from synpick_warp.configs.cell.cameras import Cameras
 from synpick_warp.configs.cell.gripper import Gripper, follow_vacuum
-from synpick_warp.configs.check import check_value
+from synpick_warp.configs.check import check_value, describe_allowed
 from synpick_warp.configs.episodes.objects import MESH
+from synpick_warp.configs.episodes.randomize import Distribution
 from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.table_lists import SPLITS, change_rows, given_values, override_table, read_rows, read_tables, resolve_splits
 from synpick_warp.configs.rules.consistency import find_conflicts
@@ -44,32 +47,19 @@ def load_config(
     splits: bool = False,
     measure: Callable[[tuple[BinRow, ...], Gripper], Mapping[str, Any]] | None = None,
 ) -> Config:
-    """Load a preset or a TOML file, override single settings, and validate the result.
+    """Load a preset or a TOML file, override single settings, and validate the result; see `synpick_warp.load_config`.
 
-    Settings override the file, the file its preset, the preset the defaults of the schema:
-
-        config = load_config()                                            # the paper's values: preset "synpick"
-        config = load_config("smoke", {"bake.worlds": 8, "cameras.resolution": [640, 360]})
-        config = load_config("my.toml")                                   # may begin with: preset = "smoke"
-        config.physics.step                                               # 0.002
+    Settings override the file, the file its preset (or "synpick"), the preset the defaults of the schema. Values may be lists
+    for TOML's arrays, tuples or arrays. Paths are relative to the current folder; those in a file to that file.
 
     Args:
-        preset_or_file: Name of a preset (`preset_names`), or path of a file that ends in .toml; a file that names no preset builds on
-            "synpick". None: the preset "synpick".
-        settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays (or tuples, arrays). Paths are relative to the
-            current folder; those in a file to that file.
         source: Where `settings` come from, for error messages.
         splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
             the [splits] of a file always hold.
         measure: Tables and sections to replace, of bins and gripper, with what their meshes measure; None: without.
 
-    Returns:
-        The complete configuration: frozen dataclasses, see `synpick_warp.configs.schema`.
-
-    Raises:
-        ConfigError: There is no such preset or file, the file is not valid TOML, a key is unknown, a value is not allowed, or
-            values contradict each other. The message names key, value and source, and what is allowed.
-    """
+    Raises ConfigError: There is no such preset or file, the file is not valid TOML, a key is unknown, a value is not allowed, or values
+    contradict each other. The message names key, value and source, and what is allowed."""
     if not isinstance(preset_or_file, str | os.PathLike | None):
         raise ConfigError(f"the preset passed is {format_value(preset_or_file)}; allowed: a name, or the path of a .toml file")
     values = _read(os.fspath(preset_or_file or DEFAULT_PRESET))
@@ -371,3 +361,64 @@ def _value_of(config: Config, key: str) -> Any:
             given = given.get(part)
         return given
     return functools.reduce(getattr, key.split("."), config)
+
+
+CAMERAS = "cameras"
+_DELETE = "\x7f"
+"""The only control character that JSON does not escape and TOML forbids."""
+
+
+def config_to_toml(config: Config, *, comments: bool = False) -> str:
+    """All settings as TOML text, including defaults; paths are absolute, so that it holds wherever it is written to. `comments`: each
+    setting is preceded by its meaning, unit and allowed values."""
+    # Without rows those of the preset would hold; no preset has rows of another kind.
+    lines = [] if config.object_rows else ["object_rows = []", ""]
+    for section, kind in sections().items():
+        if comments and kind.__doc__:
+            lines += [f"# {' '.join(kind.__doc__.split())}"]
+        table = _table(getattr(config, section), kind, comments)
+        if section == CAMERAS and config.camera:
+            # The rest is of no effect beside [[camera]] tables, which are read only alone.
+            table = [f"resolution = {format_toml(config.cameras.resolution)}"]
+        lines += [f"[{section}]", *table, ""]
+    for name, kind in table_lists().items():
+        for index, row in enumerate(getattr(config, name)):
+            lines += [f"[[{name}]]", *_table(row, kind, comments and index == 0), ""]
+    for index, split in enumerate(config.splits):
+        lines += [f"[{SPLITS}.{split.name}]", *_table(split, Split, comments and index == 0), ""]
+    return "\n".join(lines)
+
+
+def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
+    """Lines of a TOML table; `comments`: each setting with meaning, unit and allowed values above it."""
+    lines, given = [], given_values(values)
+    for name, item in settings_of(kind).items():
+        if name not in given:
+            continue
+        if comments:
+            lines.append(f"# {describe_setting(item)}")
+        value = os.path.abspath(given[name]) if item.path and given[name] else given[name]
+        lines.append(f"{name} = {format_toml(value)}")
+    return lines
+
+
+def describe_setting(item: Setting) -> str:
+    """Meaning, unit and allowed values of a setting, in sentences."""
+    unit = f"[{item.unit}] " if item.unit else ""
+    meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", item.doc)  # Links lead from configs/REFERENCE.md.
+    return f"{meaning} {unit}Allowed: {describe_allowed(item)}."
+
+
+def format_toml(value: Any) -> str:
+    """Format a value as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
+    if isinstance(value, Distribution):
+        return format_toml(value.to_toml())
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {format_toml(one)}' for key, one in value.items())} }}"
+    if isinstance(value, tuple):
+        return f"[{', '.join(format_toml(one) for one in value)}]"
+    return repr(value)

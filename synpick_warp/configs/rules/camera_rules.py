@@ -10,8 +10,26 @@ from functools import partial
 
 from synpick_warp.codes import MAX_DISPARITIES
 from synpick_warp.configs.cell.bins import BinSizes, Sides
-from synpick_warp.configs.cell.cameras import COLOR, DEPTH, MASKS, MODALITIES, OPENCV, OPENGL, CameraRow, Cameras, Jitter, Pose
-from synpick_warp.configs.cell.rig import Rig, intrinsics, inverted, lens_map, moved, position, turned, viewing_direction
+from synpick_warp.configs.cell.cameras import (
+    COLOR,
+    DEPTH,
+    MASKS,
+    MODALITIES,
+    OPENCV,
+    OPENGL,
+    CameraRow,
+    Cameras,
+    Jitter,
+    Pose,
+    Rig,
+    intrinsics,
+    inverted,
+    lens_map,
+    moved,
+    position,
+    turned,
+    viewing_direction,
+)
 from synpick_warp.configs.dataset import may_pick
 from synpick_warp.configs.episodes.randomize import FIXED
 from synpick_warp.configs.fields import Conflict
@@ -374,5 +392,4 @@ def _in_wall(at: tuple[float, ...], sizes: BinSizes) -> bool:
 
 
 def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
-    """Cross product of two vectors."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -13,16 +13,18 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
     CONFIG_FILE,
     CONSTANTS,
     ENTRIES,
     INPUTS,
+    check_file_names,
     committed_episodes,
     describe_differences,
     describe_inputs,
+    describe_strays,
     encode_manifest,
     episode_entry,
     read_checksums,
@@ -30,12 +32,10 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.commit.plausibility import check_file_names, describe_strays
 from synpick_warp.dataset.commit.writing import finalize_data_set, lock_folder, remove_path
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.exporters.writing.checksums import open_regular
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, check_output_folder, output_error, remove_folder, write_atomically
+from synpick_warp.exporters.writing import files
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.files import make_folder
@@ -75,8 +75,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     config = _config(parts, manifest)
     layout = DataLayout.of(config)
     sources = _sources(parts, layout)
-    check_output_folder(out)
-    if (out / MANIFEST_FILE).exists():
+    files.check_output_folder(out)
+    if (out / files.MANIFEST_FILE).exists():
         raise DatasetError(f"{out} is already a data set; --out takes a new or an empty folder")
     locks = []
     try:
@@ -84,7 +84,7 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
             locks.append(lock_folder(part))  # noqa: PERF401 (those that are locked must be closed)
         _fill(out, sources, config, encode_manifest(manifest))
     except OSError as error:
-        raise output_error(out, error) from error
+        raise files.output_error(out, error) from error
     finally:
         for lock in locks:
             os.close(lock)
@@ -145,7 +145,7 @@ def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
     """Link all files, then all entries, and build the indices in a staging folder, whose content is then moved; removed on errors."""
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
-    work = out / PARTIAL
+    work = out / files.PARTIAL
     names: list[str] = []
     try:
         make_folder(work)
@@ -154,7 +154,7 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
         try:
             _stage(work, sources, config, manifest, lock)
             # The manifest marks a data set, so it comes last.
-            names = sorted(os.listdir(work), key=lambda name: name == MANIFEST_FILE)
+            names = sorted(os.listdir(work), key=lambda name: name == files.MANIFEST_FILE)
             for name in names:
                 (work / name).rename(out / name)
         finally:
@@ -163,11 +163,11 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
         with contextlib.suppress(OSError):
             for name in (name for name in names if not os.path.lexists(work / name)):
                 remove_path(out / name)
-            remove_folder(work, ignore_errors=True)
+            files.remove_folder(work, ignore_errors=True)
             for folder in created:
                 folder.rmdir()
         raise
-    remove_folder(work)
+    files.remove_folder(work)
 
 
 def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: bytes, lock: int) -> None:
@@ -175,8 +175,8 @@ def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: byte
     for entry, part in sources.items():
         for name in (*read_checksums(part, entry), f"{entry}.sha256", f"{entry}.json"):
             _link(part / name, work / name)
-    write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
-    write_atomically(work / MANIFEST_FILE, manifest)
+    files.write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
+    files.write_atomically(work / files.MANIFEST_FILE, manifest)
     needs = Needs.of(config)
     with WriterPool(config.bake.writers or count_cores(), needs.slot_bytes, lock) as pool:
         finalize_data_set(work, ExportSettings.of(config), needs.classes, pool)
@@ -188,7 +188,7 @@ def _link(source: Path, target: Path) -> None:
     exists: it may be a hard link, so that it is never written to."""
     make_folder(target.parent)
     try:
-        handle = open_regular(source)
+        handle = files.open_regular(source)
     except FileNotFoundError:
         raise DatasetError(f"{source} is missing; `synpick-warp verify` names what is damaged") from None
     except OSError as error:

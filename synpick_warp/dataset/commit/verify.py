@@ -14,6 +14,9 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import (
     CONSTANTS,
     INDICES,
+    check_file_names,
+    check_frames,
+    check_listed_frames,
     committed_episodes,
     episode_entry,
     read_checksums,
@@ -21,9 +24,8 @@ from synpick_warp.dataset.commit.manifest import (
     read_manifest,
     read_settings,
 )
-from synpick_warp.dataset.commit.plausibility import check_file_names, check_frames, check_listed_frames
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.exporters.writing.checksums import checksum
+from synpick_warp.exporters.writing.files import checksum
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.processes.pool import WorkerProgram, map_ordered
 from synpick_warp.system.progress import Report, ignore_progress

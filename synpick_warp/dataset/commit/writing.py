@@ -22,44 +22,27 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.dataset import DataLayout, ExportSettings, may_pick
-from synpick_warp.configs.files.load import load_config
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml, load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.manifest import (
-    ATTEMPTS_FILE,
-    CONFIG_FILE,
-    CONSTANTS,
-    ENTRIES,
-    EPISODES_FILE,
-    INDICES,
-    INPUTS,
-    MANIFEST_FILE,
-    OBJECT,
-    committed_episodes,
-    describe_differences,
-    describe_inputs,
-    encode_manifest,
-    episode_entry,
-    is_complete,
-    make_manifest,
-    read_entry,
-    read_manifest,
-)
+from synpick_warp.dataset.commit import manifest
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter, SharedFiles, list_folders
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes, shared_files
-from synpick_warp.exporters.writing.checksums import join_manifest_entry, name_parts, write_checksums, write_manifest_entry
 from synpick_warp.exporters.writing.files import (
     LINES,
     PARTIAL,
     check_output_folder,
     is_folder,
     is_litter,
+    join_manifest_entry,
+    name_parts,
     output_error,
     output_errors,
     remove_folder,
     sync_folder,
     write_atomically,
+    write_checksums,
+    write_manifest_entry,
 )
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
@@ -90,7 +73,7 @@ class OutputFolder:
         """Create and lock a folder that is new, empty, or of a bake with the same settings, for a bake that must deliver these episodes,
         sorted. Raises ConfigError if it was started with other settings, and OutputError if it cannot be used, or another bake uses it."""
         self.out, self.config, self.episodes = out, config, list(episodes)
-        self._manifest = make_manifest(config)
+        self._manifest = manifest.make_manifest(config)
         self._layout = DataLayout.of(config)
         self._shared = shared_files(load_exporter_classes(config.bake.formats), self._layout)
         self._exporters: Exporters | None = None
@@ -120,46 +103,46 @@ class OutputFolder:
     def _scan(self) -> None:
         """Validate an existing data set against the settings, and determine its complete and remaining episodes."""
         out = self.out
-        self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
+        self._known = manifest.read_manifest(out) if os.path.lexists(out / manifest.MANIFEST_FILE) else None
         self._is_ours = self._known is not None
         if self._known:
-            if said := describe_differences(self._manifest, self._known):
+            if said := manifest.describe_differences(self._manifest, self._known):
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
             _check_kinds(out, self._shared)
-        entries = committed_episodes(out)
+        entries = manifest.committed_episodes(out)
         foreign = next((index for index in reversed(entries) if not self._layout.is_planned(index)), None)
         if foreign is not None:
             split = self._layout.split_of(foreign)
             key, episodes = (f"splits.{split.name}.episodes", split.episodes) if split else ("bake.episodes", self.config.bake.episodes)
             raise ConfigError(f"{key} is {episodes}, but {out} has episode {foreign}; a data set can only grow")
-        self._complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
+        self._complete = {index for index in entries if manifest.is_complete(self.out, manifest.episode_entry(index))}
         self.committed = sorted(self._complete.intersection(self.episodes))
         self.remaining = sorted(set(self.episodes) - self._complete)
-        indices = read_entry(out, INDICES) or {}
-        self.is_finished = not self.remaining and indices.get("episodes") == entries and is_complete(out, INDICES)
+        indices = manifest.read_entry(out, manifest.INDICES) or {}
+        self.is_finished = not self.remaining and indices.get("episodes") == entries and manifest.is_complete(out, manifest.INDICES)
         """Whether all episodes are committed and the indices cover them."""
 
     def prepare(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
         """Prepare the folder for the remaining episodes: remove incomplete ones and all indices; write manifest, settings and constants,
         unless these are complete. `inputs` are content digests of objects, lights and textures. Raises ConfigError if the data set was
         started with other objects or lights, and OutputError if the folder cannot be written."""
-        if self._known and (said := describe_inputs(inputs, self._known.get(INPUTS, {}))):
+        if self._known and (said := manifest.describe_inputs(inputs, self._known.get(manifest.INPUTS, {}))):
             raise ConfigError(f"{self.out} was started with other {said}; {_ADVICE}")
         self._exporters = exporters
         with output_errors(self.out):
             if self._known:
                 remove_folder(self.out / PARTIAL, ignore_errors=True)
             else:
-                write_atomically(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
+                write_atomically(self.out / manifest.MANIFEST_FILE, manifest.encode_manifest({**self._manifest, manifest.INPUTS: inputs}))
             self._is_ours = True
-            (self.out / ENTRIES).mkdir(exist_ok=True)
+            (self.out / manifest.ENTRIES).mkdir(exist_ok=True)
             self._remove_indices()
             if self._known:
                 self._remove_temporary()
                 self._remove_incomplete(max(self._layout.episodes_end, _planned_end(self.out)))
-            write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
+            write_atomically(self.out / manifest.CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
-            if not is_complete(self.out, CONSTANTS):
+            if not manifest.is_complete(self.out, manifest.CONSTANTS):
                 self._remove_constants()
                 try:
                     paths = exporters.write_constants()
@@ -167,18 +150,18 @@ class OutputFolder:
                     with contextlib.suppress(OSError):
                         self._remove_constants()
                     raise
-                pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
+                pool.submit(write_manifest_entry, (), (self.out, manifest.CONSTANTS, paths, {}), path=self.out / manifest.CONSTANTS)
                 pool.wait()
 
     def _remove_indices(self) -> None:
         """Remove the files that list all episodes, and their entry in the manifest."""
-        self._remove_entry(INDICES)  # First: killed in between, no mark names files that are gone.
-        for name in (EPISODES_FILE, ATTEMPTS_FILE, *self._shared.indices):
+        self._remove_entry(manifest.INDICES)  # First: killed in between, no mark names files that are gone.
+        for name in (manifest.EPISODES_FILE, manifest.ATTEMPTS_FILE, *self._shared.indices):
             (self.out / name).unlink(missing_ok=True)
 
     def _remove_constants(self) -> None:
         """Delete the constants, and folders of formats if they are empty then."""
-        self._remove_entry(CONSTANTS)
+        self._remove_entry(manifest.CONSTANTS)
         for name in self._shared.constants:
             remove_path(self.out / name)
         for name in list_folders(self.out, self._shared.folders):
@@ -189,20 +172,20 @@ class OutputFolder:
         """Delete the manifest entries and files of incomplete episodes with indices below `end`."""
         assert self._exporters is not None
         for episode in sorted(index for index in self._named_episodes() - self._complete if index < end):
-            self._remove_entry(episode_entry(episode))
+            self._remove_entry(manifest.episode_entry(episode))
             for path in self._exporters.files(episode):
                 remove_path(self.out / path)
 
     def _remove_temporary(self) -> None:
         """Delete files of entries whose commits were killed."""
-        for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / ENTRIES)):
-            (self.out / ENTRIES / name).unlink()
+        for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / manifest.ENTRIES)):
+            (self.out / manifest.ENTRIES / name).unlink()
 
     def _named_episodes(self) -> set[int]:
         """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
         cameras = len(self.config.rig)
         found: set[int] = set()
-        for folder in (ENTRIES, *list_folders(self.out, self._shared.folders)):
+        for folder in (manifest.ENTRIES, *list_folders(self.out, self._shared.folders)):
             names = os.listdir(self.out / folder) if (self.out / folder).is_dir() else []
             for index in (int(match[1]) for match in map(_INDEXED.fullmatch, names) if match):
                 found |= {index, index // cameras}
@@ -223,7 +206,7 @@ class OutputFolder:
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:
                 remove_folder(self.out / PARTIAL, ignore_errors=True)
-                if not committed_episodes(self.out):
+                if not manifest.committed_episodes(self.out):
                     self._remove_data_set()
         with contextlib.suppress(OSError):
             for folder in self._created:
@@ -238,10 +221,10 @@ class OutputFolder:
         self._remove_constants()
         if any(os.path.lexists(self.out / folder) for folder in list_folders(self.out, self._shared.folders)):
             return
-        if (self.out / ENTRIES).is_dir():
+        if (self.out / manifest.ENTRIES).is_dir():
             self._remove_temporary()
-            (self.out / ENTRIES).rmdir()
-        for name in (CONFIG_FILE, MANIFEST_FILE):
+            (self.out / manifest.ENTRIES).rmdir()
+        for name in (manifest.CONFIG_FILE, manifest.MANIFEST_FILE):
             (self.out / name).unlink(missing_ok=True)
 
 
@@ -251,7 +234,7 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
     There is one task for each file or folder that `Exporters.files` names, and one for the entry.
     """
     content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
-    entry, paths = episode_entry(end.episode), exporters.files(end.episode)
+    entry, paths = manifest.episode_entry(end.episode), exporters.files(end.episode)
     parts = name_parts(out, entry, len(paths))
     missing = set(parts)
 
@@ -280,9 +263,9 @@ def finalize_data_set(
     try:
         remove_folder(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
-        known = committed_episodes(out) if episodes is None else list(episodes)
+        known = manifest.committed_episodes(out) if episodes is None else list(episodes)
         paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, known)
-        write_manifest_entry(out, INDICES, paths, {"episodes": known})
+        write_manifest_entry(out, manifest.INDICES, paths, {"episodes": known})
     except OSError as error:
         raise output_error(out, error) from error
     finally:
@@ -292,17 +275,19 @@ def finalize_data_set(
 def build_lists(out: Path, picks: bool) -> list[Path]:
     """Write the list of episodes, and if episodes can pick (`may_pick`) the list of attempts, from the manifest entries, sorted by episode,
     or of lines made in advance, if there are LINES. Returns paths of the lists, relative to the data set."""
-    paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if picks else ()))]
+    paths = [Path(name) for name in (manifest.EPISODES_FILE, *((manifest.ATTEMPTS_FILE,) if picks else ()))]
     for path in paths:
         known = out / LINES / path / "0"
         with (out / PARTIAL / path).open("wb") as file:
             if known.is_file():
                 with known.open("rb") as lines:
                     shutil.copyfileobj(lines, file)
-            for index in () if (out / LINES).is_dir() else committed_episodes(out):
-                entry = read_entry(out, episode_entry(index))
+            for index in () if (out / LINES).is_dir() else manifest.committed_episodes(out):
+                entry = manifest.read_entry(out, manifest.episode_entry(index))
                 if entry is None:
-                    raise OutputError(f"{out / episode_entry(index)}.json was removed while the lists were written; resume the bake")
+                    raise OutputError(
+                        f"{out / manifest.episode_entry(index)}.json was removed while the lists were written; resume the bake"
+                    )
                 file.write(list_lines(entry)[path.name])
             file.flush()
             os.fsync(file.fileno())
@@ -313,23 +298,23 @@ def build_lists(out: Path, picks: bool) -> list[Path]:
 
 def list_lines(entry: Mapping[str, Any]) -> dict[str, bytes]:
     """Lines that a manifest entry adds to the lists of episodes and attempts, by their names."""
-    rows = {EPISODES_FILE: [{**entry["row"], "checksum": entry["checksum"]}], ATTEMPTS_FILE: entry["attempts"]}
+    rows = {manifest.EPISODES_FILE: [{**entry["row"], "checksum": entry["checksum"]}], manifest.ATTEMPTS_FILE: entry["attempts"]}
     return {name: "".join(json.dumps(row, allow_nan=False) + "\n" for row in found).encode() for name, found in rows.items()}
 
 
 def _planned_end(out: Path) -> int:
     """Exclusive upper bound of the episode indices planned by the folder's own settings; 0 if they cannot be read."""
     with contextlib.suppress(ConfigError, DatasetError):
-        check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
-        return DataLayout.of(load_config(str(out / CONFIG_FILE), {})).episodes_end
+        check_regular_file(out / manifest.CONFIG_FILE, MAX_TOML, DatasetError)
+        return DataLayout.of(load_config(str(out / manifest.CONFIG_FILE), {})).episodes_end
     return 0
 
 
 def _check_kinds(out: Path, shared: SharedFiles) -> None:
     """Reject what is no file or folder of a bake at the paths that it writes or deletes: symbolic links, which may point outside of the
     data set, pipes and devices, files in place of folders, folders in place of files. Raises OutputError if a path is of another kind."""
-    folders = [out / name for name in (ENTRIES, PARTIAL, *list_folders(out, shared.folders))]
-    files = [out / name for name in (CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.indices)]
+    folders = [out / name for name in (manifest.ENTRIES, PARTIAL, *list_folders(out, shared.folders))]
+    files = [out / name for name in (manifest.CONFIG_FILE, manifest.EPISODES_FILE, manifest.ATTEMPTS_FILE, *shared.indices)]
     children = [Path(child.path) for folder in folders if is_folder(folder) for child in os.scandir(folder) if not is_litter(child.name)]
     for path in (*folders, *files, *(out / name for name in shared.constants), *children):
         if path.is_symlink():
@@ -380,7 +365,7 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: L
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
-    each = {f"{OBJECT}{body.obj_id}: {body.name}": _digest_data(body) for body in catalog.bodies}
+    each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(body) for body in catalog.bodies}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 
 

@@ -10,12 +10,11 @@ import numpy as np
 
 from synpick_warp.codes import Task
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
-from synpick_warp.exporters.base import ExportContext, SharedFiles, StoredScene
+from synpick_warp.exporters.base import EpisodeExporter, ExportContext, SharedFiles, StagedEpisode, StoredScene
 from synpick_warp.exporters.lerobot import layout as lerobot
 from synpick_warp.exporters.lerobot.episode import TICK, commit_episode, frame_path, group_path
 from synpick_warp.exporters.lerobot.index import write_indices
 from synpick_warp.exporters.lerobot.video import GROUP, write_frame, write_spooled_group, write_stored_group
-from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.notes import note_files, write_notes
 from synpick_warp.exporters.writing.pool import WriterPool, WriteTask

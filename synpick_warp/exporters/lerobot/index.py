@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from synpick_warp.codes import Outcome, names
-from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.cell.cameras import Size
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.lerobot import layout as lerobot
@@ -232,7 +232,6 @@ def _to_array(values: np.ndarray, feature: lerobot.Feature) -> pa.Array:
 
 
 def _data_schema() -> pa.Schema:
-    """Arrow schema of the table of frames."""
     fields = []
     for name, feature in lerobot.FRAME_FEATURES.items():
         kind = pa.from_numpy_dtype(np.dtype(feature.dtype))
@@ -241,7 +240,6 @@ def _data_schema() -> pa.Schema:
 
 
 def _episode_schema(cameras: Sequence[str]) -> pa.Schema:
-    """Arrow schema of the table of episodes."""
     integers = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
     fields: dict[str, pa.DataType] = dict.fromkeys(integers, pa.int64()) | {"tasks": pa.list_(pa.string())}
     fields |= dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64())

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from synpick_warp.configs.cell.rig import Rig
+from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.dataset import DataLayout, split_kind
 from synpick_warp.configs.schema import Physics
 
@@ -143,7 +143,6 @@ def make_info(rig: Rig, rate: float, splits: Sequence[str], frames: int, tasks: 
 
 
 def _video_feature(width: int, height: int, rate: float) -> dict[str, Any]:
-    """Feature of a camera's videos."""
     return {
         "dtype": "video",
         "shape": [height, width, 3],

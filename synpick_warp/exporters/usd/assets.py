@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Physics, Render
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd import parts
-from synpick_warp.exporters.usd.types import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset
+from synpick_warp.exporters.usd.episode import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset
 from synpick_warp.scenes import environment
 from synpick_warp.scenes.bins import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE, make_bins
 from synpick_warp.scenes.grippers import finger_collider, finger_fixture, make_head, rod_inertia
@@ -63,7 +63,6 @@ def write_library(library: Path, context: ExportContext) -> None:
 
 
 def _save(library: Path, name: str, stage: Usd.Stage) -> None:
-    """Save a stage as an asset of the library, NAME.usdc."""
     parts.save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
 
 

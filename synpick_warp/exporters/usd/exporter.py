@@ -5,11 +5,18 @@ from functools import cached_property
 from pathlib import Path
 
 from synpick_warp.configs.dataset import DataLayout
-from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.staging import EpisodeExporter, StagedEpisode
+from synpick_warp.exporters.base import EpisodeExporter, SharedFiles, StagedEpisode
 from synpick_warp.exporters.usd.assets import make_stage_light
-from synpick_warp.exporters.usd.episode import TickSpool, tick_rows, write_episode
-from synpick_warp.exporters.usd.types import FLOOR, AssetSurface, UsdSettings, bin_asset, object_asset
+from synpick_warp.exporters.usd.episode import (
+    FLOOR,
+    AssetSurface,
+    TickSpool,
+    UsdSettings,
+    bin_asset,
+    object_asset,
+    tick_rows,
+    write_episode,
+)
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.scenes.bins import TABLE_ROUGHNESS, make_bins

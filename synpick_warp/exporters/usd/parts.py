@@ -15,7 +15,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade, Vt
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.usd.types import texture_file
+from synpick_warp.exporters.usd.episode import texture_file
 from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
@@ -181,12 +181,10 @@ def add_body(prim: Usd.Prim, mass: float, center: np.ndarray, inertia: np.ndarra
 
 
 def _add_shader(stage: Usd.Stage, path: str, shader_id: str) -> UsdShade.Shader:
-    """Define a shader of this id in the stage."""
     shader = UsdShade.Shader.Define(stage, path)
     shader.CreateIdAttr(shader_id)
     return shader
 
 
 def _vectors(rows: np.ndarray) -> Vt.Vec3fArray:
-    """Rows (N, 3) as a USD array of float vectors."""
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(rows, np.float32))

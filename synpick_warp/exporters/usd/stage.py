@@ -15,7 +15,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
 from synpick_warp.codes import Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
-from synpick_warp.exporters.usd import types
+from synpick_warp.exporters.usd import episode
 from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
@@ -46,7 +46,7 @@ FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f
 BIN = f"{ROOT}/Bin"
 
 
-def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: types.UsdSettings) -> Sdf.Layer:
+def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: episode.UsdSettings) -> Sdf.Layer:
     """Build the layer of an episode from its ticks, a row of `episode.tick_type` per frame, and its end, the properties of the root
     prim."""
     layer = Sdf.Layer.CreateAnonymous()
@@ -71,7 +71,7 @@ def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: types.UsdSe
     pair.CreateFilteredPairsRel().SetTargets([FIXTURES["cup"]])
     for instance in np.flatnonzero((ticks["object_id"] != -1).any(axis=0)).tolist():
         path, obj_id = _add_object(stage, ticks, instance, settings)
-        assets[path] = types.object_asset(obj_id)
+        assets[path] = episode.object_asset(obj_id)
     for path, part, look in _drawn(assets, looks):
         if look:
             _add_look(stage, path, part, look, settings.surfaces[assets[path]])
@@ -87,7 +87,7 @@ def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: types.UsdSe
     return layer
 
 
-def _add_root(stage: Usd.Stage, end: EpisodeEnd, settings: types.UsdSettings) -> None:
+def _add_root(stage: Usd.Stage, end: EpisodeEnd, settings: episode.UsdSettings) -> None:
     """Define units, time codes, root prim with metadata, physics scene and groups."""
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
@@ -109,7 +109,7 @@ def _add_root(stage: Usd.Stage, end: EpisodeEnd, settings: types.UsdSettings) ->
         Usd.ModelAPI(group).SetKind(Kind.Tokens.group)
 
 
-def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: types.UsdSettings) -> tuple[str, int]:
+def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: episode.UsdSettings) -> tuple[str, int]:
     """Add an instance with its labels and ids, or a distractor, which has none; returns its path and its obj_id."""
     visible = ticks["object_id"][:, instance] != -1
     obj_id = int(ticks["object_id"][visible.argmax(), instance])
@@ -166,7 +166,6 @@ def _position(pose: np.ndarray) -> Gf.Vec3d:
 
 
 def _visibility(visible: bool) -> str:
-    """USD visibility token: inherited or invisible."""
     return UsdGeom.Tokens.inherited if visible else UsdGeom.Tokens.invisible
 
 
@@ -215,7 +214,7 @@ def _add_camera(stage: Usd.Stage, name: str, camera: Camera, shaft: np.ndarray) 
     product.CreateCameraRel().SetTargets([lens.GetPath()])
 
 
-def _add_light(stage: Usd.Stage, light: types.StageLight, yaw: float, exposure: float) -> None:
+def _add_light(stage: Usd.Stage, light: episode.StageLight, yaw: float, exposure: float) -> None:
     """Add the episode's environment map as a dome light, and its sun, if it has one, as a distant light.
 
     The map is rotated by `yaw` about +z, counter-clockwise [rad]. The exposure compensation, relative to the automatic exposure [EV], is
@@ -259,12 +258,12 @@ def _drawn(assets: Mapping[str, str], looks: Mapping[str, Any]) -> Iterator[tupl
             yield path, LookPart.OBJECT, {key: row[key] for key in names if key in row}
 
 
-def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, Any], surface: types.AssetSurface) -> None:
+def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, Any], surface: episode.AssetSurface) -> None:
     """Add the material of a prim. Shaders of USD cannot turn the hue of a texture: it is a property of the prim then."""
     given, texture = surface.material, surface.texture
     color, gain, repeats = look.get("color", given.color), look.get("brightness", 1.0), 1.0
     if "texture" in look:
-        texture, repeats = types.texture_file(types.drawn_texture(part, look["texture"])), 1.0 / look["texture_width"]
+        texture, repeats = episode.texture_file(episode.drawn_texture(part, look["texture"])), 1.0 / look["texture_width"]
         color = look.get("color", WHITE)
     if texture is None:
         color = as_color(linear_to_srgb(gain * dot(hue_rotation(look.get("hue", 0.0)), srgb_to_linear(color))))

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from synpick_warp.configs.cell.rig import lens_map
+from synpick_warp.configs.cell.cameras import lens_map
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.scenes.types import Camera
 

@@ -165,7 +165,6 @@ def _adler32(count: int, total: int, moment: int) -> bytes:
 
 
 def _assemble(width: int, height: int, bits: int, color_type: int, data: Buffer) -> bytes:
-    """PNG file of compressed image data."""
     return b"".join((_head(width, height, bits, color_type), *_chunk(b"IDAT", data), _END))
 
 

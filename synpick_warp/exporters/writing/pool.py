@@ -15,9 +15,8 @@ import numpy as np
 
 from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.system.processes.pool import DeadProcessError, TaskError, TaskFuture, WorkerPool, WorkerProgram, portable_error
+from synpick_warp.system.processes import pool
 from synpick_warp.system.processes.shared_memory import SharedArray, SharedSlots
-from synpick_warp.system.processes.worker import ProcessError
 
 NICENESS = 5
 """Niceness increment of the writer processes (nice(2)). On saturated cores the bake, which feeds them and the GPU, gets three times the CPU
@@ -85,8 +84,8 @@ class WriterPool:
         Raises OutputError if memory or processes cannot be allocated.
         """
         self._waiting: deque[_QueuedTask] = deque()
-        self._running: dict[TaskFuture, _QueuedTask] = {}
-        self._answered: deque[TaskFuture] = deque()
+        self._running: dict[pool.TaskFuture, _QueuedTask] = {}
+        self._answered: deque[pool.TaskFuture] = deque()
         self._failure: SynpickError | None = None
         self._ended = False
         self._finishing = False
@@ -98,8 +97,10 @@ class WriterPool:
         handle = self._slots.handle
         setup = partial(_open_slots, handle, NICENESS if processes else 0)
         try:
-            self._pool = WorkerPool(WorkerProgram(setup, "writer process", "bake.writers", (handle,), inherited_handles), processes)
-        except (ProcessError, OSError) as error:
+            self._pool = pool.WorkerPool(
+                pool.WorkerProgram(setup, "writer process", "bake.writers", (handle,), inherited_handles), processes
+            )
+        except (pool.ProcessError, OSError) as error:
             self._slots.close()
             raise OutputError(str(error)) from error
         finally:
@@ -207,7 +208,7 @@ class WriterPool:
             self._answered += self._pool.receive(0.0 if self._answered else timeout)
             self._finish_answered()
             self._dispatch(blocking=False)
-        except DeadProcessError as death:
+        except pool.DeadProcessError as death:
             activity = "while it had nothing to do"
             if death.task is not None:  # The task that could not be sent still waits.
                 activity = f"while it wrote {(self._running.get(death.task) or self._waiting[0]).path}"
@@ -259,14 +260,14 @@ def _open_slots(handle: int, niceness: int) -> mmap.mmap:
 
 def _to_error(error: Exception, path: Path) -> SynpickError:
     """Pool's error for that of a task; of a programming error, its traceback is kept as a note, which the command line shows."""
-    error = portable_error(error)
+    error = pool.portable_error(error)
     if isinstance(error, DatasetError):
         return error
     if isinstance(error, OSError):
         return output_error(path, error)
-    kind = "" if isinstance(error, SynpickError | TaskError) else f"{type(error).__name__}: "
+    kind = "" if isinstance(error, SynpickError | pool.TaskError) else f"{type(error).__name__}: "
     result = OutputError(f"cannot write {path}: {kind}{error}")
-    if isinstance(error, TaskError):
+    if isinstance(error, pool.TaskError):
         for note in error.__notes__:
             result.add_note(note)
     return result

@@ -12,8 +12,7 @@ from pathlib import Path
 from synpick_warp.configs.fields import PATH_RULE
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import check_file_name, list_names
-from synpick_warp.scenes.assets.cad import STEP_SUFFIXES
-from synpick_warp.scenes.assets.meshes import SUFFIXES
+from synpick_warp.scenes.assets.meshes import STEP_SUFFIXES, SUFFIXES
 from synpick_warp.scenes.assets.models_info import bop_obj_id
 
 MAX_DEPTH = 3

@@ -112,7 +112,6 @@ def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[Catalo
 
 
 def _convert(entry: Any, obj_id: int, path: Path) -> FileModelInfo:
-    """Validate an entry and convert it to metres."""
     place = f"{path}: object {obj_id}"
     if not isinstance(entry, dict):
         raise CatalogError(f"{path}: no entry for object {obj_id}; add one, {_ADVICE}")

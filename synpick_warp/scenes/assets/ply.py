@@ -15,18 +15,8 @@ import numpy as np
 from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets import asset_files
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, NO_MATERIAL, WHITE, FileMaterial, decode_texture
-from synpick_warp.scenes.assets.asset_files import (
-    MAX_MESH_FILE,
-    MAX_ROWS,
-    MAX_TEXT_MESH,
-    Notes,
-    check_decimals,
-    decode_text,
-    quiet_decoding,
-    read_referred,
-    reading_as,
-)
 from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices, clip_ears, find_concave
 from synpick_warp.system.inputs.files import read_file
 
@@ -71,10 +61,10 @@ class _Header:
 
 def read_ply_file(path: Path) -> bytes:
     """Read a PLY file, text of any encoding as UTF-8. Raises CatalogError: it cannot be read, or is too large."""
-    data = read_file(path, MAX_MESH_FILE, CatalogError)
+    data = read_file(path, asset_files.MAX_MESH_FILE, CatalogError)
     if data.startswith(b"ply\rformat ascii") and b"\n" not in data:
         return data.replace(b"\r", b"\n")
-    text = "" if data.startswith(b"ply") else decode_text(data)
+    text = "" if data.startswith(b"ply") else asset_files.decode_text(data)
     return text.encode() if text.startswith("ply") else data
 
 
@@ -85,14 +75,14 @@ def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
     names = _read_header(data, path).textures
     if len(set(names)) > 1:
         raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; keep one")
-    return (names[0], read_referred(path.parent, names[0], path, MAX_TEXTURE_FILE)[1]) if names else None
+    return (names[0], asset_files.read_referred(path.parent, names[0], path, MAX_TEXTURE_FILE)[1]) if names else None
 
 
-def read_ply(path: Path, notes: Notes) -> list[MeshPart]:
+def read_ply(path: Path, notes: asset_files.Notes) -> list[MeshPart]:
     """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it. Raises CatalogError: the file
     cannot be read or has no triangles, or its texture is missing."""
     data = read_ply_file(path)
-    with reading_as("PLY", path):
+    with asset_files.reading_as("PLY", path):
         part = _ply_part(_read_elements(data, path), path, notes)
     found = notes.image(lambda: read_ply_texture(data, path))
     if found is None:
@@ -109,7 +99,7 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     """Read the vertices of a PLY file as they are stored (V, 3) float64, in the file's unit; faces and texture are not read. Raises
     CatalogError: the file cannot be read, has no vertices, or one that is not finite."""
     data = read_ply_file(path)
-    with reading_as("PLY", path), quiet_decoding():
+    with asset_files.reading_as("PLY", path), asset_files.quiet_decoding():
         vertices = _columns(_read_elements(data, path).get("vertex", _Element()), ("x", "y", "z"))
     if vertices is None or not len(vertices):
         raise CatalogError(f"{path}: no vertices with x, y and z")
@@ -137,8 +127,10 @@ def _read_header(data: bytes, path: Path) -> _Header:
     for number, line in enumerate(lines[2:], start=3):
         if (match := _ELEMENT.fullmatch(line)) and match[1] not in header.elements:
             element = header.elements[match[1]] = _Element(int(match[2]))
-            if element.count > MAX_ROWS:
-                raise CatalogError(f"{path}: {line[:80]!a}; allowed: at most {MAX_ROWS} vertices and as many faces; decimate the mesh")
+            if element.count > asset_files.MAX_ROWS:
+                raise CatalogError(
+                    f"{path}: {line[:80]!a}; allowed: at most {asset_files.MAX_ROWS} vertices and as many faces; decimate the mesh"
+                )
         elif header.elements and (match := _PROPERTY.fullmatch(line)) and match[3] not in element.kinds:
             element.kinds[match[3]] = tuple((order or "<") + _KINDS[kind] for kind in match.groups()[:2] if kind)
         elif re.match(r"\S*(element|property)|$", line):
@@ -162,14 +154,14 @@ def _read_elements(data: bytes, path: Path) -> dict[str, _Element]:
 
 def _read_text(header: _Header, data: bytes, path: Path) -> None:
     """Read the rows of a text file by trimesh, which does not mind rows or values that are missing."""
-    if len(data) > MAX_TEXT_MESH or data.count(b"\n") > 4 * MAX_ROWS:
+    if len(data) > asset_files.MAX_TEXT_MESH or data.count(b"\n") > 4 * asset_files.MAX_ROWS:
         raise CatalogError(f"{path}: too large for an ASCII file; save it as binary PLY")
     # trimesh builds meshes and paths of elements that it knows by name.
     renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)", rb"\1_", data[: header.start])
     try:
         read = load_ply(io.BytesIO(renamed + data[header.start :]), skip_materials=True)["metadata"]["_ply_raw"]
     except Exception:
-        check_decimals(decode_text(data[header.start :]), path)
+        asset_files.check_decimals(asset_files.decode_text(data[header.start :]), path)
         raise
     for name, element in header.elements.items():
         element.values = read[f"_{name}"]["data"] if element.count else {}
@@ -219,7 +211,7 @@ def _read_ragged(element: _Element, data: bytes, start: int) -> int:
     return start
 
 
-def _ply_part(elements: dict[str, _Element], path: Path, notes: Notes) -> MeshPart:
+def _ply_part(elements: dict[str, _Element], path: Path, notes: asset_files.Notes) -> MeshPart:
     """Mesh part of a file's elements; vertices are split where faces carry texture coordinates or colours."""
     vertex, face = elements.get("vertex", _Element()), elements.get("face", _Element())
     columns = [_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"))]
@@ -247,7 +239,7 @@ def _ply_part(elements: dict[str, _Element], path: Path, notes: Notes) -> MeshPa
 
 
 def _triangles(
-    face: _Element, strips: _Element, vertices: np.ndarray | None, path: Path, notes: Notes
+    face: _Element, strips: _Element, vertices: np.ndarray | None, path: Path, notes: asset_files.Notes
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Triangulate polygons, and strips. `vertices`: positions (V, 3); None: there are none. Returns the vertices of all corners (C,) and
     triangles of corners (F, 3); and the face of each triangle (F,), None for strips."""
@@ -275,7 +267,7 @@ def _triangles(
 
 
 def _clip_concave(
-    corners: np.ndarray, source: np.ndarray, flat: np.ndarray, lengths: np.ndarray, vertices: np.ndarray, notes: Notes
+    corners: np.ndarray, source: np.ndarray, flat: np.ndarray, lengths: np.ndarray, vertices: np.ndarray, notes: asset_files.Notes
 ) -> None:
     """Replace the fans of concave polygons among `corners` (F, 3), which are as many triangles."""
     starts, first = np.cumsum(lengths) - lengths, np.searchsorted(source, np.arange(len(lengths)))

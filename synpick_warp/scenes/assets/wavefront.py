@@ -19,19 +19,7 @@ from trimesh.exchange.obj import load_obj
 from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets import appearance
-from synpick_warp.scenes.assets.asset_files import (
-    MAX_PARTS,
-    MAX_ROWS,
-    MAX_TEXT_MESH,
-    MissingFileError,
-    Notes,
-    check_decimals,
-    decode_text,
-    is_missing,
-    read_referred,
-    reading_as,
-)
+from synpick_warp.scenes.assets import appearance, asset_files
 from synpick_warp.scenes.assets.mesh_parts import MeshPart, clip_ears, find_concave
 from synpick_warp.system.inputs.files import read_file
 
@@ -48,19 +36,19 @@ _POLYGON = re.compile(r"(?m)^f +\S+ +\S+ +\S+ +\S+.*$")
 _KINDS = ("v", "vt", "vn")
 
 
-def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
+def read_obj(path: Path, notes: asset_files.Notes) -> list[MeshPart]:
     """Read an OBJ file, its material libraries, and the images of the materials that its faces use. Returns one part per material. Raises
     CatalogError: the file or one that it refers to cannot be used."""
-    text = decode_text(read_file(path, MAX_TEXT_MESH, CatalogError))
-    if text.count("\n") > 4 * MAX_ROWS:
-        raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; decimate the mesh")
+    text = asset_files.decode_text(read_file(path, asset_files.MAX_TEXT_MESH, CatalogError))
+    if text.count("\n") > 4 * asset_files.MAX_ROWS:
+        raise CatalogError(f"{path}: more than {4 * asset_files.MAX_ROWS} lines; decimate the mesh")
     text = normalize_text(text, path, notes.ignored)
     lines = text.split("\n")
     # As the reader takes them: the rest of the line behind the word.
     used = dict.fromkeys(line[line.index("usemtl ") + 7 :].strip() for line in lines if "usemtl " in line)
     used.pop("", None)
-    if len(used) > MAX_PARTS or text.count("usemtl ") > MAX_ROWS:
-        raise CatalogError(f"{path}: more than {MAX_PARTS} materials; merge them")
+    if len(used) > asset_files.MAX_PARTS or text.count("usemtl ") > asset_files.MAX_ROWS:
+        raise CatalogError(f"{path}: more than {asset_files.MAX_PARTS} materials; merge them")
     known = _read_libraries(path, lines, notes)
     known |= {name: known[other] for name in used if name not in known and (other := _similar_name(name, known))}
     drawn = [known[name] for name in used if name in known]
@@ -69,10 +57,10 @@ def read_obj(path: Path, notes: Notes) -> list[MeshPart]:
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
     try:
-        with reading_as("OBJ", path):
+        with asset_files.reading_as("OBJ", path):
             parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
     except CatalogError:
-        check_decimals(text, path)
+        asset_files.check_decimals(text, path)
         raise
     if not parts:
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
@@ -93,9 +81,8 @@ def _part(
     known: dict[str, MtlMaterial],
     materials: dict[str, appearance.FileMaterial],
     path: Path,
-    notes: Notes,
+    notes: asset_files.Notes,
 ) -> MeshPart:
-    """Convert one of trimesh's meshes to a part, with its material."""
     vertices, faces = np.asarray(mesh["vertices"], np.float64), triangulate_quads(mesh["faces"])
     normals, visual, colors = mesh.get("vertex_normals"), mesh.get("visual"), mesh.get("vertex_colors")
     if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,) or (normals is not None and np.shape(normals) != vertices.shape):
@@ -143,25 +130,25 @@ def _library_names(line: str, folder: Path, owner: Path) -> list[str]:
     """Libraries of an `mtllib` line: the rest of the line if a file of this name exists, else one per word if all end in .mtl."""
     name = line.partition(" ")[2].strip()
     choices = (name, name.strip('"'), name.partition(" #")[0].strip())
-    whole = next((each for each in choices if each and not is_missing(folder, each, owner)), None)
+    whole = next((each for each in choices if each and not asset_files.is_missing(folder, each, owner)), None)
     words = name.partition(" #")[0].split()
     several = len(words) > 1 and all(word.lower().endswith(".mtl") for word in words)
     return [whole] if whole else words if several else [name]
 
 
-def _read_libraries(path: Path, lines: list[str], notes: Notes) -> dict[str, MtlMaterial]:
+def _read_libraries(path: Path, lines: list[str], notes: asset_files.Notes) -> dict[str, MtlMaterial]:
     """Read all libraries that an OBJ file refers to. Returns materials by name; a missing library is a warning, not an error."""
     known: dict[str, MtlMaterial] = {}
     named = dict.fromkeys(line for line in lines if line.startswith("mtllib ") and line[7:].strip())
     for name in dict.fromkeys(name for line in named for name in _library_names(line, path.parent, path)):
         try:
-            library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
-        except MissingFileError:
+            library, data = asset_files.read_referred(path.parent, name, path, MAX_LIBRARY)
+        except asset_files.MissingFileError:
             notes.said.append(f"there is no material library {ascii(name)[:80]}, the default material is used")
             continue
-        known |= parse_library(decode_text(data), library)
-        if len(known) > MAX_PARTS:
-            raise CatalogError(f"{path}: its material libraries have more than {MAX_PARTS} materials; merge them")
+        known |= parse_library(asset_files.decode_text(data), library)
+        if len(known) > asset_files.MAX_PARTS:
+            raise CatalogError(f"{path}: its material libraries have more than {asset_files.MAX_PARTS} materials; merge them")
     return known
 
 
@@ -251,7 +238,7 @@ class MtlMaterial:
 
     def missing_images(self) -> list[str]:
         """Names of images that the material refers to and that are missing."""
-        return [name for name in self.maps.values() if is_missing(self.library.parent, name.partition(" #")[0], self.library)]
+        return [name for name in self.maps.values() if asset_files.is_missing(self.library.parent, name.partition(" #")[0], self.library)]
 
 
 class TexturePixels(appearance.ImageCache):
@@ -261,8 +248,8 @@ class TexturePixels(appearance.ImageCache):
         """Decode an image that a material library names; `linear`: one of numbers, as roughness is. Returns the image (H, W, 3) uint8.
         Raises CatalogError: it is missing or damaged, or all images together have too many pixels."""
         plain = name.partition(" #")[0].strip()
-        name = plain if plain and is_missing(library.parent, name, library) else name
-        path, data = read_referred(library.parent, name, library, appearance.MAX_TEXTURE_FILE)
+        name = plain if plain and asset_files.is_missing(library.parent, name, library) else name
+        path, data = asset_files.read_referred(library.parent, name, library, appearance.MAX_TEXTURE_FILE)
         return self.decode((path, linear and path.suffix.lower() == ".exr"), data, str(path), linear)
 
 
@@ -370,7 +357,7 @@ def _color(words: list[str], material: MtlMaterial) -> tuple[float, float, float
     return appearance.as_color(np.clip(color, 0.0, 1.0))
 
 
-def read_material(material: MtlMaterial, pixels: TexturePixels, notes: Notes) -> appearance.FileMaterial:
+def read_material(material: MtlMaterial, pixels: TexturePixels, notes: asset_files.Notes) -> appearance.FileMaterial:
     """Read a material's images and convert it. The renderer takes one metallic and one roughness value: the means of their maps. Raises
     CatalogError: an image is damaged, or missing and not replaced."""
     notes.ignored += material.ignored

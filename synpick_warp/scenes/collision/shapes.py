@@ -25,7 +25,7 @@ from synpick_warp.scenes.assets.meshes import connected_parts, is_watertight, me
 from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, Shape, TriangleMesh
-from synpick_warp.system.hardware.caches import USER_VARIABLE, user_cache
+from synpick_warp.system.hardware.kernels import USER_VARIABLE, user_cache
 from synpick_warp.system.inputs.files import check_regular_file, make_folder
 from synpick_warp.system.linear_algebra import DECIMALS
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated

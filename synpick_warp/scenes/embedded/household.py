@@ -101,7 +101,6 @@ def _add_spout(rings: np.ndarray) -> np.ndarray:
 
 
 def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
-    """Texture of a mug's outside, with its print."""
     image = paint.blank(width, height, color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.08), (240, 236, 224))
     paint.fill(image, (0.0, 0.92, 1.0, 1.0), (240, 236, 224))
@@ -114,7 +113,6 @@ def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
 
 
 def _pitcher_scale(width: int, height: int, color: paint.Color) -> np.ndarray:
-    """Texture of a pitcher's outside, with the measuring scale."""
     image = paint.plain(color, 1102)[:64, :64]
     image = np.tile(image, (height // 64 + 1, width // 64 + 1, 1))[:height, :width].copy()
     pale = (222, 232, 248)

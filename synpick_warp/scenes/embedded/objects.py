@@ -11,7 +11,7 @@ from synpick_warp.configs.episodes.objects import HOUSEHOLD, INDUSTRIAL
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded import household, parts
 from synpick_warp.scenes.embedded.packs import Shape, make_goods
-from synpick_warp.scenes.embedded.surfaces import surface_textures
+from synpick_warp.scenes.embedded.textures import surface_textures
 from synpick_warp.scenes.modelling import BOX_FACES, NO_TEXTURE, Patch, lathe, make_mesh, project_from_box, rotation, rounded_box, solid
 from synpick_warp.scenes.types import Material, RawObject, TriangleMesh
 from synpick_warp.system.linear_algebra import matmul
@@ -138,7 +138,6 @@ _EDGE = 0.003
 
 
 def _box(*size: float) -> Patch:
-    """Box with rounded edges."""
     x, y, z = size
     return rounded_box((x, y, z), _EDGE, dict.fromkeys(BOX_FACES, NO_TEXTURE))
 
@@ -149,7 +148,6 @@ def _turned(points: int, *profile: tuple[float, float]) -> Patch:
 
 
 def _ball(radius: float) -> Patch:
-    """Sphere."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, SIDES // 2)[1:-1]
     return _turned(SIDES, *((radius * float(np.cos(angle)), radius * float(np.sin(angle))) for angle in angles))
 

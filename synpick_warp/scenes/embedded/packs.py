@@ -8,20 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.scenes import modelling
 from synpick_warp.scenes.embedded import textures as paint
 from synpick_warp.scenes.embedded.textures import Color
-from synpick_warp.scenes.modelling import (
-    BOX_FACES,
-    Patch,
-    at_height,
-    ellipse,
-    join,
-    lathe,
-    rounded_box,
-    rounded_rectangle,
-    sections,
-    solid,
-)
 
 SHEET = 1024
 """Width of a texture atlas [px]: about 3 px/mm, the resolution of the cameras at 2 m and full HD."""
@@ -31,7 +20,7 @@ CARTON_EDGE = 0.0015
 """Edge radius of cartons [m]."""
 SILVER: Color = (204, 205, 208)
 
-Shape = tuple[Patch, np.ndarray]
+Shape = tuple[modelling.Patch, np.ndarray]
 """Surface of an object and its texture (H, W, 3) uint8."""
 
 
@@ -61,7 +50,6 @@ def make_goods(name: str) -> Shape:
 
 @functools.cache
 def _read_goods() -> dict[str, dict[str, Any]]:
-    """Tables of goods.toml, by the objects' names."""
     return tomllib.loads(Path(__file__).with_name("goods.toml").read_text())
 
 
@@ -146,9 +134,9 @@ def carton(size: list[float], label: Label) -> Shape:
     extent = {"+x": (y, z), "-x": (y, z), "+y": (x, z), "-y": (x, z), "+z": (x, y), "-z": (x, y)}
     thin = "xyz"[int(np.argmin(size))]
     panels = {"+x": side, "-x": other_side, "+y": side, "-y": other_side, "+z": end, "-z": end, f"+{thin}": front, f"-{thin}": back}
-    images = {name: panels[name](*extent[name], label) for name in BOX_FACES}
+    images = {name: panels[name](*extent[name], label) for name in modelling.BOX_FACES}
     texture, at = paint.pack(images, SHEET)
-    return rounded_box((size[0], size[1], size[2]), CARTON_EDGE, at), texture
+    return modelling.rounded_box((size[0], size[1], size[2]), CARTON_EDGE, at), texture
 
 
 def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np.ndarray:
@@ -181,7 +169,7 @@ def tin(
         sides: Whether the label has its sides alone; the front is printed on the lid.
     """
     across, deep, *radius = ring
-    outline = rounded_rectangle(across, deep, radius[0], 10) if radius else ellipse(across, deep, SIDES)
+    outline = modelling.rounded_rectangle(across, deep, radius[0], 10) if radius else modelling.ellipse(across, deep, SIDES)
     # As wide as the texture atlas without padding, as high as the tin between its rims.
     width = SHEET - 2 * paint.PADDING
     high = round(width * (height - 0.008) / np.linalg.norm(np.roll(outline, -1, axis=0) - outline, axis=1).sum())
@@ -198,14 +186,14 @@ def tin(
 
     def level(scale: float, z: float) -> np.ndarray:
         """The outline, scaled, at a height [m]."""
-        return at_height(outline * scale, z)
+        return modelling.at_height(outline * scale, z)
 
     lower = np.stack([level(0.93, -half + 0.002), level(0.95, -half), level(0.99, -half), level(1.0, -half + 0.001)])
     lower = np.concatenate([lower, np.stack([level(1.0, -half + 0.003), level(narrow, -half + 0.004)])])
     upper = lower[::-1] * (1, 1, -1)
     body = np.stack([lower[-1], *(level(narrow, z) for z in np.linspace(-half, half, 5)[1:-1]), upper[0]])
     parts = (lower, at["metal"]), (body, at["label"]), (upper, at["metal"])
-    return sections(*parts, ends=(at["bottom"], at["top"])), texture
+    return modelling.sections(*parts, ends=(at["bottom"], at["top"])), texture
 
 
 def _draw_end(end: dict[str, Any], label: Label) -> np.ndarray:
@@ -243,7 +231,9 @@ def bottle(
     """
     images = {"label": wrapper(SHEET - 6, label_height, label), "body": paint.plain(**body), "cap": paint.plain(**cap)}
     texture, at = paint.pack(images, SHEET)
-    rings = np.stack([at_height(ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])
+    rings = np.stack([modelling.at_height(modelling.ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])
     first, last = band
     parts = (rings[: first + 1], at["body"]), (rings[first : last + 1], at["label"]), (rings[last:], at["body"])
-    return join(sections(*parts, ends=(at["body"], at["body"])), solid(lathe(neck, SIDES), at["cap"])), texture
+    return modelling.join(
+        modelling.sections(*parts, ends=(at["body"], at["body"])), modelling.solid(modelling.lathe(neck, SIDES), at["cap"])
+    ), texture

@@ -37,7 +37,6 @@ def _hexagon(z: float, rise: float) -> np.ndarray:
 
 
 def _meters(patch: Patch) -> Patch:
-    """Convert a surface from millimetres."""
     return Patch(MILLIMETER * patch.corners, patch.uv)
 
 
@@ -130,12 +129,10 @@ def box() -> Patch:
 
 
 def _pipe(radius: float, low: float, high: float) -> np.ndarray:
-    """Points of a cylinder about z."""
     return np.concatenate([_ring(_CIRCLE, radius, z) for z in (low, high)])
 
 
 def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
-    """Corners (8, 3) of a box."""
     return np.array(list(itertools.product(*zip(low, high, strict=True))))
 
 

@@ -1,24 +1,58 @@
 """Perception images: G-buffers of one camera without the gripper, for batches of worlds, entirely on the device."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.cell.rig import Rig, resized
+from synpick_warp.configs.cell.cameras import Rig, resized
 from synpick_warp.errors import ConfigError
+from synpick_warp.kernels.perception.components import Patches
 from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
+from synpick_warp.kernels.state import Observations, Plans
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.stages.arrays import allocate, allocate_struct, dry_run
+from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, device_array, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
 from synpick_warp.stages.render.cameras import VIEW_CAMERAS
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_grid, with_cameras
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
+
+_LENGTHS = dict.fromkeys(("area", "distance", "contour"), "px")
+_LISTS = {"largest": ("view", "instance"), "contour": ("view", "instance", "point"), "contour_length": ("view", "instance")}
+
+
+class PerceptionArrays(array_group(Patches, "view", "row", "column", units=_LENGTHS, **_LISTS)):
+    """Segmentation of a batch of views, each an image of one world."""
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentationScratch:
+    """Scratch of segmentation: its other members."""
+
+    patch: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
+    gap: wp.array = device_array("view", "row", "column", dtype=wp.int32)
+    largest_key: wp.array = device_array("view", "instance", dtype=wp.int64)
+    pole_key: wp.array = device_array("view", "instance", dtype=wp.int64)
+    square: wp.array = device_array("view", "instance", dtype=wp.int64, unit="2⁻²⁴ m²")
+
+
+_PIXELS = dict.fromkeys(("visible", "pole", "centroid", "midpoint", "distances", "grasp_pixel"), "px")
+_SETS = dict.fromkeys(("above", "ancestors"), ("world", "instance", "word"))
+_SHAPES = _SETS | {"votes": ("world", "instance", "instance"), "overflow": ("world",)}
+
+
+class Observation(array_group(Observations, "world", "instance", units=_PIXELS | {"depth": "m"}, **_SHAPES)):
+    """Perception result of each instance, when its world was last observed. `factory.attempts.InstanceObservation` maps it to JSON."""
+
+
+class Plan(array_group(Plans, "world", units={"point": "m", "yaw": "rad", "tilt": "rad"})):
+    """Plan of each world, from when it was last observed."""
+
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30

@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.configs.cell.sensors import DepthSensor
+from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images import layers
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters

@@ -14,8 +14,8 @@ from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.scenes import environment
 from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.system.hardware.cores import map_in_threads
 from synpick_warp.system.linear_algebra import dot, matmul
-from synpick_warp.system.processes.threads import map_in_threads
 
 PREFILTER_ROWS = 32
 """Rows of the prefiltered specular map: its sharpest lobe is wider than a texel of 5.6°."""

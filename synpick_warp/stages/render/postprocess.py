@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Tone
-from synpick_warp.configs.cell.sensors import Effects, effect_ranges
+from synpick_warp.configs.cell.cameras import Effects, effect_ranges
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters, EffectRanges, sample_effects_kernel
 from synpick_warp.kernels.render.images.postprocess import (
     PostProcessSettings,

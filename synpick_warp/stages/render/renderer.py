@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from synpick_warp.configs import schema
-from synpick_warp.configs.cell.sensors import DepthSensor, Effects
+from synpick_warp.configs.cell.cameras import DepthSensor, Effects
 from synpick_warp.kernels.render.visibility.gbuffer import ALL_PASSES, ShadedImage
 from synpick_warp.stages.arrays import allocate_struct, struct_arrays
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers

@@ -31,8 +31,8 @@ from synpick_warp.stages.render.light_tables import (
     sh_basis,
 )
 from synpick_warp.stages.render.wide_bvh import build_wide_bvh
+from synpick_warp.system.hardware.cores import map_in_threads
 from synpick_warp.system.linear_algebra import dot, matmul
-from synpick_warp.system.processes.threads import map_in_threads
 
 
 @dataclass(frozen=True, eq=False)

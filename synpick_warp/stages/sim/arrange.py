@@ -12,7 +12,7 @@ from synpick_warp.scenes.build import without_distractors
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import SceneData, count_columns, drop_data, mode_data, mode_rows
 from synpick_warp.stages.launch import launch
-from synpick_warp.stages.perception.arrays import Observation
+from synpick_warp.stages.perception.images import Observation
 from synpick_warp.stages.sim.physics import Physics, contact_arrays
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 

@@ -8,7 +8,7 @@ import warp as wp
 from synpick_warp.kernels.sim import gripper, tasks
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 

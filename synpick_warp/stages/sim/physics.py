@@ -21,7 +21,7 @@ from synpick_warp.newton_patches.solver import choose_solver
 from synpick_warp.scenes import build
 from synpick_warp.stages.arrays import bundle
 from synpick_warp.stages.launch import launch
-from synpick_warp.system.processes.threads import is_only_launcher
+from synpick_warp.system.hardware.cores import is_only_launcher
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()

@@ -19,7 +19,7 @@ from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.launch import launch
-from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper

@@ -150,7 +150,6 @@ class StopRequest:
             os.write(STANDARD_ERROR, _STOPPING)
 
     def _restore(self) -> None:
-        """Restore the handlers from before."""
         for number, handler in self._before.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._before = {}

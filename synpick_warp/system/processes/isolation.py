@@ -29,10 +29,9 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.cores import SETUP, count_cores
 from synpick_warp.system.inputs.files import describe_bytes
-from synpick_warp.system.processes.threads import SETUP
-from synpick_warp.system.processes.worker import ProcessError, WorkerProcess, send, start_process
+from synpick_warp.system.processes.pool import ProcessError, WorkerProcess, send, start_process
 
 MODULES = ("synpick_warp.scenes.catalog", "synpick_warp.scenes.lights")
 """What the server imports before it forks; functions of other modules work too, but import theirs in each call."""

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.system.hardware.cores import COPIES
 from synpick_warp.system.interpreter import open_standard_descriptors
-from synpick_warp.system.processes.threads import COPIES
 
 _ALIGNMENT = 64
 """Arrays start at a multiple of a cache line [B]."""

@@ -28,7 +28,7 @@ from synpick_warp.dataset.stored_array import open_array
 from synpick_warp.dataset.trajectory import GroupContext
 from synpick_warp.dataset.view_files import SceneShards
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.shards.tar_files import key_lines
 from synpick_warp.exporters.trajectory.arrays import STEPS

@@ -20,16 +20,15 @@ import trimesh
 
 import synpick_warp
 from synpick_warp.apps.validation.run import Summary, ValidationOptions, validate
-from synpick_warp.configs.cell.sensors import Effects
+from synpick_warp.configs.cell.cameras import Effects
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError, OutputError
-from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import CHECKSUMS, SceneSettings, commit_scenes, create_scene_folders
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shared.models import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block
 from synpick_warp.exporters.formats import FORMAT_TABLE
-from synpick_warp.exporters.writing.checksums import spooled_checksums, write_checksums
-from synpick_warp.exporters.writing.files import PARTIAL, open_folder
+from synpick_warp.exporters.writing.files import PARTIAL, open_folder, spooled_checksums, write_checksums
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.system.codecs.jpeg import encode_jpeg

@@ -27,11 +27,10 @@ from synpick_warp.configs.schema import Arrangement, Split
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_view
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
-from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.keypoints import Keypoints, project_keypoints, sample_keypoints
 from synpick_warp.exporters.bop.outlines import Polygon, join_parts, trace_outlines
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.exporters.bop.view import ViewSettings
+from synpick_warp.exporters.bop.view import Keypoints, ViewSettings, project_keypoints, sample_keypoints
 from synpick_warp.exporters.bop.yolo import label_files
 from synpick_warp.exporters.bop.yolo.exporter import YoloExporter
 from synpick_warp.exporters.bop.yolo.label_files import CONTENTS

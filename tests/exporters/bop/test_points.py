@@ -8,7 +8,6 @@ from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.testing.box_views import SIZES, batches, config
 from synpick_warp.testing.exporters import LENSES, ExporterContract, digests, export, with_files
 
-
 PRESENT = 0, 2, 3
 """Slots with an object."""
 

@@ -19,10 +19,9 @@ from webdataset import tariterators
 
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config, Split
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards import tar_files
-from synpick_warp.exporters.bop.shards.card import CARD_FILE, SplitContent, hub_splits, make_card, size_category
-from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import CARD_FILE, ShardsExporter, SplitContent, hub_splits, make_card, size_category
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.testing.box_views import batches, cameras, config, ends

@@ -19,10 +19,7 @@ from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.formats import FORMAT_TABLE
 from synpick_warp.exporters.trajectory import arrays as tables
-from synpick_warp.exporters.trajectory.episode import make_attempt_arrays
-from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
-from synpick_warp.exporters.trajectory.spool import spool_bytes
-from synpick_warp.exporters.trajectory.store import chunk_layout
+from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter, chunk_layout, make_attempt_arrays, spool_bytes
 from synpick_warp.stages import ticks as stage_ticks
 from synpick_warp.stages.stream import FrameStream
 from synpick_warp.testing import box_views

@@ -12,9 +12,8 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
 from synpick_warp.codes import Ending
 from synpick_warp.exporters.usd.assets import make_stage_light, separate_sun, write_light_maps
-from synpick_warp.exporters.usd.episode import TickSpool, read_ticks, tick_rows
+from synpick_warp.exporters.usd.episode import TickSpool, UsdSettings, read_ticks, tick_rows
 from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
-from synpick_warp.exporters.usd.types import UsdSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import MAX_SUN_TANGENT, map_directions, resize_map

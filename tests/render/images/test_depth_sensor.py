@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.calibration.tables import SENSORS, sensor_camera, sensor_settings
-from synpick_warp.configs.cell.sensors import DepthSensor
+from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes

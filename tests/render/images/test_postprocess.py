@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Effect, Tone, names
-from synpick_warp.configs.cell.sensors import Effects, effect_ranges
+from synpick_warp.configs.cell.cameras import Effects, effect_ranges
 from synpick_warp.configs.files.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.codes import MAX_DISPARITIES
-from synpick_warp.configs.cell.sensors import DepthSensor
+from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.images.stereo_matching import sum_path_costs_kernel
 from synpick_warp.stages.render import stereo

@@ -335,7 +335,7 @@ def test_what_is_no_distribution_is_one_line(value, said):
     ],
 )
 def test_distributions_are_written_as_they_are_read(value, tmp_path):
-    from synpick_warp.configs.files.write import config_to_toml
+    from synpick_warp.configs.files.load import config_to_toml
 
     config = load_config("smoke", {"randomize.object_roughness": value, "randomize.bin_color": {"choice": [[0.1, 0.2, 0.3]]}})
     (tmp_path / "c.toml").write_text(config_to_toml(config, comments=True))

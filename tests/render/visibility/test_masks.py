@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.codes import MAX_INSTANCES, Status
 from synpick_warp.configs.schema import UNOCCLUDED
-from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.bop.view import ViewSettings, make_view_task, rotation_matrices
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries

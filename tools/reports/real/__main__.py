@@ -31,7 +31,7 @@ except ModuleNotFoundError as missing:
 from rich.console import Console
 from scipy import stats
 
-from synpick_warp.configs.cell.rig import resized
+from synpick_warp.configs.cell.cameras import resized
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import StreamDataset

@@ -199,7 +199,6 @@ class _Block(nn.Module):
 
 
 def _convolution(before: int, after: int, size: int = 3, stride: int = 1) -> nn.Sequential:
-    """Convolution with batch normalization and ReLU."""
     return nn.Sequential(nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.ReLU())
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.apps.validation.registry import Findings, rule
 from synpick_warp.codes import Ending, Outcome, Share
-from synpick_warp.dataset.bop.models import models_folder
+from synpick_warp.dataset.bop.layout import models_folder
 from synpick_warp.dataset.reading import DataSet, Episode, open_data_set
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError

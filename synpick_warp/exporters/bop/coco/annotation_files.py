@@ -14,14 +14,22 @@ from typing import Any
 
 import msgspec
 
-from synpick_warp.configs.cell.rig import Size
+from synpick_warp.configs.cell.cameras import Size
 from synpick_warp.configs.dataset import ExportSettings
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import EncodedView
-from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.outlines import trace_outlines
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
-from synpick_warp.exporters.bop.view import ANNOTATIONS, ViewSettings, annotation_block, make_keypoints, make_rle, to_json
+from synpick_warp.exporters.bop.view import (
+    ANNOTATIONS,
+    Keypoints,
+    ViewSettings,
+    annotation_block,
+    make_category_keys,
+    make_keypoints,
+    make_rle,
+    to_json,
+)
 from synpick_warp.exporters.writing.files import PARTIAL, open_folder, output_errors, sync_folder, write_synced
 from synpick_warp.system.inputs.files import MAX_JSON, decode_json, path_inside, read_file, read_json
 

@@ -38,15 +38,15 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
     """Write a view's cloud to the staging folder of its scene."""
     points = make_points(view, settings)
     properties = "".join(f"property {_TYPES[POINT[name].str]} {name}\n" for name in POINT.names or ())
-    frame = "world" if _WORLD <= view.camera.keys() else "camera"
+    frame = "world" if view.camera.keys() >= _WORLD else "camera"
     header = f"ply\nformat binary_little_endian 1.0\ncomment {frame} frame, metres\nelement vertex {len(points)}\n{properties}end_header\n"
     with open_folder(scene) as folder:
         folder.write(f"{view.frame:06d}.ply", header.encode() + points.tobytes())
 
 
 def make_points(view: EncodedView, settings: ViewSettings) -> np.ndarray:
-    """Points (N) `POINT` of the pixels with a surface, row by row; black where the view has no colour image, and in the camera's frame where
-    the camera has no pose. Raises DatasetError: it has no intrinsics or depth scale.
+    """Points (N) `POINT` of the pixels with a surface, row by row; black if the view has no colour image, and in the camera's frame if the
+    camera has no pose. Raises DatasetError: it has no intrinsics or depth scale, or the colour image cannot be decoded.
 
     Sums have a fixed order, not BLAS's, so that bytes do not depend on the kind of processor.
     """
@@ -58,12 +58,14 @@ def make_points(view: EncodedView, settings: ViewSettings) -> np.ndarray:
     points = np.zeros(np.count_nonzero(seen), POINT)
     rays = pixel_rays(tuple(map(float, camera["cam_K"])), read_lens(camera, size), size)[seen].astype(float)
     z = depth[seen] * (camera["depth_scale"] / _MILLIMETERS)
-    shift, rotation = (camera["cam_t_w2c"], camera["cam_R_w2c"]) if _WORLD <= camera.keys() else ((0.0,) * 3, np.eye(3))
+    shift, rotation = (camera["cam_t_w2c"], camera["cam_R_w2c"]) if camera.keys() >= _WORLD else ((0.0,) * 3, np.eye(3))
     x, y, z = (part - offset / _MILLIMETERS for part, offset in zip((rays[:, 0] * z, rays[:, 1] * z, z), shift, strict=True))
     for axis, (a, b, c) in zip("xyz", np.reshape(rotation, (3, 3)).T.tolist(), strict=True):
         points[axis] = a * x + b * y + c * z
     if settings.color:
         image = cv2.imdecode(np.frombuffer(view.color[1], np.uint8), cv2.IMREAD_COLOR)
+        if image is None or image.shape[:2] != depth.shape:
+            raise DatasetError(f"the colour image {view.frame} of scene {view.scene} cannot be decoded, or has not the depth image's size")
         points["blue"], points["green"], points["red"] = image[seen].T
     objects, instances = np.zeros(depth.shape, np.int32), np.full(depth.shape, -1, np.int32)
     for index, (pose, mask) in enumerate(zip(view.gt, view.masks(), strict=True)):

@@ -13,8 +13,7 @@ from synpick_warp.configs.dataset import MAX_SHARD_SCENES
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import ViewSettings, make_rle, to_json
-from synpick_warp.exporters.writing.checksums import spooled_checksums
-from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
+from synpick_warp.exporters.writing.files import Buffer, open_folder, spooled_checksums, sync_folder, write_synced
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.system.inputs.tar_files import list_members
 

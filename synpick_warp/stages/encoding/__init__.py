@@ -1,1 +1,0 @@
-"""Image encoding on the device."""
