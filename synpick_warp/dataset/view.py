@@ -289,8 +289,8 @@ class View:
         from synpick_warp.configs.calibration.lens import pixel_rays
 
         depth = self.depth if depth is None else depth
-        rays = pixel_rays(tuple(self.intrinsics.ravel().tolist()), self.lens, self.size)
-        points = np.insert(rays, 2, 1.0, axis=-1) * depth[..., None]
+        x, y = pixel_rays(self.intrinsics, self.lens, self.size)
+        points = np.stack((x * depth, y * depth, depth), axis=-1)
         if frame == "world":
             transform = np.linalg.inv(self.world_to_camera)
             points = points @ transform[:3, :3].T + transform[:3, 3]

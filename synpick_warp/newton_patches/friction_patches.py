@@ -1,4 +1,4 @@
-"""Friction patches of SolverSteel, with contacts sorted by counting within worlds instead of a radix sort of eight passes."""
+"""Friction patches of SolverSteel, with contacts sorted by ranks within worlds instead of a radix sort of eight passes."""
 
 import functools
 import threading
@@ -17,7 +17,7 @@ BLOCK = 256
 
 def sort_by_worlds(patches: Any, model: newton.Model) -> None:
     """Have the contacts of a solver's friction patches sorted by `sort_contacts_kernel`, if worlds have equally many bodies, in their
-    order, and shapes of their own: collision detection then lists contacts by worlds."""
+    order, and shapes of their own. Contacts must be sorted by shapes, as those of a pipeline with `contact_matching` are."""
     bodies, shapes, worlds = model.body_world.numpy(), model.shape_world.numpy(), model.world_count
     each = len(bodies) // max(worlds, 1)
     ordered = len(shapes) > 0 and shapes.min() >= 0 and (np.diff(shapes) >= 0).all()

@@ -69,11 +69,11 @@ def small_blocks() -> Iterator[None]:
     A launch over the bodies of 48 worlds has 1,300 threads, with 256 a block on 6 of 132 multiprocessors, where they wait for memory of
     which each thread reads its own cache lines.
     """
-    _thread.block = SMALL_BLOCK
+    before, _thread.block = getattr(_thread, "block", 0), SMALL_BLOCK
     try:
         yield
     finally:
-        _thread.block = 0
+        _thread.block = before
 
 
 def _resolve_block(device: wp.Device, block: int | None) -> int:

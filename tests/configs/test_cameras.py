@@ -183,6 +183,7 @@ NOT_FIXED = "in {path}; allowed: the name of a camera that is fixed to the world
         (LEFT + 'modalities = ["rgb"]\n', 'camera[0].modalities is ["rgb"] in {path}; allowed: any of color, depth, masks, '),
         (LEFT + 'modalities = ["flow"]\n', "allowed: names of layers that are in render.layers, as flow is not"),
         (LEFT + 'modalities = ["depth"]\n[bake]\nformats = ["bop", "coco"]\n', "allowed: color among them with the format coco"),
+        (LEFT + 'modalities = ["color"]\n[bake]\nformats = ["points"]\n', "allowed: depth among them with the format points"),
         (LEFT + "every = 0\n", "camera[0].every is 0 in {path}; allowed: at least 1, at most 1000 [frames]"),
         (LEFT + 'every = 2\n[bake]\nformats = ["lerobot"]\n', "camera[0].every is 2 in {path}; allowed: 1 with the format lerobot"),
         (LEFT + 'every = 2\n[render]\nlayers = ["flow"]\n', "allowed: 1 with the layer flow, which leads to the frame before"),

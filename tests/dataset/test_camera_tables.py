@@ -27,7 +27,7 @@ from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing.exporters import digests
-from tests.builders import boxes, failing_after, once, run
+from tests.builders import boxes, failing_after, mistake, once, run
 from tests.online.test_stream import taken
 from tests.twins import rng
 from tests.worlds.cells import CELL, SIDE, bake_cell, camera_matrix, cell_config, check_same, check_valid, make_camera
@@ -126,6 +126,15 @@ def test_a_rectified_set_is_that_of_a_pinhole_with_the_same_matrix(tmp_path, rec
 
 
 # ---- files of some images only ----
+
+
+def test_a_camera_without_masks_is_named_before_a_conversion(tmp_path):
+    cameras = make_camera("bare", modalities=["color", "depth"], fov=40.0), make_camera("whole", fov=40.0)
+    bake_cell(tmp_path / "set", cell_config(cameras, **{"bake.formats": ["bop"]}))
+    said = mistake("convert", tmp_path / "set", "--to", "points", "--out", tmp_path / "out")
+    assert "has no masks of camera bare, which a format needs; bake it with these" in said
+    assert not (tmp_path / "out").exists()
+
 
 NAMES, EVERY = ("slow", "fast"), (3, 1)
 SPARSE = make_camera("slow", **SIDE, every=3, fov=40.0), make_camera("fast", fov=40.0)

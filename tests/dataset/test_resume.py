@@ -17,7 +17,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.cli.main import EXIT_MISTAKE
-from synpick_warp.configs.files.write import config_to_toml
+from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit import writing
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.merge import merge
@@ -98,15 +98,17 @@ SPLITS = "\n[splits.train]\nepisodes = 3\n[splits.test]\nepisodes = 1\n"
 
 
 @pytest.mark.slow
-def test_splits_fill_one_folder_in_any_order(scripted, tmp_path):
-    """Split by split and shard by shard or all at once: the same files, and the episodes are those of the same indices without splits."""
-    once, parts, plain = tmp_path / "once", tmp_path / "parts", tmp_path / "plain"
-    assert (scripted(once, splits=SPLITS), scripted(plain)) == ("", "")
+def test_splits_fill_one_folder_in_any_order(server, expected, scripted, tmp_path):
+    """Split by split and shard by shard or all at once: the same files; and the episodes are those of the same indices without splits."""
+    whole, once, parts = tmp_path / "whole", tmp_path / "once", tmp_path / "parts"
+    assert scripted(whole, splits=SPLITS) == ""
     for arguments in (["--split", "test"], ["--split=train", "--shard=0/2"], ["--split", "train,test"]):
         assert scripted(parts, *arguments, splits=SPLITS) == ""
         assert verify(parts).finished
-    files, expected = digests(once), digests(plain)
-    assert digests(parts) == files
+    assert digests(parts) == digests(whole)
+    (tmp_path / "splits.toml").write_text('preset = "smoke"' + SPLITS)
+    assert server.bake(once, config=str(tmp_path / "splits.toml")) == 0
+    files = digests(once)
     moved = {name.replace("test_web/", "train_web/").replace("test/", "train/"): digest for name, digest in files.items()}
     images = [name for name in expected if name.endswith((".png", ".tar")) or name.startswith("train/")]
     assert images
@@ -152,7 +154,14 @@ def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expec
     assert digests(whole) == expected
 
 
-SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bop.coco": False, "bake.formats": ["bop"], "bake.episodes": 2}
+SENSORS = {
+    "bop.layout": "multisensor",
+    "bop.keypoints": 4,
+    "bop.masks": True,
+    "bop.coco": True,
+    "bake.formats": ["bop"],
+    "bake.episodes": 2,
+}
 
 
 @pytest.mark.slow

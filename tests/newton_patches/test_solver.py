@@ -219,7 +219,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
     """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
     limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
     if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here. Worlds of many
-    objects have impulses and patch lists in global memory, several warps, and a warm start by votes."""
+    objects have impulses and patch lists in global memory, and several warps."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(

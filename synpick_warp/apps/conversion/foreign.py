@@ -54,6 +54,8 @@ _NEEDS = {"gt": "ground truth (scene_gt.json)", "rgb": "colour images"}
 _NEEDS_OF_MASKS = {"mask_visib": "masks of visible parts (mask_visib), nor models and cameras to render them"}
 _NEEDS_OF_DEPTH = {"camera": "cameras (scene_camera.json)", "depth": "depth images"}
 """What formats need of a scene, by the names of `SceneFiles.has`."""
+_WITH_INFO = ("bop", "shards")
+"""Formats that write scene_gt_info.json."""
 _BAKED = (CAMERA_FILE, "README.md")
 """Files that exporters write about the camera and licence of a bake: removed, since they are not true of the source's images."""
 _CAMERA = re.compile(r"camera(_\w+)?\.json")
@@ -238,7 +240,7 @@ def _check_formats(data: DataSet, first: SceneFiles, formats: Sequence[str]) -> 
         for part, what in needs.items():
             if not first.has(part):
                 raise ConfigError(f"--to names {name}, but {first.place} has no {what}, which it needs")
-        if kind.writes_depth and not (first.has("gt_info") or _has_masks(first)):
+        if name in _WITH_INFO and not (first.has("gt_info") or _has_masks(first)):
             raise ConfigError(f"--to names {name}, but {first.place} has neither scene_gt_info.json nor amodal masks, of which it is made")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from synpick_warp._version import __version__
 from synpick_warp.codes import Ending
+from synpick_warp.configs.cell.cameras import MASKS
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.annotations import ADVICE, Index, check_content
@@ -164,7 +165,10 @@ class ConversionSource:
         if "views" in needed and not {"bop", "shards"} & set(self.config.bake.formats):
             raise DatasetError(f"{self.folder} has no images; bake it with --formats bop or shards")
         if "masks" in needed and not self.config.bop.masks:
-            raise DatasetError(f"{self.folder} has no masks, which COCO annotations need; bake it with bop.masks = true")
+            raise DatasetError(f"{self.folder} has no masks, which a format needs; bake it with bop.masks = true")
+        rig = self.config.rig
+        if "masks" in needed and (bare := [index for index in range(len(rig.names)) if not rig.writes(index, MASKS)]):
+            raise DatasetError(f"{self.folder} has no masks of {rig.label(bare[0])}, which a format needs; bake it with these")
 
     def check_trajectories(self, *, gripper: bool) -> None:
         """Check that the trajectories of all episodes have what a format needs; `gripper`: states and commands of the gripper, too. Raises

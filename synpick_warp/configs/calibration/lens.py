@@ -147,16 +147,23 @@ def make_lens_map(
     return LensMap(Lens(model, coefficients), intrinsics, size)
 
 
-@functools.lru_cache(maxsize=4)
-def pixel_rays(matrix: tuple[float, ...], lens: LensMap | None, size: tuple[int, int]) -> np.ndarray:
-    """Ray (x, y, 1) of each pixel's centre: (height, width, 2) float32, for a camera matrix, row by row [px], unless there is a lens, and
-    an image's width and height [px]."""
+def pixel_rays(matrix: np.ndarray, lens: LensMap | None, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Rays (x, y, 1) of pixels' centres: x and y (height, width) float32, for a camera matrix (3, 3) [px], or a lens, and width and height
+    of the image [px]. Rays of the lenses used last are kept."""
     if lens is not None:
-        return lens.rays()
-    fx, skew, cx, _, fy, cy, *_ = matrix
-    x, y = np.moveaxis(_pixel_centers(size), -1, 0)
-    y = (y - cy) / fy
-    return np.stack(((x - cx - skew * y) / fx, y), axis=-1).astype(np.float32)
+        return _rays_of(lens)
+    (fx, skew, cx), (_, fy, cy), _ = matrix.tolist()
+    y = (np.arange(size[1])[:, None] + 0.5 - cy) / fy
+    x = (np.arange(size[0]) + 0.5 - cx - skew * y) / fx
+    return x.astype(np.float32), np.broadcast_to(y, x.shape).astype(np.float32)
+
+
+@functools.lru_cache(maxsize=4)
+def _rays_of(lens: LensMap) -> tuple[np.ndarray, np.ndarray]:
+    """The two components of `LensMap.rays`, not writable."""
+    rays = lens.rays()
+    rays.flags.writeable = False
+    return rays[..., 0], rays[..., 1]
 
 
 def with_matrix(lens: LensMap | None, matrix: np.ndarray, size: tuple[int, int] | None = None) -> LensMap | None:

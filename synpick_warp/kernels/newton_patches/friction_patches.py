@@ -32,7 +32,7 @@ def sort_contacts_kernel(
     key_inout: wp.array[wp.int64],  # (2 * contact): first body << FIRST_BODY | second body or shape, then scratch
     contact_inout: wp.array[int],  # (2 * contact): index, then scratch
 ):
-    """Sort the contacts of each world by their keys, in place: a stable counting sort, by ranks of contacts among those of their world.
+    """Sort the contacts of each world by their keys, in place: a stable sort by counting, for each contact, those of its world before it.
 
     Contacts come world by world, those without a key, the highest number, last. Launched over world, thread: a block of threads per world.
     """
@@ -48,6 +48,7 @@ def sort_contacts_kernel(
             rank += wp.where(before < key or (before == key and other < contact), 1, 0)
         key_inout[capacity + rank] = key
         contact_inout[capacity + rank] = contact_inout[contact]
+    # Keys of a world keep their range, in which the searches of other blocks find its bounds at any time.
     synchronize_block()
     for place in range(first + thread, end, wp.block_dim()):
         key_inout[place] = key_inout[capacity + place]

@@ -62,7 +62,7 @@ class SampledSurface:
         self.tree, self.thin = KDTree(self.points), KDTree(self.points[:: _DENSE // _THIN])
         queries = np.concatenate([self.points[picked[0]], positions[picked[1]]])
         # In the order of the tree: neighbours are found a third faster one after another.
-        self.queries = queries[np.argsort(np.argsort(self.tree.indices)[self.tree.query(queries)[1]], kind="stable")]
+        self.queries = queries[np.argsort(np.argsort(self.tree.indices, kind="stable")[self.tree.query(queries)[1]], kind="stable")]
         self.every = np.concatenate([self.points[self.tree.indices], positions[np.sort(random.permutation(used)[:_DENSE])]])
         """The sample, and its number of vertices at most."""
         self.spread, self.nearest = KDTree(self.queries).query(self.every)

@@ -4,29 +4,33 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from synpick_warp.configs.calibration.lens import pixel_rays, read_lens
-from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.configs.calibration.lens import LensMap, pixel_rays, read_lens
+from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import ViewSettings
-from synpick_warp.exporters.writing.files import open_folder, sync_folder, write_synced
+from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
 
 FOLDER = Path("points")
 """Folder in the data set."""
 POINT = np.dtype(
     [*((name, "<f4") for name in "xyz"), *((name, "u1") for name in ("red", "green", "blue")), ("object_id", "<i4"), ("instance_id", "<i4")]
 )
-"""A point: position [m], sRGB colour, obj_id (0: no instance), and the id of the instance's track (-1: none)."""
+"""A point: position [m], sRGB colour (black without a colour image), obj_id (0: no instance), and the id of the instance's track (-1: none,
+or unknown, as in some sets of others)."""
 _TYPES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
-_WORLD = {"cam_R_w2c", "cam_t_w2c"}
-"""Keys of a camera whose pose in the world is known."""
 _MILLIMETERS = 1000.0
 """In a metre: annotations are in millimetres."""
+_ORTHOGONAL = 1e-3
+"""Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
+_BAND = 64
+"""Rows of pixels whose points are made at a time."""
 
 
 def cloud_list(scene: int) -> Path:
@@ -35,47 +39,84 @@ def cloud_list(scene: int) -> Path:
 
 
 def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
-    """Write a view's cloud to the staging folder of its scene."""
-    points = make_points(view, settings)
-    properties = "".join(f"property {_TYPES[POINT[name].str]} {name}\n" for name in POINT.names or ())
-    frame = "world" if view.camera.keys() >= _WORLD else "camera"
-    header = f"ply\nformat binary_little_endian 1.0\ncomment {frame} frame, metres\nelement vertex {len(points)}\n{properties}end_header\n"
+    """Write a view's cloud to the staging folder of its scene. Raises DatasetError: its camera has no intrinsics, depth scale or rotation,
+    or an image is not of the camera's size."""
+    name, camera = f"image {view.frame} of scene {view.scene}", view.camera
+    lens, shift, rotation = _read_camera(camera, settings.resolution, name)
+    depth = _check_size(view.depth_image(), settings.resolution, f"depth of {name}")
+    color = _check_size(_decode(view.color[1]), settings.resolution, f"colour of {name}") if settings.color else None
+    properties = "".join(f"property {_TYPES[POINT[field].str]} {field}\n" for field in POINT.names or ())
+    count, frame = np.count_nonzero(depth), "camera" if shift is None else "world"
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment {frame} frame, metres\nelement vertex {count}\n{properties}end_header\n".encode()
+    )
+    content = bytearray(len(header) + count * POINT.itemsize)
+    content[: len(header)] = header
+    points = np.frombuffer(content, POINT, offset=len(header))
+    rays = pixel_rays(np.reshape(np.array(camera["cam_K"], float), (3, 3)), lens, settings.resolution)
+    instances, rows = _label_pixels(view, depth.shape), 0
+    poses = [(0, -1), *((pose["obj_id"], pose.get("instance_id", -1)) for pose in view.gt)]
+    ids = np.array(poses, np.int32).T
+    # In bands of rows: temporary arrays are small beside the file.
+    for first in range(0, len(depth), _BAND):
+        band = slice(first, first + _BAND)
+        seen = depth[band] > 0
+        part = points[rows : rows + np.count_nonzero(seen)]
+        rows += len(part)
+        z = depth[band][seen] * (camera["depth_scale"] / _MILLIMETERS)
+        place = [rays[0][band][seen] * z, rays[1][band][seen] * z, z]
+        if shift is not None:
+            # Sums have a fixed order, not BLAS's, so that bytes do not depend on the kind of processor.
+            x, y, z = (values - offset / _MILLIMETERS for values, offset in zip(place, shift, strict=True))
+            place = [a * x + b * y + c * z for a, b, c in rotation.T.tolist()]
+        for axis, values in zip("xyz", place, strict=True):
+            part[axis] = values
+        if color is not None:
+            part["blue"], part["green"], part["red"] = color[band][seen].T
+        part["object_id"], part["instance_id"] = ids[:, instances[band][seen]]
     with open_folder(scene) as folder:
-        folder.write(f"{view.frame:06d}.ply", header.encode() + points.tobytes())
+        folder.write(f"{view.frame:06d}.ply", memoryview(content))
 
 
-def make_points(view: EncodedView, settings: ViewSettings) -> np.ndarray:
-    """Points (N) `POINT` of the pixels with a surface, row by row; black if the view has no colour image, and in the camera's frame if the
-    camera has no pose. Raises DatasetError: it has no intrinsics or depth scale, or the colour image cannot be decoded.
-
-    Sums have a fixed order, not BLAS's, so that bytes do not depend on the kind of processor.
-    """
-    camera, size = view.camera, settings.resolution
+def _read_camera(camera: Mapping[str, Any], size: tuple[int, int], name: str) -> tuple[LensMap | None, list[float] | None, np.ndarray]:
+    """Lens of a camera's entry (None: a pinhole), and translation [mm] (None: its pose is unknown) and rotation (3, 3), world to camera."""
     if missing := {"cam_K", "depth_scale"} - camera.keys():
-        raise DatasetError(f"the camera of image {view.frame} in scene {view.scene} has no {min(missing)}, of which points are made")
-    depth = view.depth_image()
-    seen = depth > 0
-    points = np.zeros(np.count_nonzero(seen), POINT)
-    rays = pixel_rays(tuple(map(float, camera["cam_K"])), read_lens(camera, size), size)[seen].astype(float)
-    z = depth[seen] * (camera["depth_scale"] / _MILLIMETERS)
-    shift, rotation = (camera["cam_t_w2c"], camera["cam_R_w2c"]) if camera.keys() >= _WORLD else ((0.0,) * 3, np.eye(3))
-    x, y, z = (part - offset / _MILLIMETERS for part, offset in zip((rays[:, 0] * z, rays[:, 1] * z, z), shift, strict=True))
-    for axis, (a, b, c) in zip("xyz", np.reshape(rotation, (3, 3)).T.tolist(), strict=True):
-        points[axis] = a * x + b * y + c * z
-    if settings.color:
-        image = cv2.imdecode(np.frombuffer(view.color[1], np.uint8), cv2.IMREAD_COLOR)
-        if image is None or image.shape[:2] != depth.shape:
-            raise DatasetError(f"the colour image {view.frame} of scene {view.scene} cannot be decoded, or has not the depth image's size")
-        points["blue"], points["green"], points["red"] = image[seen].T
-    objects, instances = np.zeros(depth.shape, np.int32), np.full(depth.shape, -1, np.int32)
-    for index, (pose, mask) in enumerate(zip(view.gt, view.masks(), strict=True)):
+        raise DatasetError(f"the camera of {name} has no {min(missing)}, of which points are made")
+    if not (camera["cam_K"][0] > 0.0 and camera["cam_K"][4] > 0.0):
+        raise DatasetError(f"the camera of {name} has a cam_K without focal lengths above 0")
+    try:
+        lens = read_lens(camera, size)
+    except ConfigError as error:
+        raise DatasetError(f"the camera of {name} has a {error}") from None
+    if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
+        return lens, None, np.eye(3)
+    rotation = np.reshape(np.array(camera["cam_R_w2c"], float), (3, 3))
+    if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
+        raise DatasetError(f"the camera of {name} has a cam_R_w2c that is no rotation")
+    return lens, camera["cam_t_w2c"], rotation
+
+
+def _decode(file: Buffer) -> np.ndarray | None:
+    """Decode a colour image, blue first (H, W, 3) uint8, as it lies in the file; None: it cannot be decoded."""
+    return cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def _check_size(image: np.ndarray | None, size: tuple[int, int], name: str) -> np.ndarray:
+    """The image, if it is one of this width and height; raises DatasetError otherwise."""
+    if image is None or image.shape[1::-1] != size:
+        raise DatasetError(f"the {name} cannot be decoded, or is not of its camera's size, {size[0]} x {size[1]}")
+    return image
+
+
+def _label_pixels(view: EncodedView, shape: tuple[int, ...]) -> np.ndarray:
+    """Label image (H, W) int16: 1 plus the index of the visible instance, 0: none."""
+    labels = np.zeros(shape, np.int16)
+    for index, mask in enumerate(view.masks(), 1):
         runs = mask.visible
         lengths = runs.past - runs.first
         rows = np.arange(lengths.sum()) + np.repeat(runs.past - np.cumsum(lengths), lengths)
-        place = rows, np.repeat(runs.column, lengths)
-        objects[place], instances[place] = pose["obj_id"], pose.get("instance_id", index)
-    points["object_id"], points["instance_id"] = objects[seen], instances[seen]
-    return points
+        labels[rows, np.repeat(runs.column, lengths)] = index
+    return labels
 
 
 def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, split: str, frames: Sequence[Sequence[int]]) -> None:
