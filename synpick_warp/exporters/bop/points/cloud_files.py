@@ -16,6 +16,7 @@ from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
 from synpick_warp.exporters.bop.view import ViewSettings
 from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
+from synpick_warp.system.linear_algebra import matmul
 
 FOLDER = Path("points")
 """Folder in the data set."""
@@ -91,7 +92,7 @@ def _read_camera(camera: Mapping[str, Any], size: tuple[int, int], name: str) ->
     if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
         return lens, None, np.eye(3)
     rotation = np.reshape(np.array(camera["cam_R_w2c"], float), (3, 3))
-    if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
+    if not np.allclose(matmul(rotation, rotation.T), np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
         raise DatasetError(f"the camera of {name} has a cam_R_w2c that is no rotation")
     return lens, camera["cam_t_w2c"], rotation
 
