@@ -17,7 +17,7 @@ BLOCK = 256
 
 def sort_by_worlds(patches: Any, model: newton.Model) -> None:
     """Have the contacts of a solver's friction patches sorted by `sort_contacts_kernel`, if worlds have equally many bodies, in their
-    order, and shapes of their own. Contacts must be sorted by shapes, as those of a pipeline with `contact_matching` are."""
+    order, and shapes of their own. Contacts that no pipeline has sorted by shapes, as `contact_matching` does, keep Newton's sort."""
     bodies, shapes, worlds = model.body_world.numpy(), model.shape_world.numpy(), model.world_count
     each = len(bodies) // max(worlds, 1)
     ordered = len(shapes) > 0 and shapes.min() >= 0 and (np.diff(shapes) >= 0).all()
@@ -25,16 +25,24 @@ def sort_by_worlds(patches: Any, model: newton.Model) -> None:
         patches.build = functools.partial(_build, patches.build, worlds, each)
 
 
-def _build(build: Callable[..., None], worlds: int, bodies: int, model: newton.Model, *arguments: Any, **options: Any) -> None:
+def _build(
+    build: Callable[..., None],
+    worlds: int,
+    bodies: int,
+    model: newton.Model,
+    state: newton.State,
+    contacts: newton.Contacts,
+    **options: Any,
+) -> None:
     """Build the patches of a substep; `model` and what follows as in Newton's `build`."""
 
-    def sort(keys: wp.array, contacts: wp.array, *_: Any) -> None:
-        inputs, device = [bodies, keys, contacts], model.device
+    def sort(keys: wp.array, order: wp.array, *_: Any) -> None:
+        inputs, device = [bodies, keys, order], model.device
         wp.launch_tiled(sort_contacts_kernel, dim=[worlds], inputs=inputs, block_dim=BLOCK if device.is_cuda else 1, device=device)
 
-    _thread.sort = sort
+    _thread.sort = sort if contacts.contact_matching else None
     try:
-        build(model, *arguments, **options)
+        build(model, state, contacts, **options)
     finally:
         _thread.sort = None
 
