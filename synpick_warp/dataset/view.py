@@ -18,6 +18,7 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
 from synpick_warp.errors import ConfigError, DatasetError, format_value, suggest
+from synpick_warp.system.linear_algebra import is_orthonormal
 from synpick_warp.views.layer_codec import decode_layer, image_format
 
 if TYPE_CHECKING:
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
-_ORTHOGONAL = 1e-3
-"""Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 PIXEL_CENTERS = {"synpick": 0.5, "opencv": 0.0, "open3d": 0.0}
 """Image coordinates of the centre of the first pixel [px], by convention."""
 
@@ -146,7 +145,7 @@ class View:
         if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
             raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
         transform = make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
-        if not np.allclose(transform[:3, :3] @ transform[:3, :3].T, np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
+        if not is_orthonormal(transform[:3, :3]):
             raise DatasetError(f"{place} has a cam_R_w2c that is no rotation; {ADVICE}")
         return transform
 

@@ -127,7 +127,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         return wp.zeros(shape, dtype=wp.float32, device=self.model.device)
 
     def _apply_propagation_warmstart_velocity(self) -> None:
-        """Turn the impulses of the warm start into velocities, by a warp a body instead of a thread for each component of a world."""
+        """Warm start: apply the impulses of the last substep to the velocities, with one warp per body instead of a thread a component."""
         if not (self._is_fusable and self._ordered_rows):
             super()._apply_propagation_warmstart_velocity()
             return

@@ -67,7 +67,7 @@ def resolve_settings(
 
 @dataclass(frozen=True)
 class Selection:
-    """Cameras and frames of each episode; what is left out is not rendered.
+    """Subset of cameras and frames of each episode to render.
 
     The other views keep their poses, depth and masks. With a stride above 1 their light is not averaged over frames (`render.history`).
     """

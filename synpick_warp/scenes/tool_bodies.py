@@ -1,4 +1,6 @@
-"""Bodies of tools from meshes, read in an isolated process, which imports this module: without Newton, as that takes seconds."""
+"""Tool meshes: import, size check and clearance above the suction cups.
+
+Meshes are read in an isolated process, which imports this module; so it does not import Newton, which would take seconds."""
 
 import hashlib
 from dataclasses import dataclass, replace
@@ -12,16 +14,16 @@ from synpick_warp.scenes.assets.meshes import read_cell_mesh, read_measured
 from synpick_warp.scenes.types import TriangleMesh
 
 BODY_SIDES, LIKELY_SIDES = (0.01, 2.0), (0.03, 1.0)
-"""Least and largest longest side of a body, and of most bodies [m]."""
+"""Allowed range of the longest side of a tool mesh, and its usual range [m]."""
 RIM = 8
-"""Points of a cup's rim at which the room is measured."""
+"""Number of sample points on a cup's rim at which the clearance is measured."""
 ROOM, ROOM_TOLERANCE = 0.44, 1e-5
-"""Height above the lips that cups need for their bellows, in cup lengths; by what a body may be lower [m], as its precision is single."""
+"""Clearance for the bellows between a cup's lip and the mesh, as a fraction of the cup length; tolerance for single precision [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ToolBody:
-    """Mesh of a tool's body in the frame of the head, height of its lower side above each cup's lip [m], SHA-256 of the mesh."""
+    """Tool mesh in the frame of the gripper head, its height above the lip of each cup [m], and its SHA-256."""
 
     mesh: TriangleMesh
     undersides: tuple[float, ...]
@@ -29,20 +31,19 @@ class ToolBody:
 
 
 def measure_tool(gripper: Gripper) -> dict[str, Gripper]:
-    """Section, for `override_config`, of a gripper with the checksum of its mesh; none if it has it. Raises ConfigError: the mesh cannot be
-    used as a tool's body."""
+    """Gripper settings with the checksum of the mesh, as a section for `override_config`; empty if the checksum is already set. Raises
+    ConfigError: the mesh cannot be used as a tool."""
     checksum = read_body(gripper).checksum if gripper.mesh else ""
     return {} if checksum == gripper.mesh_checksum else {"gripper": replace(gripper, mesh_checksum=checksum)}
 
 
 def read_body(gripper: Gripper) -> ToolBody:
-    """Read the mesh of a gripper, or return it as it was read before in this process. Raises ConfigError: it cannot be used as a tool's
-    body."""
+    """Read a gripper's tool mesh, once a process. Raises ConfigError: the mesh cannot be used as a tool."""
     return read_measured(_body, replace(gripper, mesh_checksum=""), gripper.mesh, "gripper.mesh")
 
 
 def _body(gripper: Gripper) -> ToolBody:
-    """Read and check the mesh of a gripper. Runs in an isolated process."""
+    """Read and check a tool mesh. Runs in an isolated process."""
     path = Path(gripper.mesh)
     mesh = read_cell_mesh(gripper.mesh, gripper.mesh_unit, BODY_SIDES, LIKELY_SIDES, "gripper.mesh_unit").mesh
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -58,7 +59,7 @@ def _body(gripper: Gripper) -> ToolBody:
 
 
 def _height_over_cup(corners: np.ndarray, place: tuple[float, float], gripper: Gripper, number: int) -> float:
-    """Height of a body's lower side above the lip of a cup [m], which must have room for its bellows and something to hold it."""
+    """Height of the mesh above the lip of a cup [m]. Raises CatalogError: no mesh above the cup, or no clearance for its bellows."""
     turn = 2.0 * np.pi * np.arange(RIM) / RIM
     rim = np.array(place) + gripper.cup_width / 2 * np.column_stack([np.cos(turn), np.sin(turn)])
     heights = underside(corners, np.concatenate([[place], rim])) + gripper.cup_length
@@ -76,7 +77,8 @@ def _height_over_cup(corners: np.ndarray, place: tuple[float, float], gripper: G
 
 
 def underside(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Lowest height (n) at which vertical lines through points (n, 2) meet triangles (F, 3, 3) [m]; infinity: they meet none."""
+    """Vertical ray casting: height (n) of the lowest intersection of vertical lines through points (n, 2) with triangles (F, 3, 3) [m];
+    infinity: no intersection."""
     a, b, c = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
     a, b, c, area = (array[np.abs(area) > 1e-12] for array in (a, b, c, area))

@@ -11,6 +11,8 @@ import numpy as np
 
 DECIMALS = 12
 """Decimal places of transcendental functions that decide or are written: far from both their own errors and any tolerance here."""
+ORTHONORMAL = 1e-3
+"""Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 _NEWTON = 8
 """Steps of Newton's iteration; it converges quadratically, of what is a rotation up to a tenth in four."""
 _SWEEPS = 60
@@ -40,6 +42,11 @@ def det(matrix: np.ndarray) -> Any:
 def cofactors(matrix: np.ndarray) -> np.ndarray:
     """Cofactors of 3 x 3 matrices (..., 3, 3): transposed, the inverse times the determinant."""
     return np.stack([np.cross(matrix[..., row - 2, :], matrix[..., row - 1, :]) for row in range(3)], axis=-2)
+
+
+def is_orthonormal(matrix: np.ndarray) -> bool:
+    """Whether the rows of a matrix (3, 3) are unit vectors perpendicular to each other, up to ORTHONORMAL."""
+    return np.allclose(matmul(matrix, matrix.T), np.eye(3), rtol=0.0, atol=ORTHONORMAL)
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:

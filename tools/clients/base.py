@@ -180,8 +180,8 @@ def run_module(client: str, python: str, module: str, *arguments: str) -> tuple[
 
 
 def interpreters(names: Iterable[str], every: tuple[str, ...], given: list[str]) -> Iterator[tuple[str, str]]:
-    """Name and interpreter of each row: the one of this process, or those of options NAME=PATH, where a name may be "all". Raises
-    ValueError: an option is not NAME=PATH with the name of a client."""
+    """Yield each client with its Python interpreter: the current one, or those of options NAME=PATH; NAME "all" stands for every client.
+    Raises ValueError: an option is not NAME=PATH, or names no client."""
     chosen: dict[str, list[str]] = {}
     for text in given:
         name, _, path = text.partition("=")

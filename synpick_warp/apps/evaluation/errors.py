@@ -358,7 +358,7 @@ def _motion_errors(
 
 
 def mean_seconds(estimates: PoseTable) -> float:
-    """Mean time per image [s] over the images whose time is known; NaN: none is."""
+    """Mean time per image [s], over the images with a known time; NaN if there are none."""
     known = estimates.select(estimates.seconds >= 0.0)
     if not len(known):
         return float("nan")

@@ -84,7 +84,7 @@ class ObjectRenderer:
         return DepthPatch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
 
     def has(self, obj_id: int) -> bool:
-        """Whether an object has a model that can be rendered; others are left to the rules about models."""
+        """Whether an object has a renderable model; the rules about models report those that have none."""
         if obj_id not in self._damaged:
             try:
                 self._load(obj_id)

@@ -168,8 +168,8 @@ def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """Depth camera model: structured light for the layer depth_sensor; for ir_left, ir_right and depth_stereo an active stereo camera,
-    which of the settings above projector has baseline, disparity_step, max_disparity and distances. Axial noise is sigma_z = noise +
+    """Depth camera model: structured light for the layer depth_sensor, active stereo for ir_left, ir_right and depth_stereo. Of the
+    settings up to registration, stereo uses baseline, disparity_step, max_disparity and distances. Axial noise is sigma_z = noise +
     noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))² (Nguyen, Izadi and Lovell, 3DIMPVT 2012), with z in m and θ the
     angle of incidence; noise of disparity adds z² disparity_noise / (f · baseline). Not in the paper.
     """
@@ -297,14 +297,14 @@ class Rig:
         return self.rows[index].jitter is not None or self.moves(index)
 
     def draws_lens(self, index: int) -> bool:
-        """Whether episodes draw focal length or centre behind a lens that distorts, and with these the rays of its pixels."""
+        """Whether a camera has lens distortion and intrinsics that are randomized per episode, so that the rays of its pixels change."""
         row = self.rows[index]
         if not row.distortion or row.jitter is None:
             return False
         return (row.jitter.focal_length.kind, row.jitter.center.kind) != (OFF, OFF)
 
     def bends(self, cameras: Iterable[int]) -> bool:
-        """Whether one of some cameras has a lens that distorts."""
+        """Whether any of these cameras has lens distortion."""
         return any(self.rows[index].distortion for index in cameras)
 
     def moves(self, index: int) -> bool:
@@ -313,7 +313,7 @@ class Rig:
 
     @property
     def largest(self) -> Size:
-        """Width and height of the images with most pixels [px]."""
+        """Width and height of the largest images [px]."""
         return max(self.sizes, key=math.prod)
 
     def index(self, name: str) -> int:

@@ -338,7 +338,7 @@ def _pattern(layout: DataLayout, entry: Path) -> re.Pattern[str]:
 
 
 def check_file_names(folder: Path, entry: Path, names: Iterable[str], layout: DataLayout) -> None:
-    """Raise DatasetError unless a checksum list, of the constants or an episode, names only files that the formats of a data set write."""
+    """Check that a checksum list names only files of the data set's formats. Raises DatasetError: it names another."""
     matches = _pattern(layout, entry).fullmatch
     foreign = next((name for name in names if not matches(name)), None)
     if foreign is not None:

@@ -25,11 +25,11 @@ class StageLight:
     file: str
     """EXR file, relative to the asset library."""
     intensity: float
-    """Factor from the map's radiance to display range."""
+    """Intensity of the dome light: scale of the map's radiance for display."""
     sun_azimuth: float
-    """Direction to the sun in the map's frame, counter-clockwise about +z from +x [°]."""
+    """Azimuth of the sun in the map's frame, counter-clockwise about +z from +x [°]."""
     sun_polar: float
-    """Angle between +z and the direction to the sun [°]."""
+    """Zenith angle of the sun [°]."""
     sun_irradiance: tuple[float, float, float] | None
     """Irradiance of a surface that faces the sun, linear RGB, in the map's units; None: no distant light."""
     sun_angle: float

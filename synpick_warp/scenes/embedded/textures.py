@@ -269,7 +269,7 @@ def _boards(rng: np.random.Generator, seed: int) -> np.ndarray:
 
 
 def _checks(rng: np.random.Generator, seed: int) -> np.ndarray:
-    """Squares or stripes of two colours, as tiles, table cloths and chess boards have."""
+    """Checkerboard or stripes in two colours, with grain."""
     count = int(rng.integers(2, 16))
     place = np.arange(SIDE) * count * 2 // SIDE
     along = place[:, None] if rng.random() < 0.7 else np.zeros((SIDE, 1), int)
@@ -278,7 +278,7 @@ def _checks(rng: np.random.Generator, seed: int) -> np.ndarray:
 
 
 def _stone(rng: np.random.Generator, seed: int) -> np.ndarray:
-    """Noise of several scales in two or more colours, as of stone, cloth with a pattern, or rubbish."""
+    """Multi-octave noise in two or more colours: stone or patterned cloth."""
     image = _blend(_color(rng), _color(rng), grain(SIDE, SIDE, (4, 4), seed))
     for octave in range(int(rng.integers(1, 4))):
         size = 12.0 * 3.0**octave
@@ -288,7 +288,7 @@ def _stone(rng: np.random.Generator, seed: int) -> np.ndarray:
 
 
 def _print(rng: np.random.Generator, seed: int) -> np.ndarray:
-    """Sheets with large letters, small print, bar codes and tables, as packages and papers have."""
+    """Printed labels: large letters, small print, bar codes and tables."""
     image = blank(SIDE, SIDE, _color(rng))
     for index in range(int(rng.integers(5, 12))):
         wide, high = rng.uniform(0.12, 0.5, 2)

@@ -14,9 +14,9 @@ import numpy as np
 from synpick_warp.configs.calibration.lens import LensMap, pixel_rays, read_lens
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import EncodedView
-from synpick_warp.exporters.bop.view import ViewSettings
+from synpick_warp.exporters.bop.view import MILLIMETERS, ViewSettings
 from synpick_warp.exporters.writing.files import Buffer, open_folder, sync_folder, write_synced
-from synpick_warp.system.linear_algebra import matmul
+from synpick_warp.system.linear_algebra import is_orthonormal
 
 FOLDER = Path("points")
 """Folder in the data set."""
@@ -26,10 +26,6 @@ POINT = np.dtype(
 """A point: position [m], sRGB colour (black without a colour image), obj_id (0: no instance), and the id of the instance's track (-1: none,
 or unknown, as in some sets of others)."""
 _TYPES = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
-_MILLIMETERS = 1000.0
-"""In a metre: annotations are in millimetres."""
-_ORTHOGONAL = 1e-3
-"""Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 _BAND = 64
 """Rows of pixels whose points are made at a time."""
 
@@ -64,11 +60,11 @@ def write_view(view: EncodedView, scene: Path, settings: ViewSettings) -> None:
         seen = depth[band] > 0
         part = points[rows : rows + np.count_nonzero(seen)]
         rows += len(part)
-        z = depth[band][seen] * (camera["depth_scale"] / _MILLIMETERS)
+        z = depth[band][seen] * (camera["depth_scale"] / MILLIMETERS)
         place = [rays[0][band][seen] * z, rays[1][band][seen] * z, z]
         if shift is not None:
             # Sums have a fixed order, not BLAS's, so that bytes do not depend on the kind of processor.
-            x, y, z = (values - offset / _MILLIMETERS for values, offset in zip(place, shift, strict=True))
+            x, y, z = (values - offset / MILLIMETERS for values, offset in zip(place, shift, strict=True))
             place = [a * x + b * y + c * z for a, b, c in rotation.T.tolist()]
         for axis, values in zip("xyz", place, strict=True):
             part[axis] = values
@@ -92,7 +88,7 @@ def _read_camera(camera: Mapping[str, Any], size: tuple[int, int], name: str) ->
     if "cam_R_w2c" not in camera or "cam_t_w2c" not in camera:
         return lens, None, np.eye(3)
     rotation = np.reshape(np.array(camera["cam_R_w2c"], float), (3, 3))
-    if not np.allclose(matmul(rotation, rotation.T), np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
+    if not is_orthonormal(rotation):
         raise DatasetError(f"the camera of {name} has a cam_R_w2c that is no rotation")
     return lens, camera["cam_t_w2c"], rotation
 
