@@ -226,6 +226,14 @@ class Look(enum.IntEnum):
     """Azimuth of a lamp in the map [°]."""
     EXPOSURE = 13
     """Exposure compensation [EV]."""
+    SCRATCHES = 14
+    """Amount of scratches, 0 to 1; this and the next three are the components of `kernels.render.lighting.wear`."""
+    RUST = 15
+    """Fraction of the surface that is rusty."""
+    STAINS = 16
+    """Fraction of the surface that is oily."""
+    DUST = 17
+    """Density of dust, 0 to 1."""
 
 
 class LookPart(enum.IntEnum):

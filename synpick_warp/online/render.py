@@ -16,6 +16,7 @@ from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.looks import load_looks
 from synpick_warp.scenes.modelling import Patch, make_mesh
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
@@ -45,7 +46,8 @@ def render_scene(
     meshes = {_key(mesh): mesh for mesh, _ in objects}
     catalog = Catalog(tuple(_entry(index + 1, mesh, unit) for index, mesh in enumerate(meshes.values())))
     fixtures = make_fixtures(make_bins(settings.cell.bins), settings.gripper)
-    scene = build_render_scene(settings.render, 0.0, catalog, fixtures, tuple(cameras), load_lights(settings.bake.lights)[:1], on)
+    lights, looks = load_lights(settings.bake.lights)[:1], load_looks(settings.randomize, lambda line: None, strict=True)
+    scene = build_render_scene(settings.render, 0.0, catalog, fixtures, tuple(cameras), lights, on, looks)
     sizes = view_buffer_sizes(len(cameras), *cameras[0].resolution, len(objects))
     images, extra = allocate(ViewBuffers, sizes, on), allocate(LayerBuffers, sizes, on, layers)
     world = _world([list(meshes).index(_key(mesh)) for mesh, _ in objects], [pose for _, pose in objects], on)

@@ -26,6 +26,10 @@ class TriangleMesh:
     """Texture coordinates (V, 2) float32; v points up (the image's top edge is v = 1); zeros without a texture."""
 
 
+MAP_CENTER = 128
+"""Value of a map that is 0 of a normal's x or y."""
+
+
 @dataclass(frozen=True, eq=False)
 class Material:
     """PBR material in the metallic-roughness model (glTF 2.0)."""
@@ -38,6 +42,9 @@ class Material:
     """Metallic factor, 0..1."""
     roughness: float
     """Perceptual roughness, 0..1."""
+    maps: np.ndarray | None = field(default=None, hash=False)
+    """Maps of the texture's size (H, W, 4) uint8, in place of metallic and roughness: x and y of the normal along growing u and v, where
+    MAP_CENTER is 0 and 1 and 255 are -1 and 1; roughness and metallic, 0 to 255. None: no maps."""
 
 
 class HullSize(NamedTuple):

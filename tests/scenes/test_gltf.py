@@ -15,6 +15,7 @@ from PIL import Image
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions
+from synpick_warp.scenes.types import MAP_CENTER
 from tests.worlds.model_files import pack_glb, read_told, texels
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -330,10 +331,30 @@ def test_required_extensions_that_are_not_implemented_are_named(tmp_path, extens
 
 
 def test_what_is_ignored_is_one_line(tmp_path):
-    builder = Builder(normalTexture={"index": 0}, alphaMode="BLEND", emissiveFactor=[1, 0, 0]).require("KHR_materials_clearcoat")
+    builder = Builder(occlusionTexture={"index": 0}, alphaMode="BLEND", emissiveFactor=[1, 0, 0]).require("KHR_materials_clearcoat")
     _, finish, said = builder.with_(animations=[{}]).read(tmp_path)
-    assert said == ["ignored: KHR_materials_clearcoat, animations, normalTexture, emission, transparency"]
+    assert said == ["ignored: KHR_materials_clearcoat, animations, emission, transparency"]
     assert (finish.metallic, finish.roughness) == (1.0, 1.0)
+
+
+def test_normal_and_roughness_maps_are_read_beside_the_base_colour(tmp_path):
+    """Of COLORS: red's x is 1 and its other components are not, so that it is steep; green is roughness, blue metallic."""
+    both = {"metallicRoughnessTexture": {"index": 0}, "metallicFactor": 0.5}
+    builder = Builder(**pbr(**both), normalTexture={"index": 0, "scale": 0.5}).image().attribute("TEXCOORD_0", UV)
+    _, finish, said = builder.read(tmp_path)
+    assert not said
+    assert finish.texture.shape == (4, 4, 7)
+    for row, column in ((0, 0), (1, 1)):
+        # The corners keep their colours as the image is enlarged to the least size.
+        texel, color = finish.texture[-row, -column].astype(float), COLORS[row, column].astype(float)
+        normal = (color / 127.5 - 1.0) * (0.5, 0.5, 1.0)
+        normal[2] = max(normal[2], 1e-6)
+        assert np.allclose(texel[3:5], MAP_CENTER + 127 * normal[:2] / np.linalg.norm(normal), atol=1.0)
+        assert np.allclose(texel[5:], (color[1], color[2] / 2), atol=1.0)
+    moved = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}
+    _, finish, said = Builder(**pbr(**TEXTURE), normalTexture=moved).image().attribute("TEXCOORD_0", UV).read(tmp_path)
+    assert said == ["ignored: normalTexture with other texture coordinates"]
+    assert finish.texture.shape == (2, 2, 3)
 
 
 SKINNED = {"nodes": [{"mesh": 0, "skin": 0}]}

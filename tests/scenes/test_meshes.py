@@ -21,6 +21,7 @@ from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import bake_vertex_colors, decode_texture, linear_to_srgb, rgb8, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions, merge_positions, read_mesh, signed_volume
 from synpick_warp.scenes.assets.normals import smooth_normals
+from synpick_warp.scenes.types import MAP_CENTER
 from tests.builders import refusal
 from tests.worlds import model_files
 from tests.worlds.model_files import CORNERS, FACES, OBJ, ascii_ply, binary_ply, glb, picture, put, read, read_told, texels
@@ -247,10 +248,10 @@ def test_parts_of_a_glb_are_merged_with_their_transforms_and_materials(tmp_path)
     mesh, finish = read(tmp_path / "a.glb", glb(red, plain.apply_translation((0.3, 0, 0))))
     assert len(mesh.faces) == 24
     assert np.allclose((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)), ((-0.05, -0.05, -0.05), (0.35, 0.05, 0.05)))
+    # Each part keeps its metallic and roughness, and both have flat normals.
     texel = texels(mesh, finish.texture)
-    assert np.all(texel[mesh.vertices[:, 0] < 0.1] == (200, 10, 10))
-    assert np.all(texel[mesh.vertices[:, 0] > 0.1] == (0, 255, 0))
-    assert finish.metallic == pytest.approx(0.4)
+    assert np.all(texel[mesh.vertices[:, 0] < 0.1] == (200, 10, 10, MAP_CENTER, MAP_CENTER, 51, 178))
+    assert np.all(texel[mesh.vertices[:, 0] > 0.1] == (0, 255, 0, MAP_CENTER, MAP_CENTER, 255, 26))
     # Parts with one material share its texture.
     mesh, finish = read(tmp_path / "a.glb", glb(red, red.copy().apply_translation((0.3, 0, 0))))
     assert len(mesh.faces) == 24

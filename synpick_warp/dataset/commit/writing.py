@@ -365,6 +365,8 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: L
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
+    maps = tuple((body.obj_id, body.material.maps) for body in catalog.bodies if body.material.maps is not None)
+    textures |= {"maps": _digest_data(maps)} if maps else {}
     each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(body) for body in catalog.bodies}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 

@@ -58,7 +58,7 @@ def write_library(library: Path, context: ExportContext) -> None:
         _write_floor(library, table - FLOOR_DROP)
     for part, images in textures.items():
         for index, texture in enumerate(images):
-            parts.write_texture(library, drawn_texture(part, index), texture)
+            parts.write_texture(library, drawn_texture(part, index), Material((1.0, 1.0, 1.0), texture, 0.0, 1.0))
     _write_table(library, physics, table, settings.render, bool(textures.get(LookPart.TABLE)))
 
 
@@ -74,7 +74,7 @@ def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     root.SetDisplayName(entry.name)
     if entry.obj_id >= 0:
         parts.add_property(root, "obj_id", entry.obj_id)
-    _add_shapes(stage, physics, entry.mesh, entry.material, parts.write_texture(library, name, entry.material.texture), entry.pieces)
+    _add_shapes(stage, physics, entry.mesh, entry.material, parts.write_texture(library, name, entry.material), entry.pieces)
     parts.add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
     _save(library, name, stage)
 
@@ -82,7 +82,7 @@ def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
 def _make_fixture(library: Path, physics: Physics, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
     """Stage of a fixture's asset: mesh, material and collision shapes; not saved."""
     stage = parts.new_asset(name, name)
-    _add_shapes(stage, physics, fixture.mesh, fixture.material, parts.write_texture(library, name, fixture.material.texture), pieces)
+    _add_shapes(stage, physics, fixture.mesh, fixture.material, parts.write_texture(library, name, fixture.material), pieces)
     return stage
 
 
@@ -91,7 +91,8 @@ def _add_shapes(
 ) -> None:
     """Add an asset's visible mesh with its material, and its collision shapes."""
     root, friction = _add_contact_material(stage, physics)
-    parts.add_mesh(stage, f"{root}/Visual", mesh, parts.add_surface(stage, f"{root}/Materials/Surface", material, texture))
+    surface = parts.add_surface(stage, f"{root}/Materials/Surface", material, texture, has_maps=material.maps is not None)
+    parts.add_mesh(stage, f"{root}/Visual", mesh, surface)
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     for index, piece in enumerate(pieces):
         parts.add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, physics.gap)

@@ -49,11 +49,14 @@ class AssetSurface:
     material: Material
     texture: str | None
     """File of its texture, relative to the asset library; None: it has none."""
+    has_maps: bool = False
+    """Whether the files of its maps lie beside it."""
 
     @staticmethod
     def of(name: str, material: Material) -> "AssetSurface":
         """That of the asset of this name."""
-        return AssetSurface(replace(material, texture=None), None if material.texture is None else texture_file(name))
+        texture = None if material.texture is None else texture_file(name)
+        return AssetSurface(replace(material, texture=None, maps=None), texture, material.maps is not None)
 
 
 def texture_file(name: str) -> str:

@@ -9,6 +9,7 @@ Stages are in metres, z up, as everywhere in this package. Imports pxr, so only 
 import errno
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from synpick_warp.exporters.usd.episode import texture_file
 from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
+from synpick_warp.scenes.types import MAP_CENTER, ConvexPiece, Material, TriangleMesh
 from synpick_warp.system.linear_algebra import det, eigh
 
 CLASS = "class"
@@ -98,44 +99,76 @@ def add_faces(stage: Usd.Stage, path: str, vertices: np.ndarray, faces: np.ndarr
 
 
 def add_surface(
-    stage: Usd.Stage, path: str, material: Material, texture: str | None, gain: float = 1.0, repeats: float = 1.0
+    stage: Usd.Stage, path: str, material: Material, texture: str | None, gain: float = 1.0, repeats: float = 1.0, has_maps: bool = False
 ) -> UsdShade.Material:
     """Add a metallic-roughness material (UsdPreviewSurface). The texture, a file relative to the layer or None, repeats, and is multiplied
-    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates."""
+    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates; `has_maps`: the files of `MAPS` lie
+    beside the texture."""
     surface = UsdShade.Material.Define(stage, path)
     shader = _add_shader(stage, f"{path}/Surface", "UsdPreviewSurface")
     surface.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(material.metallic)
     shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(material.roughness)
-    color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    color: UsdShade.Input = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     linear = (gain * srgb_to_linear(material.color)).tolist()
     if texture is None:
         color.Set(Gf.Vec3f(*linear))
         return surface
     reader = _add_shader(stage, f"{path}/Coordinates", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
-    image = _add_shader(stage, f"{path}/Texture", "UsdUVTexture")
-    image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{texture}"))
-    image.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
-    image.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*linear, 1.0))
-    for name in ("wrapS", "wrapT"):
-        image.CreateInput(name, Sdf.ValueTypeNames.Token).Set("repeat")
     if repeats != 1.0:
         scaled = _add_shader(stage, f"{path}/Scale", "UsdTransform2d")
         scaled.CreateInput("scale", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(repeats))
         scaled.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
         reader = scaled
-    image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+    place = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    image = _add_image(stage, f"{path}/Texture", texture, "sRGB", place, (*linear, 1.0))
     color.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+    if has_maps:
+        normal, values = (texture.replace(".png", ending) for ending in MAPS)
+        image = _add_image(stage, f"{path}/Normals", normal, "raw", place, (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0))
+        found = image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        shader.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(found)
+        image = _add_image(stage, f"{path}/Values", values, "raw", place, (1.0, 1.0, 1.0, 1.0))
+        for channel, name in (("g", "roughness"), ("b", "metallic")):
+            shader.GetInput(name).ConnectToSource(image.CreateOutput(channel, Sdf.ValueTypeNames.Float))
     return surface
 
 
-def write_texture(library: Path, name: str, texture: np.ndarray | None) -> str | None:
-    """Write a texture into the asset library; returns its path relative to the library, None without texture."""
-    if texture is None:
+def _add_image(
+    stage: Usd.Stage, path: str, file: str, space: str, place: UsdShade.Output, scale: Sequence[float], bias: Sequence[float] = ()
+) -> UsdShade.Shader:
+    """Add a texture node (UsdUVTexture) of a file relative to the layer, which repeats: its values times `scale` plus `bias`."""
+    image = _add_shader(stage, path, "UsdUVTexture")
+    image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{file}"))
+    image.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)
+    image.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*scale))
+    if bias:
+        image.CreateInput("bias", Sdf.ValueTypeNames.Float4).Set(Gf.Vec4f(*bias))
+    for name in ("wrapS", "wrapT"):
+        image.CreateInput(name, Sdf.ValueTypeNames.Token).Set("repeat")
+    image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(place)
+    return image
+
+
+MAPS = ("_normal.png", "_values.png")
+"""Endings of the files of a material's maps: normals as in glTF, and roughness (green) with metallic (blue)."""
+
+
+def write_texture(library: Path, name: str, material: Material) -> str | None:
+    """Write a material's texture, and its maps, into the asset library; returns the texture's path relative to the library, None without
+    texture."""
+    if material.texture is None:
         return None
-    write_synced(library / texture_file(name), encode_png(texture))
-    return texture_file(name)
+    file = texture_file(name)
+    write_synced(library / file, encode_png(material.texture))
+    if material.maps is not None:
+        x, y = (material.maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
+        normal = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0))], axis=-1)
+        images = np.rint(127.5 * normal + 127.5).astype(np.uint8), np.pad(material.maps[..., 2:], ((0, 0), (0, 0), (1, 0)))
+        for ending, image in zip(MAPS, images, strict=True):
+            write_synced(library / file.replace(".png", ending), encode_png(np.ascontiguousarray(image)))
+    return file
 
 
 def add_friction(stage: Usd.Stage, path: str, friction: float) -> UsdShade.Material:

@@ -271,7 +271,8 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
     elif "hue" in look:
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
     material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness))
-    add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats)
+    has_maps = surface.has_maps and not {"texture", "roughness", "metallic"} & look.keys()
+    add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, has_maps)
 
 
 def hue_rotation(degrees: float) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Colour conversion and textures: sRGB transfer function, image decoding, vertex colour baking, texture atlases."""
 
 import io
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
-from synpick_warp.scenes.types import Material
+from synpick_warp.scenes.types import MAP_CENTER, Material
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -40,14 +40,45 @@ class FileMaterial:
     color: tuple[float, float, float]
     """Base colour factor, sRGB in 0..1; multiplies the texture in linear light."""
     texture: np.ndarray | None
-    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1)."""
+    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`."""
     metallic: float | None
     roughness: float | None
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether the texture has more channels than colour."""
+        return self.texture is not None and self.texture.shape[2] > 3
 
     def complete(self, metallic: float, roughness: float) -> Material:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
-        return Material(self.color, self.texture, *given)
+        if self.texture is None or not self.has_maps:
+            return Material(self.color, self.texture, *given)
+        return Material(self.color, self.texture[..., :3].copy(), *given, self.texture[..., 3:].copy())
+
+    def add_maps(self, **maps: np.ndarray) -> "FileMaterial":
+        """Material with normal (H, W, 2), roughness and metallic (H, W, 1) maps, uint8 as of `Material.maps`, of any sizes; those that are
+        not given are flat and constant. The material must state metallic and roughness."""
+        flat = {"color": (255, 255, 255), "normal": (MAP_CENTER, MAP_CENTER)}
+        flat |= {"roughness": (round(255 * (self.roughness or 0.0)),), "metallic": (round(255 * (self.metallic or 0.0)),)}
+        planes = maps if self.texture is None else {"color": self.texture, **maps}
+        height, width = (max([4, *(image.shape[axis] for image in planes.values())]) for axis in (0, 1))
+        layers = [
+            resize(planes[name], (width, height), Image.Resampling.BILINEAR)
+            if name in planes
+            else np.broadcast_to(np.array(value, np.uint8), (height, width, len(value)))
+            for name, value in flat.items()
+        ]
+        return replace(self, texture=np.concatenate(layers, axis=2))
+
+
+def resize(image: np.ndarray, size: tuple[int, int], filter: Image.Resampling) -> np.ndarray:
+    """Resize an image of any number of channels (H, W, C) uint8 to a width and height."""
+    if image.shape[1::-1] == size:
+        return image
+    return np.stack(
+        [np.asarray(Image.fromarray(np.ascontiguousarray(plane)).resize(size, filter)) for plane in image.transpose(2, 0, 1)], -1
+    )
 
 
 # Default base colour (sRGB): a light grey, since highlights do not show on pure white.
@@ -62,6 +93,16 @@ def plain_color(color: tuple[float, float, float] | None) -> tuple[float, float,
     """Colour of a material whose image is not there: its own, unless it has none, or white or black, which exporters write beside an
     image; then light grey."""
     return GREY if color is None or all(value < _ROUNDING for value in color) or all(value > 1.0 - _ROUNDING for value in color) else color
+
+
+def encode_normals(image: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """Encode a normal map of glTF (H, W, 3) uint8 as x and y (H, W, 2) uint8 of `Material.maps`; `scale` is a factor on x and y."""
+    normals = (image / 127.5 - 1.0) * (scale, scale, 1.0)
+    # Images from other programs have 127 or 128 where a surface is flat.
+    normals[np.abs(image - 127.5) <= 0.5] = 0.0
+    normals[..., 2] = np.maximum(normals[..., 2], _ROUNDING)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    return (np.rint(normals[..., :2] * (MAP_CENTER - 1)) + MAP_CENTER).astype(np.uint8)
 
 
 def srgb_to_linear(value: Any) -> np.ndarray:
@@ -200,7 +241,7 @@ def tile_texture(texture: np.ndarray, tiles: tuple[int, int], said: list[str]) -
         said.append(f"a texture repeats {tiles[0]} x {tiles[1]} times beside other materials: scaled to {width} x {height} pixels")
         # With more repetitions than pixels, the texture is its mean, and the rest is left out.
         tiles = min(tiles[0], MAX_TEXTURE_SIDE // width), min(tiles[1], MAX_TEXTURE_SIDE // height)
-        texture = np.asarray(Image.fromarray(texture).resize((width, height), Image.Resampling.BOX))
+        texture = resize(texture, (width, height), Image.Resampling.BOX)
     return np.tile(texture, (tiles[1], tiles[0], 1))
 
 
@@ -233,12 +274,12 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         parts: Texture coordinates (V, 2) in 0..1, or None, and the material, of each part.
         said: Warnings are added to it.
 
-    Returns new texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8. Raises
+    Returns new texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, C) uint8. Raises
     CatalogError: the atlas is too large."""
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:
-        texture = None if uv is None else material.texture
+        texture = None if uv is None and not material.has_maps else material.texture
         key = (id(texture), material.color)
         if key not in places:
             places[key] = len(blocks)
@@ -246,7 +287,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         index.append(places[key])
     blocks = _fit_blocks(blocks, owner, said)
     width, height = max(block.shape[1] for block in blocks), sum(block.shape[0] for block in blocks)
-    atlas, tops = np.zeros((height, width, 3), np.uint8), np.cumsum([0, *(block.shape[0] for block in blocks)])
+    atlas, tops = np.zeros((height, width, blocks[0].shape[2]), np.uint8), np.cumsum([0, *(block.shape[0] for block in blocks)])
     for block, top in zip(blocks, tops, strict=False):
         atlas[top : top + block.shape[0], : block.shape[1]] = block
     uvs = []
@@ -261,11 +302,12 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
 
 
 def tint(texture: np.ndarray, color: tuple[float, float, float]) -> np.ndarray:
-    """Multiply a texture by a base colour factor, sRGB, in linear light; by white it stays as it is."""
+    """Multiply the colours of a texture by a base colour factor, sRGB, in linear light; by white it stays as it is."""
     # A table of the 256 levels, since whole images in 64-bit floats take eight times the room.
     levels = srgb_to_linear(np.arange(256) / 255.0)[:, None] * srgb_to_linear(color)
     table = np.rint(linear_to_srgb(levels) * 255.0).astype(np.uint8)
-    return np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1)
+    colors = [table[texture[..., channel], channel] for channel in range(3)]
+    return np.stack([*colors, *texture[..., 3:].transpose(2, 0, 1)], axis=-1)
 
 
 def _fit_blocks(blocks: list[np.ndarray], owner: str, said: list[str]) -> list[np.ndarray]:
@@ -274,9 +316,7 @@ def _fit_blocks(blocks: list[np.ndarray], owner: str, said: list[str]) -> list[n
     for halvings in range(8):
         if halvings:
             sizes = [(max(block.shape[1] >> halvings, 4), max(block.shape[0] >> halvings, 4)) for block in first]
-            blocks = [
-                np.asarray(Image.fromarray(block).resize(size, Image.Resampling.BOX)) for block, size in zip(first, sizes, strict=True)
-            ]
+            blocks = [resize(block, size, Image.Resampling.BOX) for block, size in zip(first, sizes, strict=True)]
         if max(block.shape[1] for block in blocks) * sum(block.shape[0] for block in blocks) <= MAX_TEXTURE_PIXELS:
             said += [f"its textures together are too large: scaled by 1/{2**halvings}"] if halvings else []
             return blocks

@@ -183,7 +183,7 @@ def read_mesh(path: Path, unit: float, options: MeshOptions = MeshOptions(), rep
         parts = [part for part in parts if len(part.faces)]
         if not parts:
             raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
-        found = _finish(_join([_bake_colors(part) for part in parts], path, options, notes), unit, options, notes)
+        found = _finish(_join([_bake_colors(part, notes) for part in parts], path, options, notes), unit, options, notes)
     line = notes.line(path)
     if line is not None:
         report(line)
@@ -342,7 +342,7 @@ def _clean(part: MeshPart, unit: float, path: Path) -> MeshPart:
     return replace(part, faces=faces) if len(used) == len(part.vertices) else part.take(used, index.reshape(-1, 3))
 
 
-def _bake_colors(part: MeshPart) -> MeshPart:
+def _bake_colors(part: MeshPart, notes: Notes) -> MeshPart:
     """Multiply vertex colours into the base colour factor, if they are uniform, or into a baked texture."""
     if part.colors is None:
         return part
@@ -350,16 +350,19 @@ def _bake_colors(part: MeshPart) -> MeshPart:
     if (part.colors == part.colors[0]).all():
         color = appearance.as_color(appearance.linear_to_srgb(factor * appearance.srgb_to_linear(part.colors[0])))
         return replace(part, colors=None, material=replace(part.material, color=color))
-    skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture)
+    notes.ignored += ["maps beneath vertex colours"] if part.material.has_maps else []
+    skin = None if part.material.texture is None or part.uv is None else (part.uv, part.material.texture[..., :3])
     uv, texture = appearance.bake_vertex_colors(part.faces, part.colors, factor, skin)
     material = replace(part.material, color=appearance.WHITE, texture=texture)
     return part.take(part.faces.reshape(-1), np.arange(part.faces.size).reshape(-1, 3), uv=uv, colors=None, material=material)
 
 
 def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes) -> MeshPart:
-    """Merge all parts into one: one material, with metallic and roughness averaged by area."""
+    """Merge all parts into one, with one material: a texture with maps where metallic or roughness differ, or a part has maps. Where not
+    all parts state both, they are averaged by area."""
     if len(parts) == 1:
         return parts[0]
+    parts = _share_maps(parts)
     first = parts[0].material
     if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
         parts = [_unroll(part, notes) for part in parts]
@@ -383,6 +386,18 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
         None,
         replace(first, **mean),
     )
+
+
+def _share_maps(parts: list[MeshPart]) -> list[MeshPart]:
+    """Give all parts maps if one has them, or metallic or roughness differ; parts of one texture still share it."""
+    values = {(part.material.metallic, part.material.roughness) for part in parts}
+    if not any(part.material.has_maps for part in parts) and (len(values) == 1 or any(None in each for each in values)):
+        return parts
+    made: dict[Any, appearance.FileMaterial] = {}
+    for part in parts:
+        key = id(part.material)
+        made[key] = made.get(key) or (part.material if part.material.has_maps else part.material.add_maps())
+    return [replace(part, material=made[id(part.material)]) for part in parts]
 
 
 def _unroll(part: MeshPart, notes: Notes) -> MeshPart:

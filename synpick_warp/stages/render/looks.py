@@ -31,7 +31,14 @@ SETTINGS = {
     (LookPart.OBJECT, Look.BRIGHTNESS): "object_brightness",
     (LookPart.OBJECT, Look.ROUGHNESS): "object_roughness",
     (LookPart.OBJECT, Look.METALLIC): "object_metallic",
+    (LookPart.OBJECT, Look.SCRATCHES): "object_scratches",
+    (LookPart.OBJECT, Look.RUST): "object_rust",
+    (LookPart.OBJECT, Look.STAINS): "object_stains",
+    (LookPart.OBJECT, Look.DUST): "object_dust",
     (LookPart.BIN, Look.COLOR): "bin_color",
+    (LookPart.BIN, Look.SCRATCHES): "bin_scratches",
+    (LookPart.BIN, Look.STAINS): "bin_stains",
+    (LookPart.BIN, Look.DUST): "bin_dust",
     (LookPart.BIN, Look.ROUGHNESS): "bin_roughness",
     (LookPart.BIN, Look.METALLIC): "bin_metallic",
     (LookPart.TABLE, Look.COLOR): "table_color",
@@ -45,9 +52,9 @@ SETTINGS = {
     (LookPart.LAMP, Look.TEMPERATURE): "lamp_temperature",
 }
 """Setting of `Randomize` that has a part's distribution of a parameter."""
-_COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels")
+_COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels", "maps")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats")}
+_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern")}
 _MATERIALS = StructArrays(
     RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )
@@ -129,11 +136,12 @@ class Dresser:
     """
 
     def __init__(self, scene: RenderScene, seed: int, instances: int, views: int) -> None:
-        """Allocate the materials of at most `views` views of worlds with `instances` instances. `scene` must have looks."""
+        """Allocate the materials of at most `views` views of worlds with `instances` instances."""
+        looks = scene.looks or Looks(Randomize(), (), ())
         self._seed = wp.uint64(seed)
         self._first = scene.surfaces.color.shape[0]
-        self._table = build_look_table(scene.looks, self._first - len(scene.looks.all_textures), scene.device)
-        self._materials = materials_of_view(instances, bool(scene.looks.background_textures))
+        self._table = build_look_table(looks, self._first - len(looks.all_textures), scene.device)
+        self._materials = materials_of_view(instances, bool(looks.background_textures))
         levels = scene.surfaces.first_texel.shape[1]
         surfaces = allocate_materials(self._first + views * self._materials, levels, scene.device)
         for name in Surfaces.vars:

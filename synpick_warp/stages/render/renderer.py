@@ -68,7 +68,7 @@ class Renderer:
             colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
-        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None else None
+        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None or scene.has_maps else None
         self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views

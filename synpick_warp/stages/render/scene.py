@@ -11,7 +11,20 @@ from synpick_warp.configs import schema
 from synpick_warp.kernels.render.images.layers import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
-from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
+from synpick_warp.kernels.render.lighting.materials import (
+    METALLIC_MAP,
+    METALLIC_SHIFT,
+    NORMAL_MAP,
+    NORMAL_STEPS,
+    NORMAL_ZERO,
+    ROUGHNESS_MAP,
+    ROUGHNESS_MASK,
+    ROUGHNESS_SHIFT,
+    TEXEL_BITS,
+    TEXEL_MASK,
+    TRIANGLE_RECORDS,
+    Surfaces,
+)
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, ImageGrid
@@ -21,7 +34,7 @@ from synpick_warp.scenes.bins import TABLE_ROUGHNESS
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
+from synpick_warp.scenes.types import MAP_CENTER, Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.light_tables import (
     EnvironmentTables,
@@ -65,6 +78,8 @@ class RenderScene:
     """Owners of the meshes whose handles `meshes` holds."""
     looks: Looks | None = None
     """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
+    has_maps: bool = False
+    """Whether a material has normal, roughness or metallic maps."""
     suction_maps: Any = None
     """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
 
@@ -77,6 +92,10 @@ class RenderScene:
     def height(self) -> int:
         """Height of the images [px]."""
         return self.grid.height
+
+
+ALL_MAPS = int(NORMAL_MAP) | int(ROUGHNESS_MAP) | int(METALLIC_MAP)
+"""Bits of `Surfaces.maps` of a material with maps: a file that states only some has its constants in the others."""
 
 
 def blank_scene(cameras: int, width: int, height: int, device: wp.Device) -> RenderScene:
@@ -103,6 +122,32 @@ def pack_texels(image: np.ndarray) -> np.ndarray:
     root = np.rint(np.sqrt(srgb_to_linear(np.arange(256) / 255.0)) * int(TEXEL_MASK)).astype(np.uint32)
     red, green, blue = root[image.reshape(-1, 3).T]
     return red | green << bits | blue << 2 * bits
+
+
+def detail_levels(maps: np.ndarray) -> list[np.ndarray]:
+    """Mip pyramid of maps (H, W, 4) uint8 as of `Material.maps`, packed (H W) uint32. The variance of the normals below a texel widens
+    its roughness (Toksvig, 2005), as the squared GGX width, which is averaged."""
+    x, y = (maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
+    alpha2 = (maps[..., 2] / 255.0) ** 4
+    planes = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0)), alpha2, maps[..., 3] / 255.0], axis=-1).astype(np.float32)
+    levels = [pack_details(planes)]
+    while max(planes.shape[:2]) > 1:
+        height, width = planes.shape[:2]
+        planes = cv2.resize(planes, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+        levels.append(pack_details(planes))
+    return levels
+
+
+def pack_details(planes: np.ndarray) -> np.ndarray:
+    """Pack filtered maps (H, W, 5) into texels (H W) uint32, the layout of `Surfaces.detail`: mean normal, squared GGX width, metallic."""
+    planes = planes.reshape(-1, 5).astype(np.float64)
+    length = np.clip(np.linalg.norm(planes[:, :3], axis=1), 1e-3, 1.0)
+    # Variance of a von Mises-Fisher distribution of normals along one axis, by the length of their mean (Banerjee et al., 2005).
+    variance = (1.0 - length**2) / (length * (3.0 - length**2))
+    roughness = np.clip(planes[:, 3] + 2.0 * variance, 0.0, 1.0) ** 0.25
+    x, y = np.rint(planes[:, :2].T / length * float(NORMAL_STEPS)).astype(np.int64) + int(NORMAL_ZERO)
+    packed = x | y << int(TEXEL_BITS) | np.rint(roughness * int(ROUGHNESS_MASK)).astype(np.int64) << int(ROUGHNESS_SHIFT)
+    return (packed | np.rint(31.0 * planes[:, 4]).astype(np.int64) << int(METALLIC_SHIFT)).astype(np.uint32)
 
 
 def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
@@ -170,12 +215,18 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     chains = map_in_threads(lambda material: mip_levels(material.texture) if material.texture is not None else [], materials)
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
-    texels, total = [], 0
-    for row, chain in enumerate(chains):
-        for level, image in enumerate(chain):
+    texels: list[np.ndarray] = []
+    details: list[np.ndarray] = []
+    total = 0
+    for row, (material, chain) in enumerate(zip(materials, chains, strict=True)):
+        packed = [pack_texels(image) for image in chain]
+        texels += packed
+        details += packed if material.maps is None else detail_levels(material.maps)
+        for level, image in enumerate(packed):
             first_texel[row, level] = total
-            texels.append(pack_texels(image))
-            total += len(texels[-1])
+            total += len(image)
+    if all(material.maps is None for material in materials) or not texels:
+        details = [np.zeros(1, np.uint32)]
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()
     surfaces.triangle = wp.array(np.concatenate([pack_triangles(shape) for shape in shapes]), dtype=wp.vec4, device=device)
@@ -186,6 +237,8 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
+    surfaces.maps = wp.array([0 if m.maps is None else ALL_MAPS for m in materials], dtype=wp.int32, device=device)
+    surfaces.detail = wp.array(np.concatenate(details), dtype=wp.uint32, device=device)
     surfaces.albedo = measure_albedo(device)
     return surfaces
 
@@ -355,5 +408,6 @@ def build_render_scene(
         device=device,
         keep=keep,
         looks=looks,
+        has_maps=any(material.maps is not None for material in materials),
         suction_maps=build_suction_scene(catalog, cup_radius, device),
     )

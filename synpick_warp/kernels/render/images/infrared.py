@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     interpolate_surface,
     make_table_surface,
     map_table,
-    sample_base_color,
+    material_at,
     widen_roughness,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
@@ -145,9 +145,9 @@ def render_infrared_kernel(
     else:
         point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
         surface = seen_surface(scene, shot.bodies, cameras, view, hit, point, outgoing, shot.views.instances)
-        roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
-        color = sample_base_color(scene.surfaces, surface)
-        brdf = make_brdf(scene.surfaces.albedo, color, scene.surfaces.metallic[surface.row], roughness, surface.normal, outgoing)
+        material = material_at(scene.surfaces, surface)
+        roughness = widen_roughness(material.roughness, surface.normal_spread)
+        brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
         ambient = unoccluded_light(scene.lights, which, yaw, brdf)
         radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
         dots = dot_light(scene, sensor, shot.bodies, shot.views, view, point, surface, brdf)

@@ -8,7 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
-from synpick_warp.kernels.render.lighting.materials import RandomizedSurfaces
+from synpick_warp.kernels.render.lighting.materials import METALLIC_MAP, ROUGHNESS_MAP, RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -69,6 +69,10 @@ class DrawnMaterial:
     """Row of `RandomizedSurfaces` whose texture it has."""
     repeats: float
     """As in `RandomizedSurfaces`."""
+    maps: int
+    """As in `Surfaces`: values that are drawn replace maps."""
+    wear: wp.vec4
+    """As in `RandomizedSurfaces`."""
 
 
 @wp.func
@@ -81,23 +85,32 @@ def draw_material(table: LookTable, surfaces: RandomizedSurfaces, base: int, key
     result.recolor = wp.identity(n=3, dtype=float)
     result.texture = base
     result.repeats = 1.0
+    result.maps = surfaces.maps[base]
     if part < 0:
         return result
     if table.distribution[part, Look.TEXTURE].kind != LookKind.OFF:
         result.texture = int(draw_look(table, key, part, Look.TEXTURE)[0])
         result.repeats = 1.0 / draw_look(table, key, part, Look.TEXTURE_WIDTH)[0]
         result.color = wp.vec3(1.0, 1.0, 1.0)
+        result.maps = 0
     if table.distribution[part, Look.COLOR].kind != LookKind.OFF:
         encoded = draw_look(table, key, part, Look.COLOR)
         result.color = wp.vec3(srgb_decode(encoded[0]), srgb_decode(encoded[1]), srgb_decode(encoded[2]))
     if table.distribution[part, Look.ROUGHNESS].kind != LookKind.OFF:
         result.roughness = draw_look(table, key, part, Look.ROUGHNESS)[0]
+        result.maps = result.maps & ~ROUGHNESS_MAP
     if table.distribution[part, Look.METALLIC].kind != LookKind.OFF:
         result.metallic = draw_look(table, key, part, Look.METALLIC)[0]
+        result.maps = result.maps & ~METALLIC_MAP
     if table.distribution[part, Look.HUE].kind != LookKind.OFF:
         result.recolor = hue_rotation(draw_look(table, key, part, Look.HUE)[0])
     if table.distribution[part, Look.BRIGHTNESS].kind != LookKind.OFF:
         result.recolor = draw_look(table, key, part, Look.BRIGHTNESS)[0] * result.recolor
+    wear = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for kind in range(4):
+        if table.distribution[part, Look.SCRATCHES + kind].kind != LookKind.OFF:
+            wear[kind] = draw_look(table, key, part, Look.SCRATCHES + kind)[0]
+    result.wear = wear
     return result
 
 
@@ -148,6 +161,9 @@ def dress_bodies_kernel(
     surfaces_inout.roughness[row] = material.roughness
     surfaces_inout.recolor[row] = material.recolor
     surfaces_inout.repeats[row] = material.repeats
+    surfaces_inout.wear[row] = material.wear
+    surfaces_inout.pattern[row] = int(key >> wp.uint64(40))
+    surfaces_inout.maps[row] = material.maps
     surfaces_inout.texture_size[row] = surfaces_inout.texture_size[material.texture]
     surfaces_inout.texture_levels[row] = surfaces_inout.texture_levels[material.texture]
     for level in range(surfaces_inout.first_texel.shape[1]):

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
+from synpick_warp.kernels.render.lighting.wear import wear_out
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
@@ -26,6 +27,16 @@ TEXEL_WIDTH = wp.constant(0.57735)
 """Texel width of the selected mip level, relative to the pixel's footprint: 1 / sqrt(3). The kernel of a bilinear look-up in box-filtered
 texels has a variance of 1/6 + 1/12 = 1/4 texel²; at this width that is the variance of a one-pixel box filter, 1/12 px². With texels one
 pixel wide, textures would be blurred."""
+NORMAL_MAP, ROUGHNESS_MAP, METALLIC_MAP = wp.constant(1), wp.constant(2), wp.constant(4)
+"""Bits of `Surfaces.maps`."""
+NORMAL_ZERO = wp.constant(512)
+"""Packed value of 0 of a map's normal."""
+NORMAL_STEPS = wp.constant(511.0)
+"""Steps of a map's normal from 0 to 1."""
+ROUGHNESS_SHIFT, ROUGHNESS_MASK = wp.constant(20), wp.constant(127)
+"""Place of a map's roughness among the bits of a texel, and its largest packed value."""
+METALLIC_SHIFT = wp.constant(27)
+"""Place of a map's metallic, whose largest packed value is 31."""
 MIN_TILT = wp.constant(0.1)
 """Lower bound of the cosine between surface normal and view direction, which limits a pixel's footprint at grazing angles."""
 TRIANGLE_RECORDS = wp.constant(5)
@@ -57,16 +68,30 @@ class Surfaces:
     """(material): number of mip levels."""
     texel: wp.array[wp.uint32]
     """(texel): square roots of linear red, green and blue in TEXEL_BITS bits each, red in the lowest, so that one load reads all."""
+    maps: wp.array[int]
+    """(material): NORMAL_MAP, ROUGHNESS_MAP and METALLIC_MAP: which maps `detail` has in place of the values above."""
+    detail: wp.array[wp.uint32]
+    """(texel): x and y of the normal in the triangle's tangent frame, roughness and metallic, packed as `stages.render.scene.pack_details`
+    does; read by `RandomizedSurfaces` alone."""
     albedo: AlbedoTables
     """Directional albedo of the specular lobe, the same for all surfaces."""
 
 
-RandomizedSurfaces = variant_of(Surfaces, "RandomizedSurfaces", row=wp.array2d[int], recolor=wp.array[wp.mat33], repeats=wp.array[float])
-"""Surfaces whose materials each episode draws at random (`looks`): constant, but for the materials of views.
+RandomizedSurfaces = variant_of(
+    Surfaces,
+    "RandomizedSurfaces",
+    row=wp.array2d[int],
+    recolor=wp.array[wp.mat33],
+    repeats=wp.array[float],
+    wear=wp.array[wp.vec4],
+    pattern=wp.array[int],
+)
+"""Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
 More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
-clamped to 0..1, and `repeats` the factor on its texture coordinates."""
+clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise has the seed
+`pattern`."""
 AnySurfaces = Any
 """`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
@@ -87,6 +112,23 @@ class Surface:
     """Width of the pixel's footprint on the surface, in texture lengths."""
     normal_spread: float
     """Change of the normal across the pixel's footprint [rad]."""
+    tangent: wp.vec4
+    """Direction of growing u in the world, not normalized, and the side of growing v: 1 or -1 times the cross product of normal and
+    direction; zero without maps, or where u does not grow."""
+    place: wp.vec3
+    """Position in the body's frame, in radii of its bounding sphere; zero without wear."""
+    place_footprint: float
+    """Width of the pixel's footprint on the surface, in these radii."""
+
+
+@wp.struct
+class SurfaceMaterial:
+    """Material of a surface at one hit: linear base colour, metallic, perceptual roughness, and shading normal towards the viewer."""
+
+    color: wp.vec3
+    metallic: float
+    roughness: float
+    normal: wp.vec3
 
 
 @wp.func
@@ -157,6 +199,55 @@ def repeat_texture(surfaces: RandomizedSurfaces, surface: Surface) -> Surface:  
 
 
 @wp.func
+def place_details(
+    meshes: Meshes,
+    surfaces: Surfaces,
+    surface: Surface,
+    mesh: int,
+    triangle: int,
+    barycentric: wp.vec2,
+    footprint: float,
+    to_world: wp.mat33,
+) -> Surface:
+    """Shading data with tangent and place, if the material may have maps or wear; `footprint` [m] is the pixel's on the surface."""
+    return surface
+
+
+@wp.func
+def place_details(  # noqa: F811
+    meshes: Meshes,
+    surfaces: RandomizedSurfaces,
+    surface: Surface,
+    mesh: int,
+    triangle: int,
+    barycentric: wp.vec2,
+    footprint: float,
+    to_world: wp.mat33,
+) -> Surface:
+    """Shading data with tangent and place. The tangent is that of the triangle: the gradient of its texture coordinate u."""
+    result = surface
+    first = meshes.first_triangle[mesh] + triangle
+    a = meshes.corner[3 * first]
+    edge = meshes.corner[3 * first + 1] - a
+    other = meshes.corner[3 * first + 2] - a
+    if wp.length_sq(surfaces.wear[surface.row]) > 0.0:
+        point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
+        result.place = (point - meshes.center[mesh]) / meshes.radius[mesh]
+        result.place_footprint = footprint / meshes.radius[mesh]
+    if (surfaces.maps[surface.row] & NORMAL_MAP) != 0:
+        u = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first)[3]
+        v = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 3)
+        toward_b = wp.vec2(read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 1)[3] - u, v[1] - v[0])
+        toward_c = wp.vec2(read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 2)[3] - u, v[2] - v[0])
+        turn = wp.sign(toward_b[0] * toward_c[1] - toward_b[1] * toward_c[0])
+        # A surface that is seen from behind has the map's normal turned round as a whole.
+        side = wp.sign(wp.dot(to_world * wp.cross(edge, other), surface.face_normal))
+        gradient = side * turn * (to_world * (toward_c[1] * edge - toward_b[1] * other))
+        result.tangent = wp.vec4(gradient[0], gradient[1], gradient[2], side * turn)
+    return result
+
+
+@wp.func
 def interpolate_surface(
     meshes: Meshes,
     surfaces: AnySurfaces,
@@ -195,6 +286,7 @@ def interpolate_surface(
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
     result.uv_footprint = pixel_width / tilt * more[3]
     result.normal_spread = pixel_width / tilt * face[3]
+    result = place_details(meshes, surfaces, result, mesh, triangle, barycentric, pixel_width / tilt, to_world)
     return repeat_texture(surfaces, result)
 
 
@@ -208,9 +300,17 @@ def decode_texel(surfaces: AnySurfaces, index: int) -> wp.vec3:
     return wp.vec3(red * red, green * green, blue * blue)
 
 
+@wp.struct
+class Taps:
+    """Texels of a bilinear look-up: upper left, upper right, lower left and lower right one, and the weights of right and lower ones."""
+
+    index: wp.vec4i
+    weight: wp.vec2
+
+
 @wp.func
-def sample_mip_level(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
-    """Bilinear look-up in one mip level of a repeating texture: linear colour divided by TEXEL_SCALE.
+def find_taps(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -> Taps:
+    """Texels about a place in one mip level of a repeating texture.
 
     v grows upward, row 0 is the image's top; `row` is that of `Surfaces`.
     """
@@ -221,20 +321,28 @@ def sample_mip_level(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -
     y = (1.0 - uv[1] - wp.floor(1.0 - uv[1])) * float(height) - 0.5
     left = int(wp.floor(x))
     top = int(wp.floor(y))
-    right_weight = x - float(left)
-    lower_weight = y - float(top)
+    taps = Taps()
+    taps.weight = wp.vec2(x - float(left), y - float(top))
     # Both are at least -1 and less than the level's size; a modulo would cost more than the texels.
     right = wp.where(left + 1 == width, 0, left + 1)
     bottom = wp.where(top + 1 == height, 0, top + 1)
     left = wp.where(left < 0, width - 1, left)
     top = wp.where(top < 0, height - 1, top)
     first = surfaces.first_texel[row, level]
+    taps.index = wp.vec4i(
+        first + top * width + left, first + top * width + right, first + bottom * width + left, first + bottom * width + right
+    )
+    return taps
+
+
+@wp.func
+def sample_mip_level(surfaces: AnySurfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
+    """Bilinear look-up in one mip level of a repeating texture: linear colour divided by TEXEL_SCALE."""
+    taps = find_taps(surfaces, row, level, uv)
     return wp.lerp(
-        wp.lerp(decode_texel(surfaces, first + top * width + left), decode_texel(surfaces, first + top * width + right), right_weight),
-        wp.lerp(
-            decode_texel(surfaces, first + bottom * width + left), decode_texel(surfaces, first + bottom * width + right), right_weight
-        ),
-        lower_weight,
+        wp.lerp(decode_texel(surfaces, taps.index[0]), decode_texel(surfaces, taps.index[1]), taps.weight[0]),
+        wp.lerp(decode_texel(surfaces, taps.index[2]), decode_texel(surfaces, taps.index[3]), taps.weight[0]),
+        taps.weight[1],
     )
 
 
@@ -252,20 +360,102 @@ def sample_base_color(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec3
 
 
 @wp.func
+def mip_level(surfaces: AnySurfaces, surface: Surface) -> float:
+    """Mip level of a look-up, between levels, by TEXEL_WIDTH; the material must have a texture."""
+    size = surfaces.texture_size[surface.row]
+    texels = TEXEL_WIDTH * surface.uv_footprint * wp.sqrt(float(size[0]) * float(size[1]))
+    return wp.clamp(wp.log2(wp.max(texels, 1.0e-6)), 0.0, float(surfaces.texture_levels[surface.row] - 1))
+
+
+@wp.func
 def sample_texture(surfaces: AnySurfaces, surface: Surface) -> wp.vec3:
     """Material colour times texture, linear, filtered trilinearly at the mip level given by TEXEL_WIDTH."""
     color = surfaces.color[surface.row]
-    size = surfaces.texture_size[surface.row]
-    if size[0] == 0:
+    if surfaces.texture_size[surface.row][0] == 0:
         return color
-    texels = TEXEL_WIDTH * surface.uv_footprint * wp.sqrt(float(size[0]) * float(size[1]))
-    last = surfaces.texture_levels[surface.row] - 1
-    level = wp.clamp(wp.log2(wp.max(texels, 1.0e-6)), 0.0, float(last))
+    level = mip_level(surfaces, surface)
     lower = int(level)
-    upper = wp.min(lower + 1, last)
+    upper = wp.min(lower + 1, surfaces.texture_levels[surface.row] - 1)
     fine = sample_mip_level(surfaces, surface.row, lower, surface.uv)
     coarse = sample_mip_level(surfaces, surface.row, upper, surface.uv)
     return TEXEL_SCALE * wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))
+
+
+@wp.func
+def decode_detail(surfaces: RandomizedSurfaces, index: int) -> wp.vec4:
+    """Unpack a texel of the maps: x and y of the normal, roughness, metallic."""
+    texel = int(surfaces.detail[index])
+    x = float((texel & TEXEL_MASK) - NORMAL_ZERO)
+    y = float(((texel >> TEXEL_BITS) & TEXEL_MASK) - NORMAL_ZERO)
+    roughness = float((texel >> ROUGHNESS_SHIFT) & ROUGHNESS_MASK)
+    return wp.vec4(x / NORMAL_STEPS, y / NORMAL_STEPS, roughness / float(ROUGHNESS_MASK), float((texel >> METALLIC_SHIFT) & 31) / 31.0)
+
+
+@wp.func
+def sample_details(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec4:
+    """Trilinear look-up of the maps: x and y of the normal in the tangent frame, roughness, metallic."""
+    level = mip_level(surfaces, surface)
+    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for step in range(2):
+        at = wp.min(int(level) + step, surfaces.texture_levels[surface.row] - 1)
+        taps = find_taps(surfaces, surface.row, at, surface.uv)
+        upper = wp.lerp(decode_detail(surfaces, taps.index[0]), decode_detail(surfaces, taps.index[1]), taps.weight[0])
+        lower = wp.lerp(decode_detail(surfaces, taps.index[2]), decode_detail(surfaces, taps.index[3]), taps.weight[0])
+        share = level - float(int(level))
+        total += wp.where(step == 0, 1.0 - share, share) * wp.lerp(upper, lower, taps.weight[1])
+    return total
+
+
+@wp.func
+def bump_normal(surface: Surface, x: float, y: float) -> wp.vec3:
+    """Normal mapping (Blinn, 1978; tangent frames as in glTF 2.0): the interpolated normal, tilted by x along u and y along v."""
+    along = wp.vec3(surface.tangent[0], surface.tangent[1], surface.tangent[2])
+    along -= wp.dot(along, surface.normal) * surface.normal
+    if wp.length_sq(along) == 0.0:
+        return surface.normal
+    along = wp.normalize(along)
+    across = surface.tangent[3] * wp.cross(surface.normal, along)
+    height = wp.sqrt(wp.max(1.0 - x * x - y * y, 0.0))
+    return wp.normalize(x * along + y * across + height * surface.normal)
+
+
+@wp.func
+def material_at(surfaces: Surfaces, surface: Surface) -> SurfaceMaterial:
+    """Material at a hit: that of its row, and the interpolated normal."""
+    result = SurfaceMaterial()
+    result.color = sample_base_color(surfaces, surface)
+    result.metallic = surfaces.metallic[surface.row]
+    result.roughness = surfaces.roughness[surface.row]
+    result.normal = surface.normal
+    return result
+
+
+@wp.func
+def material_at(surfaces: RandomizedSurfaces, surface: Surface) -> SurfaceMaterial:  # noqa: F811
+    """Material at a hit: that of its row or of its maps, and the wear of its body."""
+    result = SurfaceMaterial()
+    result.color = sample_base_color(surfaces, surface)
+    result.metallic = surfaces.metallic[surface.row]
+    result.roughness = surfaces.roughness[surface.row]
+    result.normal = surface.normal
+    maps = surfaces.maps[surface.row]
+    if maps != 0:
+        details = sample_details(surfaces, surface)
+        if (maps & NORMAL_MAP) != 0:
+            result.normal = bump_normal(surface, details[0], details[1])
+        if (maps & ROUGHNESS_MAP) != 0:
+            result.roughness = details[2]
+        if (maps & METALLIC_MAP) != 0:
+            result.metallic = details[3]
+    wear = surfaces.wear[surface.row]
+    if wp.length_sq(wear) > 0.0:
+        worn = wear_out(
+            wear, surfaces.pattern[surface.row], surface.place, surface.place_footprint, result.color, result.metallic, result.roughness
+        )
+        result.color = worn.color
+        result.metallic = worn.metallic
+        result.roughness = worn.roughness
+    return result
 
 
 @wp.func

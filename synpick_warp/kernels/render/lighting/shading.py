@@ -25,7 +25,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     interpolate_surface,
     make_table_surface,
     map_table,
-    sample_base_color,
+    material_at,
     widen_roughness,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
@@ -137,10 +137,9 @@ def gather_light(
 @wp.func
 def shade_point(scene: AnyScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
     """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
-    color = sample_base_color(scene.surfaces, surface)
-    metallic = scene.surfaces.metallic[surface.row]
-    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
+    material = material_at(scene.surfaces, surface)
+    roughness = widen_roughness(material.roughness, surface.normal_spread)
+    brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
 
 

@@ -165,6 +165,8 @@ class TextureInfo(msgspec.Struct):
     index: Index
     texCoord: Index = 0  # noqa: N815
     extensions: InfoExtensions | None = None
+    scale: float = 1.0
+    """Of a normal map: factor on the x and y of its normals."""
 
 
 class Pbr(msgspec.Struct):
@@ -194,11 +196,11 @@ class MaterialExtensions(msgspec.Struct):
 
 
 class GltfMaterial(msgspec.Struct):
-    """glTF material: PBR parameters, extensions, and textures that are reported but not used."""
+    """glTF material: PBR parameters, normal map, extensions, and textures that are reported but not used."""
 
     pbrMetallicRoughness: Pbr | None = None  # noqa: N815
     extensions: MaterialExtensions | None = None
-    normalTexture: Any = None  # noqa: N815
+    normalTexture: TextureInfo | None = None  # noqa: N815
     occlusionTexture: Any = None  # noqa: N815
     emissiveTexture: Any = None  # noqa: N815
     emissiveFactor: Three = (0.0, 0.0, 0.0)  # noqa: N815

@@ -3,6 +3,7 @@
 import io
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image as PillowImage
@@ -207,25 +208,58 @@ class _Reader:
             material = schema.item_at(self.gltf.materials, index, "material", self.path)
             self.note_ignored(material)
             gloss = material.extensions.glossiness if material.extensions else None
-            self.materials[index] = self.gloss(gloss) if gloss else self.pbr(material.pbrMetallicRoughness or schema.Pbr())
+            pbr = material.pbrMetallicRoughness or schema.Pbr()
+            found, info = self.gloss(gloss) if gloss else self.pbr(pbr)
+            self.materials[index] = self.mapped(found, info, material.normalTexture, schema.Pbr() if gloss else pbr)
         return self.materials[index]
 
+    def mapped(
+        self, material: appearance.FileMaterial, info: schema.TextureInfo | None, normal: schema.TextureInfo | None, pbr: schema.Pbr
+    ) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
+        """Add the maps of normals, and of roughness and metallic, that have the texture coordinates of the base colour `info`; without one
+        those of the normals. Returns the reference to the texture whose coordinates hold."""
+        maps: dict[str, np.ndarray] = {}
+        for name, each in (("normalTexture", normal), ("metallicRoughnessTexture", pbr.metallicRoughnessTexture)):
+            if each is None or material.metallic is None or material.roughness is None:
+                continue
+            if info is not None and self.coordinates(info) != self.coordinates(each):
+                self.notes.ignored.append(f"{name} with other texture coordinates")
+                continue
+            image = self.texture(each)
+            if image is None:
+                continue
+            info = info or each
+            if each is normal:
+                maps["normal"] = appearance.encode_normals(image, each.scale)
+            else:
+                # glTF 2.0, section 3.9.2: green is roughness, blue is metalness.
+                maps["roughness"], maps["metallic"] = (
+                    np.rint(image[..., channel : channel + 1] * min(max(factor, 0.0), 1.0)).astype(np.uint8)
+                    for channel, factor in ((1, pbr.roughnessFactor), (2, pbr.metallicFactor))
+                )
+        return (material.add_maps(**maps), info) if maps else (material, info)
+
+    def coordinates(self, info: schema.TextureInfo) -> tuple[Any, ...]:
+        """By what a texture's coordinates follow from a vertex: their set, transform and wrap modes."""
+        texture = schema.item_at(self.gltf.textures, info.index, "texture", self.path)
+        sampler = None if texture.sampler is None else schema.item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
+        return info.texCoord, info.extensions, sampler and (sampler.wrapS, sampler.wrapT)
+
     def note_ignored(self, material: schema.GltfMaterial) -> None:
-        """Note the features of a material beyond base colour, metallic and roughness, which are not used."""
-        self.notes.ignored += [name for name in ("normalTexture", "occlusionTexture") if getattr(material, name) is not None]
+        """Note the features of a material that are not used. Occlusion is none: it is that of the geometry."""
         if material.emissiveTexture is not None or any(material.emissiveFactor):
             self.notes.ignored.append("emission")
         if material.alphaMode != "OPAQUE":
             self.notes.ignored.append("transparency")
 
     def pbr(self, pbr: schema.Pbr) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
-        """Convert a metallic-roughness material: (material, base colour texture); of the metallic-roughness texture, the mean is used."""
+        """Convert a metallic-roughness material: (material, base colour texture); of the metallic-roughness texture, the mean."""
         for name, value in (("metallicFactor", pbr.metallicFactor), ("roughnessFactor", pbr.roughnessFactor)):
             if not -_FACTOR_TOLERANCE <= value <= 1.0 + _FACTOR_TOLERANCE:
                 raise CatalogError(f"{self.path}: {name} is {value:g}; allowed: 0 to 1; correct the material")
         metallic, roughness = pbr.metallicFactor, pbr.roughnessFactor
         if pbr.metallicRoughnessTexture is not None:
-            # glTF 2.0, section 3.9.2: green is roughness, blue is metalness. The renderer takes one value per object: the mean.
+            # The mean stands for the map where that cannot be used, see `mapped`.
             image = self.texture(pbr.metallicRoughnessTexture)
             mean = np.zeros(3) if image is None else image.reshape(-1, 3).mean(axis=0) / 255.0
             metallic, roughness = metallic * float(mean[2]), roughness * float(mean[1])
@@ -306,7 +340,7 @@ class _Reader:
         sampler = schema.item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
         mirror = sampler.wrapS == _MIRROR, sampler.wrapT == _MIRROR
         if any(mirror):
-            material, uv = self.mirrored(material, uv, (self.source(info), *mirror))
+            material, uv = self.mirrored(material, uv, (id(material.texture), *mirror))
         clamp = sampler.wrapS == _CLAMP, sampler.wrapT == _CLAMP
         if any(clamp):
             image, uv = appearance.clamp_texture(material.texture, uv, clamp, self.notes.ignored)
@@ -316,7 +350,7 @@ class _Reader:
     def mirrored(
         self, material: appearance.FileMaterial, uv: np.ndarray, key: tuple[int, bool, bool]
     ) -> tuple[appearance.FileMaterial, np.ndarray]:
-        """Extend an image by its mirror image to the right, upwards, or both; `key`: its index and the two."""
+        """Extend an image by its mirror image to the right, upwards, or both; `key`: its identity and the two."""
         mirror = key[1:]
         if key not in self.tiles:
             image = material.texture

@@ -22,7 +22,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     interpolate_surface,
     make_table_surface,
     map_table,
-    sample_base_color,
+    material_at,
 )
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
@@ -171,10 +171,9 @@ def make_vertex(
     vertex = Vertex()
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
-    metallic = scene.surfaces.metallic[surface.row]
-    roughness = wp.max(scene.surfaces.roughness[surface.row], min_roughness)
-    color = sample_base_color(scene.surfaces, surface)
-    vertex.brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
+    material = material_at(scene.surfaces, surface)
+    roughness = wp.max(material.roughness, min_roughness)
+    vertex.brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return vertex
 
 
