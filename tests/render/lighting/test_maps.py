@@ -90,7 +90,8 @@ def measure_wear_kernel(place: wp.array[wp.vec3], kind: int, amount: float, foot
     index = wp.tid()
     amounts = wp.vec4(0.0, 0.0, 0.0, 0.0)
     amounts[kind] = amount
-    worn = wear.wear_out(amounts, 7 * (index % 64), place[index], footprint, wp.vec3(0.5, 0.5, 0.5), 1.0, 0.3)
+    found = wear.find_wear(amounts, 7 * (index % 64), place[index], footprint)
+    worn = wear.apply_wear(found, wp.vec3(0.5, 0.5, 0.5), 1.0, 0.3)
     out[index] = wp.vec3(worn.color[0], worn.metallic, worn.roughness)
 
 

@@ -11,7 +11,7 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.materials import Surface, interpolate_surface, make_table_surface, map_table, material_at
+from synpick_warp.kernels.render.lighting.materials import Surface, interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.visibility.camera import (
     NEAR_PLANE,
@@ -189,7 +189,8 @@ def albedo_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row:
     """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface."""
     color = wp.vec3(0.0, 0.0, 0.0)
     if int(shot.gbuffer.segment[view, row, column]) != Segment.NOTHING:
-        color = material_at(scene.surfaces, hit_surface(scene, shot, view, row, column)).color
+        surface = hit_surface(scene, shot, view, row, column)
+        color = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface)).color
     return wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
 

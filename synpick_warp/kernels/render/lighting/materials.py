@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
-from synpick_warp.kernels.render.lighting.wear import wear_out
+from synpick_warp.kernels.render.lighting.wear import Wear, apply_wear, find_wear
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
@@ -420,7 +420,22 @@ def bump_normal(surface: Surface, x: float, y: float) -> wp.vec3:
 
 
 @wp.func
-def material_at(surfaces: Surfaces, surface: Surface) -> SurfaceMaterial:
+def wear_at(surfaces: Surfaces, surface: Surface) -> Wear:
+    """Wear of a surface in a pixel: none."""
+    return Wear()
+
+
+@wp.func
+def wear_at(surfaces: RandomizedSurfaces, surface: Surface) -> Wear:  # noqa: F811
+    """Wear of a surface in a pixel, by the amounts of its row."""
+    amount = surfaces.wear[surface.row]
+    if amount[0] + amount[1] + amount[2] + amount[3] > 0.0:
+        return find_wear(amount, surfaces.pattern[surface.row], surface.place, surface.place_footprint)
+    return Wear()
+
+
+@wp.func
+def material_at(surfaces: Surfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:
     """Material at a hit: that of its row, and the interpolated normal."""
     result = SurfaceMaterial()
     result.color = sample_base_color(surfaces, surface)
@@ -431,8 +446,8 @@ def material_at(surfaces: Surfaces, surface: Surface) -> SurfaceMaterial:
 
 
 @wp.func
-def material_at(surfaces: RandomizedSurfaces, surface: Surface) -> SurfaceMaterial:  # noqa: F811
-    """Material at a hit: that of its row or of its maps, and the wear of its body."""
+def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
+    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share."""
     result = SurfaceMaterial()
     result.color = sample_base_color(surfaces, surface)
     result.metallic = surfaces.metallic[surface.row]
@@ -447,11 +462,8 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface) -> SurfaceMateri
             result.roughness = details[2]
         if (maps & METALLIC_MAP) != 0:
             result.metallic = details[3]
-    wear = surfaces.wear[surface.row]
-    if wp.length_sq(wear) > 0.0:
-        worn = wear_out(
-            wear, surfaces.pattern[surface.row], surface.place, surface.place_footprint, result.color, result.metallic, result.roughness
-        )
+    if wear.share[0] + wear.share[1] + wear.share[2] + wear.share[3] > 0.0:
+        worn = apply_wear(wear, result.color, result.metallic, result.roughness)
         result.color = worn.color
         result.metallic = worn.metallic
         result.roughness = worn.roughness

@@ -26,6 +26,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     make_table_surface,
     map_table,
     material_at,
+    wear_at,
     widen_roughness,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
@@ -36,6 +37,7 @@ from synpick_warp.kernels.render.lighting.shadows import byte_of
 from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
+from synpick_warp.kernels.render.lighting.wear import Wear
 from synpick_warp.kernels.render.visibility.camera import hit_position, in_image, loop_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import SHADE_PASS, AnyShot, ShadedImage, body_of
 from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
@@ -135,9 +137,9 @@ def gather_light(
 
 
 @wp.func
-def shade_point(scene: AnyScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
+def shade_point(scene: AnyScene, sky: Sky, surface: Surface, wear: Wear, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
     """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
-    material = material_at(scene.surfaces, surface)
+    material = material_at(scene.surfaces, surface, wear)
     roughness = widen_roughness(material.roughness, surface.normal_spread)
     brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
@@ -209,8 +211,9 @@ def shade_pixel(
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
     normal = wp.transpose(to_world) * surface.face_normal
     light = gather_light(scene, shot, denoised, sky, image, view, row, column, normal)
+    wear = wear_at(scene.surfaces, surface)
     if segment == Segment.TABLE or samples_per_axis == 1:
-        return shade_point(scene, sky, surface, outgoing, light)
+        return shade_point(scene, sky, surface, wear, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
     orientation = wp.sign(sum_of(edge_areas(corners, middle_ray)))
     center = wp.vec3(barycentric[0], barycentric[1], 1.0 - barycentric[0] - barycentric[1])
@@ -224,7 +227,7 @@ def shade_pixel(
         footprint_scale = 1.0 - moved * (1.0 - 1.0 / float(samples_per_axis))
         point = wp.vec2(weights[0], weights[1])
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, point, outgoing, footprint_scale * width)
-        total += shade_point(scene, sky, surface, outgoing, light)
+        total += shade_point(scene, sky, surface, wear, outgoing, light)
     return total / float(samples)
 
 
