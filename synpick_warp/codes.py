@@ -56,6 +56,8 @@ class Mode(enum.IntEnum):
     """Untargeted picking: the target has the fewest ancestors in the clutter graph."""
     TARGET = 2
     """Targeted picking: the target has the most ancestors."""
+    STILL = 3
+    """One frame of the settled pile; the gripper waits, and is invisible."""
 
 
 class Task(enum.IntEnum):
@@ -195,6 +197,7 @@ class Stream(enum.IntEnum):
     TRIALS = 20
     UPRIGHT = 21
     SCATTER = 22
+    DOME = 23
 
 
 class Look(enum.IntEnum):

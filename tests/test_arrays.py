@@ -301,7 +301,7 @@ def test_missing_ambiguous_and_unknown_arguments_are_errors():
 
 
 def test_derived_values_come_before_sections_and_earlier_sections_before_later():
-    first, second = SimpleNamespace(first=0, pick_share=0.25, cycle=0), SimpleNamespace(pick_share=0.5, pick_or_target_share=0.75)
+    first, second = SimpleNamespace(first=0, pick_share=0.25, cycle=0, still=0), SimpleNamespace(pick_share=0.5, pick_or_target_share=0.75)
     result = fill(ModeData, first, second)
     assert (float(result.pick_share), float(result.pick_or_target_share)) == (0.25, 0.75)
     assert float(fill(ModeData, first, second, pick_share=1.0).pick_share) == 1.0

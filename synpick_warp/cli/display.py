@@ -227,7 +227,7 @@ def _attempts(summary: BakeSummary) -> str:
     total = summary.outcomes.total()
     fractions = [f"{_words(outcome)} {count:,} ({count / total:.0%})" for outcome, count in summary.outcomes.most_common()]
     picked, objects, lost = (
-        sum(getattr(row, name) for row in summary.episodes if row.mode != "move") for name in ("picked", "objects", "lost")
+        sum(getattr(row, name) for row in summary.episodes if row.mode in ("pick", "target")) for name in ("picked", "objects", "lost")
     )
     return f"{total:,} attempts: {', '.join(fractions)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
 

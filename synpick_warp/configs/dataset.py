@@ -207,11 +207,11 @@ def split_kind(folder: str) -> str:
 
 
 def mode_weights(bake: Bake, mode: str | None = None) -> dict[str, float]:
-    """Unnormalized probability of each of MODES in a bake of mode `mode` (None: bake.mode); 0: never."""
+    """Unnormalized probability of modes in a bake of mode `mode` (None: bake.mode); 0: never."""
     mode = bake.mode if mode is None else mode
     if mode == MIXED:
         return dict(zip(MODES, bake.mix, strict=True))
-    return {name: float(mode in (name, CYCLE)) for name in MODES}
+    return {name: float(mode in (name, CYCLE)) for name in dict.fromkeys((*MODES, mode)) if name != CYCLE}
 
 
 def bake_modes(bake: Bake, splits: Sequence[Split]) -> tuple[str, ...]:
@@ -220,7 +220,7 @@ def bake_modes(bake: Bake, splits: Sequence[Split]) -> tuple[str, ...]:
 
 
 def possible_modes(bake: Bake, splits: Sequence[Split]) -> set[str]:
-    """Modes of MODES that episodes of a data set with these settings can have."""
+    """Modes, mixed and cycle resolved, that episodes of a data set with these settings can have."""
     return {name for mode in bake_modes(bake, splits) for name, weight in mode_weights(bake, mode).items() if weight > 0.0}
 
 

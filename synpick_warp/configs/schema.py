@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from synpick_warp.codes import MAX_INSTANCES, Tone, names
 from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, Tote
-from synpick_warp.configs.cell.cameras import CameraRow, Cameras, DepthSensor, Effects, Rig
+from synpick_warp.configs.cell.cameras import CameraRow, Cameras, DepthSensor, Effects, Rig, Still
 from synpick_warp.configs.cell.gripper import Gripper, Suction
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
@@ -26,6 +26,8 @@ MIXED = "mixed"
 """Each episode draws its mode."""
 CYCLE = "cycle"
 """Round robin: episode i has the mode MODES[i % 3], so every three episodes in a row have one of each."""
+STILL = "still"
+"""Mode of all episodes of a data set or of none: one frame of the settled pile."""
 FAST = "fast"
 REFERENCE = "reference"
 UNOCCLUDED = "unoccluded"
@@ -55,8 +57,8 @@ class Bake:
     mode: str = setting(
         "pick",
         "Task of the gripper: pick (empty the tote), target (dig for the most occluded object), move (stir), mixed (drawn per episode), "
-        "cycle (pick, target, move in turn).",
-        choices=(*MODES, MIXED, CYCLE),
+        "cycle (pick, target, move in turn), still (one frame of the settled pile without gripper, see [still]; objects as in mode pick).",
+        choices=(*MODES, MIXED, CYCLE, STILL),
     )
     mix: Annotated[tuple[float, float, float], "[0, 1000]"] = setting((1.0, 1.0, 1.0), "Weights of pick, target and move in mode mixed.")
     worlds: Annotated[int, "[0, 65536]"] = setting(
@@ -285,7 +287,7 @@ class Split:
     first: Annotated[int, f"[-1, {INT32_MAX}]"] = setting(
         -1, "Index of its first episode; -1: the next after the split before it. A gap leaves room to grow."
     )
-    mode: str = setting("", "As bake.mode; empty: that.", choices=("", *MODES, MIXED, CYCLE))
+    mode: str = setting("", "As bake.mode; empty: that.", choices=("", *MODES, MIXED, CYCLE, STILL))
     folder: str = setting("", "Folder of the split; empty: its name, with _pbr if bop.color_format is jpg, as in test_pbr.")
 
 
@@ -299,6 +301,7 @@ class Config:
     bins: Bins = field(default_factory=Bins)
     gripper: Gripper = field(default_factory=Gripper)
     cameras: Cameras = field(default_factory=Cameras)
+    still: Still = field(default_factory=Still)
     arrangement: Arrangement = field(default_factory=Arrangement)
     settle: Settle = field(default_factory=Settle)
     physics: Physics = field(default_factory=Physics)
@@ -323,7 +326,8 @@ class Config:
     @property
     def rig(self) -> Rig:
         """All cameras."""
-        return Rig.of(self.cameras, self.camera, self.bop.rectified)
+        stills = STILL in ([split.mode for split in self.splits] or [self.bake.mode])
+        return Rig.of(self.cameras, self.camera, self.bop.rectified, self.still if stills else None)
 
     @property
     def cell(self) -> Cell:

@@ -56,7 +56,8 @@ class EpisodeOutcome(NamedTuple):
     @property
     def sentence(self) -> str:
         """How the episode ended, of the bin that it has."""
-        return name_bin(self.ending.sentence, self.bin)
+        seen = self.mode == "still" and self.ending.delivers
+        return "the pile was seen at rest" if seen else name_bin(self.ending.sentence, self.bin)
 
     def as_json(self) -> dict[str, Any]:
         """Row as the dictionary of a line of episodes.jsonl."""

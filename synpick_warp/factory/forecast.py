@@ -23,7 +23,7 @@ from synpick_warp.stages.sim.arrange import sample_episodes_ahead
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress
 
-FRAMES_OF_MODE = {Mode.PICK: (60, 44, 102), Mode.TARGET: (81, 51, 75), Mode.MOVE: (409, 0, 33)}
+FRAMES_OF_MODE = {Mode.PICK: (60, 44, 102), Mode.TARGET: (81, 51, 75), Mode.MOVE: (409, 0, 33), Mode.STILL: (1, 0, 0)}
 """Frames of an episode: fixed part, part per object, and standard deviation. Least squares over 56 episodes of real objects
 (tools/results/episodes_lengths.json)."""
 DEVIATIONS = 2.0
@@ -89,6 +89,9 @@ SURE = 0.2
 VIEW_TIME = (0.9e-3, 0.15e-9)
 """Time of a view in a bake of many worlds on an H100 with 16 cores: fixed part [s] and part per pixel [s/px] (tools/README.md)."""
 
+SETTLE_TIME = 13e-3
+"""Time of a pile in 512 worlds that settle: 52 ticks, as 24 piles took on average, of 33 steps, 130,700 a second (tools/README.md) [s]."""
+
 
 @dataclass(frozen=True)
 class Forecast:
@@ -117,18 +120,20 @@ def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> 
     formats = [find_format(name) for name in config.bake.formats]
     view, tick = sum(each.view_bytes for each in formats), sum(each.frame_bytes for each in formats)
     size = frames * (tick + view * sum(share * (pixels / FULL_HD) ** SIZE_EXPONENT for share, pixels in cameras))
-    seconds = frames * sum(share * (VIEW_TIME[0] + VIEW_TIME[1] * pixels) for share, pixels in cameras)
+    seconds = SETTLE_TIME * len(episodes) if config.rig.still else 0.0
+    seconds += frames * sum(share * (VIEW_TIME[0] + VIEW_TIME[1] * pixels) for share, pixels in cameras)
     return Forecast(len(episodes), frames, round(frames * sum(share for share, _ in cameras)), round(size), seconds)
 
 
 def predict_length(config: Config, catalog: Catalog, episodes: Sequence[int]) -> float:
-    """Mean number of frames of episodes, by their modes and objects; 0 of none. Those of mode move follow speed and rounds."""
+    """Mean number of frames of episodes, by their modes and objects; 0 of none. Those of mode move follow speed and rounds; a still has
+    one."""
     if not len(episodes):
         return 0.0
     modes, objects = sample_episodes_ahead(config, catalog, np.asarray(episodes, np.int32), pick_device(config.bake.device))
     stirring = config.move.rounds / Move().rounds * Move().speed / config.move.speed
     frames = predict_frames(modes, objects) * np.where(modes == Mode.MOVE, stirring, 1.0)
-    return float(frames.mean()) * Physics().tick_time / config.physics.tick_time
+    return float(frames.mean()) * (1.0 if config.rig.still else Physics().tick_time / config.physics.tick_time)
 
 
 def forecast_settings(config: Config, episodes: Sequence[int], progress: Progress) -> Forecast:

@@ -194,6 +194,8 @@ class ModeData:
     """Probability of PICK or TARGET."""
     cycle: int
     """Period of a round robin [episodes], in which evenly spaced numbers, instead of random ones, choose the modes; 0: random."""
+    still: int
+    """1: all episodes are STILL."""
 
 
 @wp.struct

@@ -166,8 +166,7 @@ def _slots_of_trials(drawn: np.ndarray, compound: np.ndarray, shortfall: float) 
 
 def find_repeat_rules(bake: Bake, pick: Pick, move: Move) -> set[bool]:
     """Whether episodes may contain several instances of an object: the values in all modes that the bake's episodes can have."""
-    rules = {"pick": pick.repeats, "target": pick.repeats, "move": move.repeats}
-    return {rules[mode] for mode, weight in mode_weights(bake).items() if weight > 0.0}
+    return {move.repeats if mode == "move" else pick.repeats for mode, weight in mode_weights(bake).items() if weight > 0.0}
 
 
 def _draw_trials(volume: np.ndarray, budget: float | np.float32, rule: Arrangement, repeats: bool) -> np.ndarray:

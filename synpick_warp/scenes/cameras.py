@@ -144,6 +144,12 @@ class EpisodeCameras:
 
     def _drawn(self, episode: int, index: int) -> Camera:
         camera, jitter = self.cameras[index], self.rig.rows[index].jitter
+        if self.rig.dome:
+            key = stream_key(self._seed, episode, 0, Stream.DOME, index)
+            pose = self.rig.dome.pose([uniform(key, sample) for sample in range(7)])
+            at, *view = (np.array(vector) for vector in (pose.position, pose.look_at, pose.up))
+            rotation = _look_at(self.rig.label(index), at, *view)
+            camera = replace(camera, rotation=rotation, translation=-dot(rotation, at))
         if jitter is None:
             return camera
         position, rotation, focal_length, center = draw_jitter(jitter, self._seed, episode, index)

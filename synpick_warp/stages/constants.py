@@ -170,21 +170,21 @@ def _cylinder(entry: CatalogEntry) -> tuple[float, float, float]:
     return float(np.linalg.norm(points[:, :2], axis=1).max()), float(points[:, 2].min()), float(points[:, 2].max())
 
 
-def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) -> wp.array:
+def mode_data(rows: Sequence[tuple[int, float, float, int, int]], device: wp.Device) -> wp.array:
     """Array of `ModeData` from the values of its members, in order."""
     names = structs.ModeData.vars
     return wp.array([fill(structs.ModeData, **dict(zip(names, row, strict=True))) for row in rows], dtype=structs.ModeData, device=device)
 
 
-def mode_rows(bake: schema.Bake, splits: Sequence[schema.Split]) -> list[tuple[int, float, float, int]]:
+def mode_rows(bake: schema.Bake, splits: Sequence[schema.Split]) -> list[tuple[int, float, float, int, int]]:
     """Members of `ModeData` of each split, or of the one range without splits."""
     ranges = [(split.first, split.mode) for split in splits] or [(0, bake.mode)]
     rows = []
     for first, mode in ranges:
         weights = mode_weights(bake, mode)
-        pick, target, move = weights["pick"], weights["target"], weights["move"]
-        total = pick + target + move
-        rows.append((first, pick / total, (pick + target) / total, len(schema.MODES) if mode == schema.CYCLE else 0))
+        pick, target, total = weights["pick"], weights["target"], sum(weights.values())
+        period = len(schema.MODES) if mode == schema.CYCLE else 0
+        rows.append((first, pick / total, (pick + target) / total, period, int(mode == schema.STILL)))
     return rows
 
 

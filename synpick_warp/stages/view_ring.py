@@ -78,9 +78,10 @@ ViewExtrinsics = tuple[dict[str, Any], Mapping[str, Any]]
 
 
 def history_count(rig: Rig, worlds: int, group: int = 0) -> int:
-    """Number of light histories of a group of cameras, one a world and camera; 0: none is averaged, as cameras move or leave frames out."""
+    """Number of light histories of a group of cameras, one a world and camera; 0: none is averaged, as cameras move or leave frames out, or
+    episodes have one frame."""
     cameras = rig.groups[group]
-    return 0 if rig.moves(cameras[0]) or rig.every[cameras[0]] > 1 else worlds * len(cameras)
+    return 0 if rig.still or rig.moves(cameras[0]) or rig.every[cameras[0]] > 1 else worlds * len(cameras)
 
 
 @dataclass(frozen=True, eq=False)

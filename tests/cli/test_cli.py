@@ -110,7 +110,7 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
         (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of PLY, OBJ, glTF"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
-        (["--config", "smook"], 'there is no preset "smook"; presets: full-bin, randomized, smoke, synpick, synpick-hard, '),
+        (["--config", "smook"], 'there is no preset "smook"; presets: full-bin, randomized, smoke, stills, synpick, synpick-hard, '),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
         (["extra"], '"extra" is neither an option nor the value of one; see synpick-warp bake --help'),
         (["--shard", "-1/4"], "--shard has no value; if -1/4 is one, write --shard=-1/4"),
@@ -242,7 +242,7 @@ def test_help_shows_units_and_defaults(capsys):
     assert "default 1920x1080 px; cameras.resolution" in text
     assert "A GPU simulates at least 8. auto is 0. (at least 0, at most 65536; default 0; bake.worlds)" in text
     assert "Weights of mixed: --set bake.mix=[pick, target, move]" in text
-    assert "(pick, target, move, mixed, cycle; default pick; bake.mode)" in text
+    assert "(pick, target, move, mixed, cycle, still; default pick; bake.mode)" in text
 
 
 def test_config_prints_what_it_would_use(capsys):

@@ -121,7 +121,7 @@ class KernelWorlds:
             self._catalog(),
             fill(structs.DropData, **(DROP | {"objects": self.instances} | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
-            mode_data([(0, 0.0, 0.0, 0)], self.device),
+            mode_data([(0, 0.0, 0.0, 0, 0)], self.device),
             fill(structs.MoveData, **move),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
@@ -254,5 +254,5 @@ def arrangement_worlds(device: Any, worlds: int, mix: tuple[float, float, float]
     }
     result = KernelWorlds(device, worlds, **(default | sizes))
     shares = (np.cumsum(mix)[:2] / np.sum(mix)).tolist()
-    result.scene = replace(result.scene, modes=mode_data([(0, *shares, 0)], device))
+    result.scene = replace(result.scene, modes=mode_data([(0, *shares, 0, 0)], device))
     return result

@@ -99,7 +99,7 @@ class Truth:
     camera: np.ndarray
     """Index of the camera (N,) int64."""
     mode: np.ndarray
-    """Mode of the episode (N,) str: pick, target or move."""
+    """Mode of the episode (N,) str: pick, target, move or still."""
     speed: np.ndarray
     """Speed of the object's origin (N,) float64 [m/s], from the frame before, in an instance's first frame from the next one; NaN: the
     instance is in a single frame only."""

@@ -128,11 +128,11 @@ def _without_attempt(figures: Figures) -> Rule:
 def _endings(figures: Figures) -> Rule:
     endings = figures.statistics.total.episodes.endings
     given_up = endings.get(Ending.GAVE_UP.name.lower(), 0)
-    picking = sum(group.episodes.episodes for group in figures.statistics.groups if group.mode != "move")
+    picking = sum(group.episodes.episodes for group in figures.statistics.groups if group.mode in ("pick", "target"))
     if picking >= MIN_EPISODES and given_up / picking >= GIVEN_UP_SHARE:
         title = f"{given_up / picking:.0%} of the picking episodes were given up"
         yield WARNING, title, f"{given_up:,} of {picking:,}: {Ending.GAVE_UP.sentence}. Their bins are not empty at the end."
-    short = [index for index, row in figures.episodes.rows.items() if row.frames <= 1]
+    short = [index for index, row in figures.episodes.rows.items() if row.frames <= (row.mode != "still")]
     if short:
         yield WARNING, f"{_number(len(short), 'episode')} of one frame or none", f"Episodes {_listed(map(str, short))}."
 

@@ -76,7 +76,7 @@ class GroupStatistics:
     split: str
     """Name of the split; empty: all."""
     mode: str
-    """pick, target or move; empty: all."""
+    """pick, target, move or still; empty: all."""
     episodes: EpisodeFigures
     annotations: Annotations
     objects_over_time: tuple[TimePoint, ...]

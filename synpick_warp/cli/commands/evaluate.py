@@ -289,7 +289,7 @@ def estimate(
     targets: Annotated[
         Path | None, Parameter(help="Images and objects to estimate, as in BOP's test_targets_bop19.json; instead of --every.")
     ] = None,
-    modes: Annotated[str | None, Parameter(help="Only episodes of these modes: pick, target, move; joined by commas.")] = None,
+    modes: Annotated[str | None, Parameter(help="Only episodes of these modes: pick, target, move, still; joined by commas.")] = None,
     cameras: Annotated[str | None, Parameter(help="Only these cameras, such as 0,2.")] = None,
     episodes: Annotated[str | None, Parameter(help="Only these episodes, such as 0-9,12.")] = None,
     split: EpisodesOfOption = None,

@@ -4,7 +4,7 @@ camera effects on colour images, a depth camera, and the rig of all of them. Of 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -31,6 +31,8 @@ OPENCV, OPENGL = "opencv", "opengl"
 COLOR, DEPTH, MASKS = "color", "depth", "masks"
 MODALITIES = (COLOR, DEPTH, MASKS, *LAYER_TABLE)
 """Image modalities that a camera may export."""
+DECIMALS = 12
+"""Decimal places of sines and cosines, whose last bits depend on the processor's C library; see `system.linear_algebra`."""
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,39 @@ class CameraRow:
 
 
 @dataclass(frozen=True)
+class Still:
+    """Mode still: views of a pile at rest, each from a random place on a dome over it, which every episode draws anew. Not in the paper."""
+
+    views: Annotated[int, "[0, 64]"] = setting(
+        6, "Views of a pile, each a camera with intrinsics, lens, modalities and jitter of the first one; 0: the cameras stay as they are."
+    )
+    target: Annotated[Vector, "[-100, 100] m"] = setting((0.0, 0.0, 0.05), "Look-at point of all views, in the tote's frame.")
+    target_spread: Annotated[float, "[0, 10] m"] = setting(0.05, "Half width of the look-at point's random offset along each axis.")
+    distance: Annotated[tuple[float, float], "(0, 100] m"] = setting(
+        (1.6, 2.2), "Minimum and maximum distance to the look-at point, uniform between."
+    )
+    elevation: Annotated[tuple[float, float], "[0, 90] °"] = setting(
+        (30.0, 90.0), "Minimum and maximum elevation, uniform by area of the dome; the azimuth is free."
+    )
+    roll: Annotated[float, "[0, 180] °"] = setting(
+        45.0, "Half width of the random rotation about the optical axis (BlenderProc's script of BOP's train_pbr)."
+    )
+
+    def pose(self, samples: Sequence[float]) -> Pose:
+        """Pose by seven samples in [0, 1]: of distance, elevation, azimuth, roll and look-at point."""
+        distance, height, azimuth, roll, *offset = samples
+        (_, low), (_, high) = map(_direction, self.elevation)
+        (x, y), (c, s) = _direction(360.0 * azimuth), _direction(self.roll * (2.0 * roll - 1.0))
+        up = low + (high - low) * height
+        out = math.sqrt(1.0 - up * up)
+        target = [middle + self.target_spread * (2.0 * part - 1.0) for middle, part in zip(self.target, offset, strict=True)]
+        away = self.distance[0] + (self.distance[1] - self.distance[0]) * distance
+        at = [middle + away * part for middle, part in zip(target, (out * x, out * y, up), strict=True)]
+        vectors = {"position": at, "look_at": target, "up": (-c * up * x - s * y, -c * up * y + s * x, c * out)}
+        return replace(Pose(), **{name: tuple(vector) for name, vector in vectors.items()})
+
+
+@dataclass(frozen=True)
 class Effects:
     """Camera effects on colour images, all off by default. Each view draws its parameters uniformly from these ranges (minimum, maximum; 0,
     0: off), and they are recorded. Not in the paper.
@@ -158,6 +193,12 @@ class Effects:
     saturation: Annotated[tuple[float, float], "[-1, 4]"] = setting(
         (0.0, 0.0), "Relative change of the difference of sRGB values to their luma; -1: grey."
     )
+
+
+def _direction(angle: float) -> tuple[float, float]:
+    """Cosine and sine of an angle [°]."""
+    turn = math.radians(angle)
+    return round(math.cos(turn), DECIMALS), round(math.sin(turn), DECIMALS)
 
 
 def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
@@ -232,9 +273,11 @@ class Rig:
     """With name and resolution."""
     is_listed: bool
     """Whether they come from [[camera]] tables."""
+    still: Still | None = None
+    """Of mode still: how views are drawn; the poses of the rows are amid them."""
 
     @classmethod
-    def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = (), rectified: bool = False) -> Rig:
+    def of(cls, cameras: Cameras, rows: tuple[CameraRow, ...] = (), rectified: bool = False, still: Still | None = None) -> Rig:
         """Rig of [[camera]] tables, or without any of the section; `rectified`: pinholes of the same matrices, without distortion. Raises
         ConfigError: the section has no position, or another number of up vectors."""
         listed = bool(rows)
@@ -246,9 +289,12 @@ class Rig:
                 raise ConfigError(f"cameras.positions has {counts}; each camera needs one of both")
             pairs = zip(cameras.positions, cameras.ups, strict=True)
             rows = tuple(CameraRow(fov=cameras.fov, pose=Pose(position=at, look_at=cameras.target, up=up)) for at, up in pairs)
+        if still and still.views:
+            poses = (still.pose((1.0, 0.5, index / still.views, 0.5, 0.5, 0.5, 0.5)) for index in range(still.views))
+            rows = tuple(replace(rows[0], name="", pose=pose) for pose in poses)
         named = (replace(row, name=row.name or f"camera_{index}", pose=in_opencv_axes(row.pose)) for index, row in enumerate(rows))
         sized = (replace(row, resolution=row.resolution or cameras.resolution) for row in named)
-        return cls(tuple(scaled(replace(row, distortion=None, model=None) if rectified else row) for row in sized), listed)
+        return cls(tuple(scaled(replace(row, distortion=None, model=None) if rectified else row) for row in sized), listed, still)
 
     def __len__(self) -> int:
         """Number of cameras."""
@@ -283,6 +329,11 @@ class Rig:
         """Frames from one picture of each camera to the next."""
         return tuple(row.every or 1 for row in self.rows)
 
+    @property
+    def dome(self) -> Still | None:
+        """Dome on which each episode draws the cameras' poses; None: there is none."""
+        return self.still if self.still and self.still.views else None
+
     def writes(self, index: int, modality: str) -> bool:
         """Whether there are files of a camera's images of this kind, one of MODALITIES, if the settings have such at all."""
         chosen = self.rows[index].modalities
@@ -294,7 +345,7 @@ class Rig:
 
     def is_placed(self, index: int) -> bool:
         """Whether a camera's matrix and pose are not the same in all views."""
-        return self.rows[index].jitter is not None or self.moves(index)
+        return bool(self.dome) or self.rows[index].jitter is not None or self.moves(index)
 
     def draws_lens(self, index: int) -> bool:
         """Whether a camera has lens distortion and intrinsics that are randomized per episode, so that the rays of its pixels change."""
@@ -322,7 +373,7 @@ class Rig:
 
     def key(self, index: int, name: str, section: str = "") -> str:
         """Full key of a camera's setting `name` for messages; `section`: its name in [cameras], if that differs."""
-        return f"camera[{index}].{name}" if self.is_listed else f"cameras.{section or name}"
+        return f"camera[{0 if self.dome else index}].{name}" if self.is_listed else f"cameras.{section or name}"
 
     def label(self, index: int) -> str:
         """Name of a camera for messages, such as "camera 0"."""

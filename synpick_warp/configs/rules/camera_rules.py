@@ -22,6 +22,7 @@ from synpick_warp.configs.cell.cameras import (
     Jitter,
     Pose,
     Rig,
+    Still,
     intrinsics,
     inverted,
     lens_map,
@@ -47,6 +48,8 @@ ASPECT = 2.0
 """Largest ratio of fx and fy: sensors that bin pixels in one direction reach it."""
 FOCAL_LENGTHS = (1 / (2 * math.tan(math.radians(85.0))), 1 / (2 * math.tan(math.radians(0.5))))
 """Least and largest focal length in widths of the image: those of fov."""
+DOME_STEPS = 8
+"""Steps of the azimuth at which places on a dome are checked."""
 STEPS = 4
 """Steps of positions within their jitter that are checked."""
 NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
@@ -68,7 +71,7 @@ def find_camera_conflicts(config: Config) -> Iterator[Conflict]:
     rig = config.rig
     for layer in config.render.layers:
         LAYER_TABLE[layer]  # Raises ConfigError if it is of a package that is broken.
-    for index in range(len(rig)):
+    for index in range(1 if rig.dome else len(rig)):
         yield from _view(rig, index, config)
     yield from _perception(config.perception.camera, rig, may_pick(config.bake, config.splits))
     if SENSOR_LAYERS.intersection(config.render.layers):
@@ -152,11 +155,24 @@ def _view(rig: Rig, index: int, config: Config) -> Iterator[Conflict]:
     placement = partial(_placement, label=label, bins=bins, shift=config.bins.shift)
     if rig.moves(index):
         placement = partial(_mounting, label=label, gripper=config.gripper)
-    for place, rule in placement(row, keys):
+    if rig.still and rig.moves(index):
+        yield rig.key(index, "fixed_to"), "world in mode still, in which the gripper is away"
+    elif rig.dome:
+        yield from _dome(row, rig.dome, placement)
+    for place, rule in () if rig.dome else placement(row, keys):
         axes = config.camera[index].pose.axes if config.camera else None
         yield place, rule + _other_pose(row.pose, lambda pose: not list(placement(replace(row, pose=pose), keys)), bins[0].noun, axes)
     if row.jitter is not None:
         yield from _jitter(rig.key(index, "jitter"), row, row.jitter, placement)
+
+
+def _dome(row: CameraRow, dome: Still, placement: Callable[..., Iterator[Conflict]]) -> Iterator[Conflict]:
+    """Yield the first place of a dome, at the ends of its ranges, at which a camera would not be allowed by `placement`."""
+    ends, turns = (0.0, 1.0), [step / DOME_STEPS for step in range(DOME_STEPS)]
+    for samples in itertools.product(ends, ends, turns, (0.5,), ends, ends, ends):
+        for key, rule in placement(replace(row, pose=dome.pose(samples)), ("still.distance", "still.roll", "still.target")):
+            yield key, f"a dome, with elevation and target_spread, whose cameras have {rule}"
+            return
 
 
 def _other_pose(pose: Pose, fits: Callable[[Pose], bool], noun: str, axes: str | None) -> str:

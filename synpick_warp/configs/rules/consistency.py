@@ -14,7 +14,7 @@ from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects
 from synpick_warp.configs.fields import Conflict
 from synpick_warp.configs.rules.camera_rules import find_camera_conflicts
-from synpick_warp.configs.schema import FORMATS, MIXED, Bake, Bop, Config, Move, Physics, Pick, Settle, Split
+from synpick_warp.configs.schema import FORMATS, MIXED, STILL, Bake, Bop, Config, Move, Physics, Pick, Settle, Split
 from synpick_warp.errors import format_value
 
 _NAME = re.compile(r"(?!(tote|table|pallet)$)[a-z0-9_]{1,32}")
@@ -76,6 +76,10 @@ def _modes(bake: Bake, splits: Sequence[Split]) -> Iterator[Conflict]:
     """Yield conflicts of modes and formats."""
     if MIXED in bake_modes(bake, splits) and not any(bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
+    if STILL in bake_modes(bake, splits):
+        yield from ((f"splits.{split.name}.mode", "still in all splits or in none") for split in splits if split.mode != STILL)
+        if "lerobot" in bake.formats:
+            yield "bake.formats", "without lerobot in mode still, as one frame is no video"
     if not bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
     if PICKS in bake.formats and not may_pick(bake, splits):
@@ -160,10 +164,10 @@ def _pictures(config: Config) -> Iterator[Conflict]:
     layers, color_format = config.render.layers, config.bop.color_format
     if len(set(layers)) < len(layers):
         yield "render.layers", f"each layer once: {format_value(list(dict.fromkeys(layers)))}"
-    for name, section in (("effects", config.effects), ("depth_sensor", config.depth_sensor)):
+    for name, section in (("effects", config.effects), ("depth_sensor", config.depth_sensor), ("still", config.still)):
         for item in dataclasses.fields(section):
             value = getattr(section, item.name)
-            if isinstance(value, tuple) and value[0] > value[1]:
+            if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
                 yield f"{name}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
     low, high = config.effects.jpeg_quality
     if high and not low:

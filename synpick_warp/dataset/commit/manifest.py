@@ -29,6 +29,7 @@ import msgspec
 
 from synpick_warp._version import __version__
 from synpick_warp.configs.cell.bins import Bins
+from synpick_warp.configs.cell.cameras import Still
 from synpick_warp.configs.cell.gripper import EACH, SUCTION1
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.episodes.manipulation import MASK, SAME, Picks
@@ -98,6 +99,7 @@ _YOUNGER: dict[str, dict[str, Any]] = {
     | {name: getattr(Objects(), name) for name in ("embedded", "mass_volume", "symmetries", "symmetry_tolerance")},
     "bins": {item.name: item.default for item in dataclasses.fields(Bins)},
     "picks": {item.name: item.default for item in dataclasses.fields(Picks)},
+    "still": {item.name: item.default for item in dataclasses.fields(Still)},
     "randomize": given_values(Randomize()),
 }
 YOUNGER_SETTINGS: dict[str, Any] = {f"{section}.{name}": value for section, table in _YOUNGER.items() for name, value in table.items()}

@@ -70,7 +70,8 @@ def sample_modes_kernel(
     # State:
     state_inout: Worlds,
 ):
-    """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
+    """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes; all
+    may be STILL instead.
 
     The fractions are those of the episode's split; splits are sorted by first episode. u is the first sample of the stream (seed, episode,
     0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a round robin of n episodes, episode i of the split has
@@ -88,7 +89,9 @@ def sample_modes_kernel(
     u = uniform(stream_key(seed, episode, 0, Stream.MODE), 0)
     if mode.cycle > 0:
         u = (float((episode - mode.first) % mode.cycle) + 0.5) / float(mode.cycle)
-    if u < mode.pick_share:
+    if mode.still == 1:
+        state_inout.mode[world] = Mode.STILL
+    elif u < mode.pick_share:
         state_inout.mode[world] = Mode.PICK
     elif u < mode.pick_or_target_share:
         state_inout.mode[world] = Mode.TARGET

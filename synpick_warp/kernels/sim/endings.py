@@ -17,7 +17,7 @@ def delivers(ending: int) -> bool:
 
 @wp.kernel
 def judge_tasks_kernel(layout: LayoutData, catalog: CatalogData, move: MoveData, pick: PickData, state_inout: Worlds, attempts: Attempts):
-    """Write the `Ending` of episodes that complete: all waypoints reached, no object with label left, or too many failed attempts.
+    """Write the `Ending` of episodes that complete: all waypoints reached, no object with label left, too many failed attempts, or STILL.
 
     Launched over world.
     """
@@ -27,6 +27,9 @@ def judge_tasks_kernel(layout: LayoutData, catalog: CatalogData, move: MoveData,
     if state_inout.mode[world] == Mode.MOVE:
         if state_inout.waypoint[world] >= move.waypoints:
             state_inout.ending[world] = Ending.FINISHED
+        return
+    if state_inout.mode[world] == Mode.STILL:
+        state_inout.ending[world] = Ending.FINISHED
         return
     if attempts.task[world] != Task.LOOK:
         return
