@@ -224,7 +224,7 @@ def make_env(
         task: "pick": any object; "target": the one that the observation names; "move": stir the bin.
         num_envs: Number of environments.
         device: Overrides `bake.device`.
-        obs: Contents of the observation, a dict: of depth, rgb, instances, normals, state.
+        obs: Contents of the observation, a dict: of depth, rgb, instances, normals, points, state.
         resolution: Width and height of images, of `perception.camera` or the first camera [px].
         action: "pixel" or "point": a whole pick; "twist": a tick. None: "pixel", of task "move" "twist".
         autoreset: "next_step", "same_step" or "disabled", as Gymnasium defines them.

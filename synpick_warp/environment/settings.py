@@ -22,6 +22,7 @@ OBSERVATIONS: Mapping[str, str] = {
     "rgb": "color",
     "instances": "segment",
     "normals": "normal",
+    "points": "cloud",
     "state": "state",
     "target_mask": "mask",
     "target_point": "point",
@@ -29,7 +30,7 @@ OBSERVATIONS: Mapping[str, str] = {
 """Name of an observation -> field of `SightArrays`."""
 TARGETS = ("target_mask", "target_point")
 """Observations of task TARGET, which are always added to it (the mask only if other images are observed), and which others lack."""
-IMAGES = ("depth", "rgb", "instances", "normals", "target_mask")
+IMAGES = ("depth", "rgb", "instances", "normals", "points", "target_mask")
 MAX_STEPS: Mapping[str, int] = {PIXEL: 30, POINT: 30, TWIST: 600}
 """Steps after which an episode is truncated, by action: attempts, or ticks (40 s)."""
 RESAMPLES = 1000

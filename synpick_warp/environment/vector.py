@@ -71,6 +71,7 @@ def observation_space(choice: EnvironmentChoice, environment: PickingEnvironment
         "rgb": (0, 255, (height, width, 3), np.uint8),
         "instances": (0, int(Segment.CUP), (height, width), np.uint8),
         "normals": (-np.inf, np.inf, (height, width, 3), np.float32),
+        "points": (-np.inf, np.inf, (height, width, 3), np.float32),
         "target_mask": (0, 1, (height, width), np.uint8),
         "target_point": (-np.inf, np.inf, (3,), np.float32),
     }

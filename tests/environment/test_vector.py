@@ -11,7 +11,7 @@ from synpick_warp.environment.make import make_picking
 from synpick_warp.environment.settings import action_bounds, fixed_settings, make_choice
 from synpick_warp.errors import ActionError, ConfigError
 from synpick_warp.stages.render.sampling_rates import accumulates
-from tests.environment.conftest import ARGUMENTS, SIZE, build, same
+from tests.environment.conftest import ARGUMENTS, SETTINGS, SIZE, build, same
 
 needs_gymnasium = pytest.mark.skipif(importlib.util.find_spec("gymnasium") is None, reason="Gymnasium is not installed")
 
@@ -34,6 +34,19 @@ def test_a_target_is_named_by_mask_and_point(target):
         assert ((instances == number) == (mask == 1)).all()
     np.testing.assert_allclose(np.linalg.norm(obs["normals"], axis=-1), 1.0, atol=1e-5)
     assert obs["rgb"].std() > 1.0
+
+
+def test_points_are_depth_along_the_rays_of_pixel_centres(device):
+    """And not a number beside the bin, where no table is."""
+    choice = make_choice(**ARGUMENTS | {"obs": ("points",)})
+    environment = make_picking(choice, "smoke", SETTINGS | {"render.table": False}, str(device))
+    points, sight = environment.reset(seed=3)[0]["points"], environment.worlds.sight
+    depth, (fx, fy, cx, cy) = sight.arrays.depth.numpy()[:2], sight.images.views.cameras.intrinsics.numpy()[0]
+    x, y = (np.arange(SIZE[0]) + 0.5 - cx) / fx, (np.arange(SIZE[1])[:, None] + 0.5 - cy) / fy
+    rays = np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
+    assert (points.shape, points.dtype) == ((2, *SIZE[::-1], 3), np.float32)
+    np.testing.assert_allclose(points, np.where(depth > 0, depth, np.nan)[..., None] * rays, atol=1e-6)
+    assert 0.1 < np.isnan(points).mean() < 0.9
 
 
 def test_the_point_of_the_target_picks_it(target):

@@ -32,8 +32,10 @@ def copy_images_kernel(
     depth_out: wp.array3d[float],  # (world, row, column) [m]
     segment_out: wp.array3d[wp.uint8],  # (world, row, column)
     normal_out: wp.array3d[wp.vec3],  # (world, row, column)
+    cloud_out: wp.array3d[wp.vec3],  # (world, row, column) [m]; or empty
 ):
-    """Copy the G-buffer to the worlds' images: planar depth (0: no surface), segmentation id, unit shading normal (up where no mesh is).
+    """Copy the G-buffer to the worlds' images: planar depth (0: no surface), segmentation id, unit shading normal (up where no mesh is),
+    and the surface points in the camera's axes (NaN: no surface).
 
     Launched over view, pixel (tile order, from flat index `first` on).
     """
@@ -48,9 +50,12 @@ def copy_images_kernel(
     if segment != Segment.NOTHING:
         depth = gbuffer.depth[view, row, column]
     depth_out[world, row, column] = depth
+    axis = camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    if cloud_out.shape[0] > 0:
+        cloud_out[world, row, column] = wp.where(segment == Segment.NOTHING, wp.nan, depth) * axis
     normal = wp.vec3(0.0, 0.0, 1.0)
     if segment != Segment.NOTHING and segment != Segment.TABLE:
-        ray = views.cameras.to_world[view] * camera_ray(views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+        ray = views.cameras.to_world[view] * axis
         triangle = gbuffer.triangle[view, row, column]
         barycentric = gbuffer.barycentric[view, row, column]
         body = body_of(segment, views.instances)

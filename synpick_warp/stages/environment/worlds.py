@@ -42,6 +42,8 @@ class SightArrays:
     """Segmentation id: 0 nothing, 1 + instance_id, or a `Segment`."""
     normal: wp.array = device_array("world", "row", "column", dtype=wp.vec3)
     """Unit shading normal in the world's frame, facing the camera."""
+    cloud: wp.array = device_array("world", "row", "column", dtype=wp.vec3, unit="m")
+    """Surface point in the camera's axes; NaN: no surface."""
     color: wp.array = device_array("world", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
     mask: wp.array = device_array("world", "row", "column", dtype=wp.uint8)
@@ -52,7 +54,7 @@ class SightArrays:
     """State vector of gripper and instances; see `write_states_kernel`."""
 
 
-IMAGES = {"depth", "segment", "normal", "mask"}
+IMAGES = {"depth", "segment", "normal", "mask", "cloud"}
 """Arrays that follow from the G-buffer, without shading."""
 
 
@@ -78,7 +80,7 @@ class Sight:
         worlds, instances = simulation.layout.worlds, simulation.layout.instances
         values = int(observations.GRIPPER_VALUES) + instances * int(observations.INSTANCE_VALUES)
         sizes = {"world": worlds, "row": height, "column": width, "value": values}
-        only = {*wanted, *(IMAGES - {"mask"} if IMAGES & set(wanted) else ())}
+        only = {*wanted, *(IMAGES - {"mask", "cloud"} if IMAGES & set(wanted) else ())}
         self.arrays = allocate(SightArrays, sizes, self.device, only)
         self.images: PerceptionImages | None = None
         if IMAGES & only:
@@ -128,7 +130,8 @@ class Sight:
         images.views.world.assign(padded)
         images.render(snapshot)
         inputs = [images.scene.meshes, images.scene.surfaces, images.scene.grid, images.bodies, images.gbuffer, images.views]
-        launch_pixels(observations.copy_images_kernel, images.pixels, inputs, [arrays.depth, arrays.segment, arrays.normal], self.device)
+        outputs = [arrays.depth, arrays.segment, arrays.normal, arrays.cloud]
+        launch_pixels(observations.copy_images_kernel, images.pixels, inputs, outputs, self.device)
 
     def _render(self, snapshot: Snapshot, worlds: np.ndarray) -> None:
         renderer = self.renderer
