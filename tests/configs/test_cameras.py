@@ -62,6 +62,15 @@ def test_tables_are_written_and_read(tmp_path, comments):
     assert "[[camera]]" not in config_to_toml(load_config("smoke"))
 
 
+def test_tables_on_a_preset_with_cameras_of_its_own_are_read_back(tmp_path):
+    """What the preset sets of [cameras] has no effect, so that a data set's config.toml, which lacks it, is that of its manifest."""
+    (tmp_path / "cell.toml").write_text(f'preset = "tabletop"\n{TOP}')
+    config = load_config(tmp_path / "cell.toml")
+    (tmp_path / "again.toml").write_text(config_to_toml(config))
+    assert load_config(tmp_path / "again.toml") == config
+    assert (config.cameras.resolution, config.rig.sizes) == ((1280, 720), ((1280, 720),))
+
+
 def test_poses_of_all_forms_look_the_same_way(tmp_path):
     forms = (
         f"matrix = {DOWN}",

@@ -327,6 +327,9 @@ def _build(values: Values, override: str) -> Config:
     }
     parts |= {name: values[name][0] for name in table_lists() if name in values}
     _check_sole_cameras(values, override)
+    if parts.get(CAMERA):
+        # As in config.toml: what else a preset sets of [cameras] is of no effect beside [[camera]] tables.
+        parts[CAMERAS] = Cameras(resolution=parts[CAMERAS].resolution)
     return Config(**parts, splits=splits)
 
 
