@@ -141,13 +141,16 @@ def describe_error(error: BaseException) -> str:
 
 
 @contextmanager
-def reading_as(kind: str, path: Path) -> Iterator[None]:
-    """Convert any exception of a reader to a `CatalogError`: damaged files can raise nearly every type."""
+def reading_as(kind: str, path: Path, data: bytes = b"") -> Iterator[None]:
+    """Convert any exception of a reader to a `CatalogError`: damaged files can raise nearly every type. `data`: content of the file if it
+    may be text, whose numbers may have decimal commas, as written under some locales."""
     try:
         yield
     except CatalogError:
         raise
     except Exception as error:
+        if (match := _COMMA.search(decode_text(data))) is not None:
+            raise CatalogError(f"{path}: its numbers have decimal commas, such as {match[1][:40]}; export it with decimal points") from None
         raise CatalogError(f"{path}: not readable as {kind} ({describe_error(error)})") from error
 
 
@@ -249,12 +252,6 @@ def _match_case(folder: Path, names: Sequence[str]) -> Path | None:
                 return None
         path = path / name
     return path
-
-
-def check_decimals(text: str, path: Path) -> None:
-    """Raise CatalogError if the coordinates of an unreadable mesh file have decimal commas, as written under some locales."""
-    if (match := _COMMA.search(text)) is not None:
-        raise CatalogError(f"{path}: its numbers have decimal commas, such as {match[1][:40]}; export it with decimal points")
 
 
 def decode_text(data: bytes) -> str:

@@ -25,7 +25,6 @@ from synpick_warp.scenes.assets.asset_files import (
     MAX_ROWS,
     MAX_TEXT_MESH,
     Notes,
-    check_decimals,
     decode_text,
     ignore,
     quiet_decoding,
@@ -41,60 +40,33 @@ from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
 _HEADER = 84
-_SAMPLE = 4096
+"""Bytes before the triangles of a binary STL file."""
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(r"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 
 
 def read_stl(path: Path, notes: Notes) -> list[MeshPart]:
-    """Read an STL file. Equal corners become one vertex; the triangles' own normals are not used, since they are often wrong. Raises
-    CatalogError: the file cannot be read, or is too large."""
+    """Read an STL file, of all its solids together. Equal corners become one vertex; the triangles' own normals are not used, since they
+    are often wrong. Raises CatalogError: the file cannot be read, or is too large."""
     data = read_file(path, MAX_MESH_FILE, CatalogError)
-    count = int.from_bytes(data[80:_HEADER], "little")
-    # Binary files may begin with "solid" as well, and text with any word: the announced size decides first.
-    exact = len(data) >= _HEADER and len(data) == _HEADER + count * _TRIANGLE.itemsize
-    if exact or (len(data) >= _HEADER and b"\0" in data[:_SAMPLE] and not _VERTEX.search(decode_text(data[:_SAMPLE]))):
-        corners = _binary(data, count, path, notes)
+    count, (held, rest) = int.from_bytes(data[80:_HEADER], "little"), divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
+    # Binary files may begin with "solid" as well, and text with any word.
+    if (count, 0) != (held, rest) and "\0" not in decode_text(data[: _HEADER + _TRIANGLE.itemsize]):
+        if len(data) > MAX_TEXT_MESH:
+            raise CatalogError(f"{path}: too large for a text file; save it as binary STL")
+        with reading_as("STL", path, data):
+            corners = np.array(_VERTEX.findall(decode_text(data)), np.float64).reshape(-1, 3, 3)
+    elif held < count:
+        raise CatalogError(f"{path}: not readable as STL (its header announces {count} triangles, its body holds {max(held, 0)})")
     else:
-        corners = _text(data, path)
-    if not len(corners):
-        raise CatalogError(f"{path}: no triangles; a model needs a surface")
+        if held > count or rest:  # Programs that write triangles as they come leave the number in the header at 0.
+            announced, count = count, count if count and rest else held
+            notes.said.append(f"its header announces {announced} triangles, its body holds {held}: {count} are read")
+        triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
+        notes.ignored += ["colours or other attributes of triangles"] if np.any(triangles["attribute"]) else []
+        corners = triangles["corners"].astype(np.float64)
     vertices, index = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     return [MeshPart(vertices, index.reshape(-1, 3).astype(np.int64), None, None, None, NO_MATERIAL)]
-
-
-def _binary(data: bytes, count: int, path: Path, notes: Notes) -> np.ndarray:
-    """Triangle corners (F, 3, 3) float64 of a binary STL file: as many as its body holds, unless other bytes follow those announced.
-
-    Programs that write triangles as they come leave the number in the header at 0.
-    """
-    held, rest = divmod(len(data) - _HEADER, _TRIANGLE.itemsize)
-    if max(count, held) > MAX_ROWS:
-        raise CatalogError(f"{path}: announces {count} triangles, holds {held}; allowed: at most {MAX_ROWS}; decimate the mesh")
-    if held < count:
-        raise CatalogError(f"{path}: not readable as STL (its header announces {count} triangles, its body holds {held}); it is cut short")
-    if held > count or rest:
-        announced, count = count, count if count and rest else held
-        notes.said.append(f"its header announces {announced} triangles, its body holds {held}: {count} are read")
-    triangles = np.frombuffer(data, _TRIANGLE, count, _HEADER)
-    if np.any(triangles["attribute"]):
-        notes.ignored.append("colours or other attributes of triangles")
-    return triangles["corners"].astype(np.float64)
-
-
-def _text(data: bytes, path: Path) -> np.ndarray:
-    """Triangle corners (F, 3, 3) float64 of a text STL file, of all its solids together."""
-    if len(data) > MAX_TEXT_MESH:
-        raise CatalogError(f"{path}: too large for a text file; save it as binary STL")
-    text = decode_text(data)
-    if text.count("vertex") + text.count("VERTEX") > 3 * MAX_ROWS:
-        raise CatalogError(f"{path}: more than {MAX_ROWS} triangles; decimate the mesh")
-    numbers = _VERTEX.findall(text)
-    try:
-        return np.array(numbers, dtype=np.float64).reshape(-1, 3, 3)
-    except ValueError:
-        check_decimals(text, path)
-        raise CatalogError(f"{path}: not readable as STL (its {len(numbers)} vertices are not three numbers each, three a facet)") from None
 
 
 STEP_SUFFIXES = (".step", ".stp")

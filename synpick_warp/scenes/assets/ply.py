@@ -1,18 +1,14 @@
 """PLY import (Turk, 1994), text and binary, with BOP's texture comments; vertices keep the order of the file.
 
-Rows of text are read by trimesh. Binary ones are read here: trimesh takes all lists of a property for as long as the first, which mixed
-triangles and quads are not.
+The numbers of text are read into the layout of a binary file, so that one reader serves both. trimesh reads neither the lists of mixed
+triangles and quads in binary files, nor notices that rows of text are missing.
 """
 
-import io
 import re
-import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from trimesh.exchange.ply import load_ply
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets import asset_files
@@ -28,34 +24,33 @@ _UV_COLUMNS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 # Property names of colours, sRGB: those of most programs, then older ones.
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _INDICES = ("vertex_indices", "vertex_index")
-_KINDS = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I", "float": "f", "double": "d"}
-_KINDS |= {"int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
-_KINDS |= {"int64": "q", "uint64": "Q", "float16": "e"}
-"""Codes of struct and NumPy by the names of types, also such as are found in files only."""
-_END = re.compile(rb"(?m)^(?:.*[ \t])?end_header(?:[ \t\r].*)?$\n?")
-"""Last line of a header: for trimesh too, the first with that word."""
-_ELEMENT = re.compile(r"element\s+(\S+)\s+([0-9]{1,20})")
-_PROPERTY = re.compile(rf"property\s+(?:list\s+({'|'.join(_KINDS)})\s+)?({'|'.join(_KINDS)})\s+(\S+)")
+_KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4", "double": "f8"}
+_KINDS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"}
+_KINDS |= {"int64": "i8", "uint64": "u8", "float16": "f2"}
+"""NumPy's names of types, also of such as are found in files only."""
+_TEXT = "=f8"
+"""Type of the numbers of a text file."""
+_HEADER = re.compile(rb"ply[ \t\r]*\n(.*?\n)[ \t]*end_header[^\n]*\n?", re.DOTALL)
 
 
 @dataclass(eq=False)
 class _Element:
     """PLY element: number of rows, and types and values of its properties by name."""
 
-    count: int = 0
+    count: int
     kinds: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Type of a property's values, before it that of the lengths if they are lists."""
-    values: dict[str, Any] = field(default_factory=dict)
-    """Columns (count) or (count, 1); of lists (count, length), or an object array of arrays unless all are equally long."""
+    values: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    """Values of all rows, one after another, and the number of each row's values (count,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Header:
-    """Header of a PLY file: elements without values, texture comments, byte order (empty: text), and where the body begins."""
+    """Header of a PLY file: elements without values, texture comments, whether it is text, and where the body begins."""
 
     elements: dict[str, _Element]
     textures: list[str]
-    order: str
+    is_text: bool
     start: int
 
 
@@ -72,7 +67,8 @@ def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
     """Name and content of the texture that a PLY header names in a line `comment TextureFile NAME` (in any case), inside the file's folder;
     None if there is none. Raises MissingFileError: there is no such file; CatalogError: the file cannot be used, or the header is none of
     PLY or names several."""
-    names = _read_header(data, path).textures
+    with asset_files.reading_as("PLY", path):
+        names = _read_header(data, path).textures
     if len(set(names)) > 1:
         raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; keep one")
     return (names[0], asset_files.read_referred(path.parent, names[0], path, MAX_TEXTURE_FILE)[1]) if names else None
@@ -82,7 +78,7 @@ def read_ply(path: Path, notes: asset_files.Notes) -> list[MeshPart]:
     """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it. Raises CatalogError: the file
     cannot be read or has no triangles, or its texture is missing."""
     data = read_ply_file(path)
-    with asset_files.reading_as("PLY", path):
+    with asset_files.reading_as("PLY", path, data if b"\0" not in data else b""):
         part = _ply_part(_read_elements(data, path), path, notes)
     found = notes.image(lambda: read_ply_texture(data, path))
     if found is None:
@@ -100,7 +96,7 @@ def read_ply_vertices(path: Path) -> np.ndarray:
     CatalogError: the file cannot be read, has no vertices, or one that is not finite."""
     data = read_ply_file(path)
     with asset_files.reading_as("PLY", path), asset_files.quiet_decoding():
-        vertices = _columns(_read_elements(data, path).get("vertex", _Element()), ("x", "y", "z"))
+        vertices = _columns(_read_elements(data, path).get("vertex", _Element(0)), ("x", "y", "z"))
     if vertices is None or not len(vertices):
         raise CatalogError(f"{path}: no vertices with x, y and z")
     if not np.isfinite(vertices).all():
@@ -110,113 +106,90 @@ def read_ply_vertices(path: Path) -> np.ndarray:
 
 def _read_header(data: bytes, path: Path) -> _Header:
     """Parse the header. Numbers of rows are limited, since the body of an element without properties has no size."""
-    end = _END.search(data, 0, MAX_HEADER)
-    if end is None:
-        raise CatalogError(f"{path}: not readable as PLY (no header that ends within {MAX_HEADER} bytes)")
-    try:
-        lines = [line.strip() for line in data[: end.start()].decode().split("\n")[:-1]]
-    except UnicodeDecodeError as error:
-        number = data.count(b"\n", 0, error.start) + 1
-        raise CatalogError(f"{path}: not readable as PLY (line {number} of its header is not UTF-8); save it as UTF-8") from None
-    if len(lines) < 2 or lines[0] != "ply":
-        raise CatalogError(f"{path}: not readable as PLY (its first line is not ply)")
-    order = "" if "ascii" in lines[1].lower() else ">" if "big" in lines[1].lower() else "<"
-    comments = [words for line in lines if len(words := line.split(maxsplit=2)) == 3 and words[0] == "comment"]
-    header = _Header({}, [words[2] for words in comments if words[1].lower() == "texturefile"], order, end.end())
-    element = _Element()
-    for number, line in enumerate(lines[2:], start=3):
-        if (match := _ELEMENT.fullmatch(line)) and match[1] not in header.elements:
-            element = header.elements[match[1]] = _Element(int(match[2]))
-            if element.count > asset_files.MAX_ROWS:
-                raise CatalogError(
-                    f"{path}: {line[:80]!a}; allowed: at most {asset_files.MAX_ROWS} vertices and as many faces; decimate the mesh"
-                )
-        elif header.elements and (match := _PROPERTY.fullmatch(line)) and match[3] not in element.kinds:
-            element.kinds[match[3]] = tuple((order or "<") + _KINDS[kind] for kind in match.groups()[:2] if kind)
-        elif re.match(r"\S*(element|property)|$", line):
-            raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
+    match = _HEADER.match(data, 0, MAX_HEADER)
+    if match is None:
+        raise ValueError(f"no header that ends within {MAX_HEADER} bytes")
+    kind, *lines = [line.strip() for line in match[1].decode().split("\n")]
+    order = ">" if "big" in kind.lower() else "<"
+    header = _Header(known := {}, [], "ascii" in kind.lower(), match.end())
+    element = _Element(0)
+    for line in lines:
+        match line.split():
+            case ["element", name, count] if name not in known:
+                element = known[name] = _Element(int(count))
+                if not 0 <= element.count <= asset_files.MAX_ROWS:
+                    raise CatalogError(f"{path}: {line[:80]!a}; allowed: at most {asset_files.MAX_ROWS} rows; decimate the mesh")
+            case ["property", "list", length, kind, name] if known and name not in element.kinds and {length, kind} <= _KINDS.keys():
+                element.kinds[name] = order + _KINDS[length], order + _KINDS[kind]
+            case ["property", kind, name] if known and name not in element.kinds and kind in _KINDS:
+                element.kinds[name] = (order + _KINDS[kind],)
+            case ["comment", word, *_] if word.lower() == "texturefile":
+                header.textures.extend(line.split(maxsplit=2)[2:])
+            case [word, *_] if "element" in word or "property" in word:
+                raise ValueError(f"its header has {line[:80]!a}")
     return header
 
 
 def _read_elements(data: bytes, path: Path) -> dict[str, _Element]:
     """Elements of a PLY file by name."""
     header = _read_header(data, path)
-    if not header.order:
-        _read_text(header, data, path)
-        return header.elements
-    start = header.start
+    start, body = (0, data[header.start :]) if header.is_text else (header.start, data)
+    if header.is_text:
+        if len(data) > asset_files.MAX_TEXT_MESH:
+            raise CatalogError(f"{path}: too large for an ASCII file; save it as binary PLY")
+        body = np.fromstring(body.decode("latin-1"), np.dtype(_TEXT), sep=" ").tobytes() if body.strip() else b""
     for element in header.elements.values():
-        start = _read_rows(element, data, start)
-    if start != len(data):
-        raise ValueError(f"its header announces {start} bytes, it has {len(data)}")
+        kinds = {name: (_TEXT,) * len(each) if header.is_text else each for name, each in element.kinds.items()}
+        start = _read_rows(element, kinds, body, start)
+    if start != len(body):
+        raise ValueError("it has more values than its header announces")
     return header.elements
 
 
-def _read_text(header: _Header, data: bytes, path: Path) -> None:
-    """Read the rows of a text file by trimesh, which does not mind rows or values that are missing."""
-    if len(data) > asset_files.MAX_TEXT_MESH or data.count(b"\n") > 4 * asset_files.MAX_ROWS:
-        raise CatalogError(f"{path}: too large for an ASCII file; save it as binary PLY")
-    # trimesh builds meshes and paths of elements that it knows by name.
-    renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)", rb"\1_", data[: header.start])
-    try:
-        read = load_ply(io.BytesIO(renamed + data[header.start :]), skip_materials=True)["metadata"]["_ply_raw"]
-    except Exception:
-        asset_files.check_decimals(asset_files.decode_text(data[header.start :]), path)
-        raise
-    for name, element in header.elements.items():
-        element.values = read[f"_{name}"]["data"] if element.count else {}
-        if any(key not in element.values or len(element.values[key]) != element.count for key in element.kinds if element.count):
-            raise ValueError(f"its header announces {element.count} rows of {name[:40]}, its body is shorter; the file is cut short")
-
-
-def _read_rows(element: _Element, data: bytes, start: int) -> int:
-    """Read the rows of an element of a binary file; returns where the next element begins."""
-    if not element.count:
-        return start
+def _read_rows(element: _Element, kinds: dict[str, tuple[str, ...]], body: bytes, start: int) -> int:
+    """Read the rows of an element, whose values have these types in the body; returns where the next element begins."""
     fields, at = [], start
     # Rows as long as the first one are read at once; if one differs, its list's length is not the first one's.
-    for name, (*length, kind) in element.kinds.items():
-        shape = tuple(int(np.frombuffer(data, each, 1, at)[0]) for each in length)
+    for name, (*length, kind) in kinds.items() if element.count else ():
+        shape = tuple(int(np.frombuffer(body, each, 1, at)[0]) for each in length)
         fields += [(f"{name} length", each) for each in length] + [(name, kind, shape)]
         at += np.dtype(fields[-len(length) - 1 :]).itemsize
     row = np.dtype(fields)
     end = start + element.count * row.itemsize
-    if end <= len(data):
-        rows = np.frombuffer(data, row, element.count, start)
-        lengths = [rows[name] for name in row.names or () if name.endswith(" length")]
-        if all((length == length[0]).all() for length in lengths):
-            element.values = {name: rows[name] for name in element.kinds}
-            return end
-    return _read_ragged(element, data, start)
+    rows = np.frombuffer(body, row, element.count, start) if fields and end <= len(body) else None
+    if rows is not None and all((rows[name] == rows[name][0]).all() for name in row.names or () if name.endswith(" length")):
+        values = {name: rows[name].reshape(element.count, -1) for name in kinds}
+        element.values = {name: (each.reshape(-1), np.full(element.count, each.shape[1])) for name, each in values.items()}
+    else:
+        end = _read_ragged(element, kinds, body, start)
+    # Numbers of text have the precision and the range of their types.
+    element.values = {name: (flat.astype(element.kinds[name][-1]), count) for name, (flat, count) in element.values.items()}
+    return end
 
 
-def _read_ragged(element: _Element, data: bytes, start: int) -> int:
+def _read_ragged(element: _Element, kinds: dict[str, tuple[str, ...]], body: bytes, start: int) -> int:
     """Read rows with lists of several lengths one by one; returns as `_read_rows`."""
-    values: dict[str, list[Any]] = {name: [] for name in element.kinds}
-    plan = [(values[name], struct.Struct(kinds[0]), np.dtype(kinds[-1]), len(kinds) == 2) for name, kinds in element.kinds.items()]
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in kinds}
+    plan = [(columns[name], [np.dtype(kind) for kind in each]) for name, each in kinds.items()]
     for _ in range(element.count):
-        for column, single, kind, is_list in plan:
-            (value,) = single.unpack_from(data, start)
-            start += single.size
-            if is_list:
-                end = start + int(value) * kind.itemsize
-                if not start <= end <= len(data):
-                    raise ValueError("a list is longer than the file")
-                value, start = (start, int(value)), end
-            column.append(value)
-    for column, (name, (_, _, kind, is_list)) in zip(values.values(), zip(values, plan, strict=True), strict=True):
-        element.values[name] = np.empty(element.count, object) if is_list else np.array(column, kind)
-        if is_list:
-            element.values[name][:] = [np.frombuffer(data, kind, length, place) for place, length in column]
+        for column, (*length, kind) in plan:
+            count = 1
+            for each in length:
+                count, start = int(np.frombuffer(body, each, 1, start)[0]), start + each.itemsize
+            if count < 0:
+                raise ValueError("a list has a negative length")
+            column.append(np.frombuffer(body, kind, count, start))
+            start += count * kind.itemsize
+    element.values = {name: (np.concatenate(rows), np.array([len(row) for row in rows])) for name, rows in columns.items() if rows}
     return start
 
 
 def _ply_part(elements: dict[str, _Element], path: Path, notes: asset_files.Notes) -> MeshPart:
     """Mesh part of a file's elements; vertices are split where faces carry texture coordinates or colours."""
-    vertex, face = elements.get("vertex", _Element()), elements.get("face", _Element())
+    vertex, face, strips = (elements.get(name, _Element(0)) for name in ("vertex", "face", "tristrips"))
     columns = [_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"))]
     columns += [next((rows for names in _UV_COLUMNS if (rows := _columns(vertex, names)) is not None), None), _colors(vertex)]
-    flat, corners, source = _triangles(face, elements.get("tristrips", _Element()), columns[0], path, notes)
+    flat, corners, source = _triangles(face, strips, columns[0], path, notes)
     if columns[0] is None:
         raise CatalogError(f"{path}: vertices without x, y and z")
     face_colors = _colors(face) if columns[3] is None and source is not None else None
@@ -226,7 +199,7 @@ def _ply_part(elements: dict[str, _Element], path: Path, notes: asset_files.Note
         check_indices(faces, len(columns[0]), path)
         columns = [None if rows is None else rows[faces.reshape(-1)] for rows in columns]
         if has_uv:
-            uv = np.asarray(_lists(face, "texcoord")[0], np.float64).reshape(len(flat), 2)
+            uv = face.values["texcoord"][0].astype(np.float64).reshape(len(flat), 2)
             columns[2], known = uv[corners].reshape(-1, 2), known | {"texcoord"}
         if face_colors is not None and source is not None:
             columns[3] = np.repeat(face_colors[source], 3, axis=0)
@@ -245,7 +218,7 @@ def _triangles(
     triangles of corners (F, 3); and the face of each triangle (F,), None for strips."""
     name = next((name for name in (*_INDICES, *face.kinds) if name in face.kinds), None)
     if name is not None and face.count:
-        flat, lengths = _lists(face, name)
+        flat, lengths = face.values[name]
         count = np.maximum(lengths - 2, 0)
         source = np.repeat(np.arange(len(lengths)), count)
         step = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count)
@@ -254,7 +227,7 @@ def _triangles(
         if vertices is not None and np.any(lengths > 3) and 0 <= flat.min() <= flat.max() < len(vertices):
             _clip_concave(corners, source, flat.astype(np.int64), lengths, vertices, notes)
     elif strips.count:
-        flat, source_faces = np.concatenate([_lists(strips, next(iter(strips.kinds)))[0], [-1]]), None
+        flat, source_faces = np.concatenate([next(iter(strips.values.values()))[0], [-1]]), None
         start = np.flatnonzero((flat[:-2] >= 0) & (flat[1:-1] >= 0) & (flat[2:] >= 0))
         begin = np.maximum.accumulate(np.where(flat < 0, np.arange(len(flat)) + 1, 0))[start]
         odd = (start - begin) % 2
@@ -276,20 +249,11 @@ def _clip_concave(
         corners[first[index] : first[index] + count - 2] = start + np.array(clip_ears(vertices[flat[start : start + count]]))
 
 
-def _lists(element: _Element, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Values of a list property, one after another, and the length of each row's list."""
-    rows = np.asarray(element.values[name])
-    if rows.dtype == object:
-        return np.concatenate([np.atleast_1d(row) for row in rows]), np.array([np.size(row) for row in rows])
-    rows = rows.reshape(element.count, -1)
-    return rows.reshape(-1), np.full(len(rows), rows.shape[1])
-
-
 def _columns(element: _Element, names: tuple[str, ...]) -> np.ndarray | None:
     """Stack columns (V, len(names)) float64; None unless all exist."""
     if not element.count or not all(name in element.kinds for name in names):
         return None
-    return np.stack([np.asarray(element.values[name], dtype=np.float64).reshape(-1) for name in names], axis=1)
+    return np.stack([element.values[name][0].astype(np.float64) for name in names], axis=1).reshape(element.count, len(names))
 
 
 def _colors(element: _Element) -> np.ndarray | None:

@@ -56,12 +56,8 @@ def read_obj(path: Path, notes: asset_files.Notes) -> list[MeshPart]:
         notes.said += [f"the image {ascii(image)[:80]} of an unused material is missing" for image in known[name].missing_images()]
     pixels = TexturePixels(path)
     materials = {name: read_material(known[name], pixels, notes) for name in used if name in known}
-    try:
-        with asset_files.reading_as("OBJ", path):
-            parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
-    except CatalogError:
-        asset_files.check_decimals(text, path)
-        raise
+    with asset_files.reading_as("OBJ", path, text.encode()):
+        parts = [_part(mesh, used, known, materials, path, notes) for mesh in _load(text, used)]
     if not parts:
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     return parts
