@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.console import Console
 
-from synpick_warp.cli.commands.doctor import describe_machine
-from tools.options import MeasuredRow, print_machine, print_rows
+from tools.options import MeasuredRow
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "tools" / "results"
@@ -125,12 +123,3 @@ def write_run(path: Path | None, run: Mapping[str, Any]) -> None:
         rows = ",\n".join(f"  {json.dumps(row, ensure_ascii=False)}" for row in run["rows"])
         head = json.dumps({name: value for name, value in run.items() if name != "rows"}, indent=1, ensure_ascii=False)
         path.write_text(f'{head[:-2]},\n "rows": [\n{rows}\n ]\n}}\n', encoding="utf-8")
-
-
-def finish_report(tool: str, json_file: Path | None, device: Any, heading: str, title: str, rows: list[MeasuredRow], **more: object) -> int:
-    """Print the machine and the rows of a report and write its run; returns the exit code, 1 if a bound is violated."""
-    console, machine = Console(highlight=False), describe_machine(device)
-    print_machine(console, machine)
-    print_rows(console, heading, title, rows)
-    write_run(json_file, describe_run(tool, machine, rows, **more))
-    return 0 if all(row.holds for row in rows) else 1

@@ -155,14 +155,6 @@ def fail(tool: str, error: SynpickError | str) -> int:
     return 2
 
 
-def print_machine(console: Console, machine: Iterable[tuple[str, str]]) -> None:
-    """Print the table of the machine that was measured: (name, value) pairs."""
-    table = Table(show_header=False, box=None)
-    for name, value in machine:
-        table.add_row(name, value)
-    console.print(table)
-
-
 def print_rows(console: Console, heading: str, title: str, rows: Iterable[MeasuredRow]) -> None:
     """Print a table of rows with bounds and verdicts; whole numbers without a unit are printed as counts."""
     table = Table(heading, "", "unit", "bound", "", title=title)

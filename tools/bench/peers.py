@@ -18,6 +18,7 @@ import newton
 import numpy as np
 import warp as wp
 
+from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.cameras import Rig
 from synpick_warp.configs.schema import UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
@@ -38,7 +39,6 @@ from tools.bench import worlds
 from tools.bench.peer_scenes import RayScene, SensorScene, compare_hits
 from tools.bench.run import FOREVER, Bench
 from tools.options import MeasuredRow, of_part
-from tools.reports.rest import is_inside
 
 PEERS: Mapping[str, tuple[str, ...]] = {"mujoco-warp": ("mujoco", "mujoco_warp"), "mujoco": ("mujoco",), "sensor-camera": ()}
 """Peers, and the modules that they import besides those of the product."""
@@ -53,6 +53,8 @@ SMALL_SIZE = (64, 64)
 """Image size of policies that learn in many worlds [px]."""
 SMALL_WORLDS, SMALL_WORLDS_CPU = 2048, 8
 """Worlds with such images, on a GPU and on the CPU."""
+HEAP_HEIGHT = 0.1
+"""Height above the rim up to which the centre of mass of an object counts as inside [m]."""
 CHECKED_VIEWS = 6
 """Views in which the outputs are compared, of all cameras of their worlds."""
 
@@ -400,6 +402,12 @@ class MujocoEngine:
         positions, end = 1 + self.model.nq, 1 + self.model.nq + self.model.nv
         coordinates, velocities = self.state[:, 1:positions], self.state[:, positions:end]
         return coordinates.reshape(self.worlds, -1, 7)[..., LINEAR], velocities.reshape(self.worlds, -1, 6)[..., LINEAR]
+
+
+def is_inside(sizes: BinSizes, position: np.ndarray) -> np.ndarray:
+    """Whether positions (N, 3) lie above the floor, within the rim's opening, and at most `HEAP_HEIGHT` above the rim."""
+    rim = np.array(sizes.opening) / 2
+    return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < sizes.height + HEAP_HEIGHT)
 
 
 def measure_engine(make: Callable[[], NewtonEngine | MujocoEngine], config: Config, pile: EqualPile) -> Iterator[MeasuredRow]:

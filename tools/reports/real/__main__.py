@@ -38,7 +38,7 @@ from synpick_warp.online.dataset import StreamDataset
 from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
-from tools.reports.real_frames import RealFrame, read_frames
+from tools.reports.real.frames import RealFrame, read_frames
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
@@ -276,7 +276,7 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
 def make_options() -> argparse.ArgumentParser:
     """Parser of the command line."""
     parser = make_parser(__doc__, "config", "device", "models", "lights", "seed", "set", "json", own=OWN, config=PRESET)
-    parser.add_argument("--real", type=Path, required=True, help="folder of annotated frames, as tools.reports.real_frames reads them")
+    parser.add_argument("--real", type=Path, required=True, help="frames: SSSS_FFFFFF-{color,depth,label}.png and -poses.json")
     return parser
 
 

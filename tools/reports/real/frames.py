@@ -1,0 +1,95 @@
+"""Reader of annotated frames of a real RGB-D camera (YCB-Video's, by way of `oprb/ycbvideo`), for measuring only.
+
+Pixel centres are at + 0.5 in this project and at whole numbers in those frames, so `K` has 0.5 px added to the principal point.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.system.inputs.files import decode_json
+from synpick_warp.system.inputs.image_files import decode_image
+
+CENTER = 0.5
+"""Centre of the first pixel in our coordinates, where the frames have 0 [px]."""
+_MILLIMETRES = 1e3
+"""In a metre."""
+
+
+@dataclass(frozen=True, eq=False)
+class RealFrame:
+    """Annotated frame: images (H, W), intrinsics (3, 3) [px], and poses of N objects in the frames of the models [mm]."""
+
+    sequence: int
+    image: int
+    color: np.ndarray
+    """RGB (H, W, 3) uint8."""
+    depth: np.ndarray
+    """Planar depth (H, W) uint16 [0.1 mm]; 0: not measured."""
+    label: np.ndarray
+    """obj_id of each pixel (H, W) uint8; 0: none of the objects."""
+    intrinsics: np.ndarray
+    """Camera matrix (3, 3) [px]; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
+    world_to_camera: np.ndarray
+    """Matrix (3, 4): rotation, and translation [m]."""
+    object_ids: tuple[int, ...]
+    rotations: np.ndarray
+    """Object to camera (N, 3, 3)."""
+    translations: np.ndarray
+    """Object to camera (N, 3) [mm]: of the bounding box's centre."""
+
+    @property
+    def name(self) -> str:
+        """Name of the frame's files."""
+        return f"{self.sequence:04d}_{self.image:06d}"
+
+    def mask(self, index: int) -> np.ndarray:
+        """Visible mask of an object (H, W) bool."""
+        return self.label == self.object_ids[index]
+
+
+def read_frames(folder: Path) -> list[RealFrame]:
+    """Read all annotated frames of a folder, by name. Raises DatasetError: there are none, or a file is missing or damaged."""
+    names = sorted(path.name.removesuffix("-poses.json") for path in folder.glob("*-poses.json"))
+    if not names:
+        raise DatasetError(f"{folder} has no frames (SSSS_FFFFFF-poses.json)")
+    return [_read_frame(folder, name) for name in names]
+
+
+def _read_frame(folder: Path, name: str) -> RealFrame:
+    path = folder / f"{name}-poses.json"
+    content = decode_json(_read(path), dict[str, Any], path, DatasetError)
+    try:
+        objects, matrix = content["objects"], np.array(content["K"], np.float64)
+        matrix[:2, 2] += CENTER
+        rotations = np.array([entry["R_model_to_camera"] for entry in objects]).reshape(-1, 3, 3)
+        return RealFrame(
+            sequence=int(content["sequence"]),
+            image=int(content["frame"]),
+            color=cv2.cvtColor(_image(folder / f"{name}-color.png"), cv2.COLOR_BGR2RGB),
+            depth=_image(folder / f"{name}-depth.png"),
+            label=_image(folder / f"{name}-label.png"),
+            intrinsics=matrix,
+            world_to_camera=np.array(content["world_to_camera"]),
+            object_ids=tuple(int(entry["obj_id"]) for entry in objects),
+            rotations=rotations,
+            translations=_MILLIMETRES * np.array([entry["t_bop_m"] for entry in objects]).reshape(-1, 3),
+        )
+    except (KeyError, TypeError, ValueError) as fault:
+        raise DatasetError(f"{path} is no record of poses: {fault}") from None
+
+
+def _read(path: Path) -> bytes:
+    """Content of a file; DatasetError without it."""
+    try:
+        return path.read_bytes()
+    except OSError as fault:
+        raise DatasetError(f"{path} cannot be read: {fault.strerror}") from None
+
+
+def _image(path: Path) -> np.ndarray:
+    return decode_image(_read(path), path, DatasetError)
