@@ -162,6 +162,8 @@ def test_the_callers_words_hold_where_the_file_says_nothing(tmp_path):
 FRAMES = [{"fl_x": focal, "cx": 1, "cy": 1} for focal in (1.0, 2.0)]
 ONES = '"fx": 1, "fy": 1, "cx": 1, "cy": 1'
 SHAPES = b"(3, 3), }" + 12 * b" ", b"(9999999999999, 3), }"
+LAUGHS = "a0: &a0 [1, 2]\n" + "".join(f"a{n + 1}: &a{n + 1} [*a{n}, *a{n}]\n" for n in range(40)) + "intrinsics: *a40\ncamera_model: *a40\n"
+DAMAGED = "is no calibration file: its reader "
 REFUSED = {
     "nothing": ("", "no calibration file"),
     "a list": ("- 1\n- 2\n", "no calibration file"),
@@ -190,16 +192,16 @@ REFUSED = {
     "a modified model": (realsense("distortion.modified_brown_conrady"), "not OpenCV's"),
     "an ftheta model": (realsense(3), "not OpenCV's"),
     "Zivid without lens": (ZIVID[: ZIVID.index("  Distortion")], "has no Distortion"),
-    "an alias": ("a: &b [1]\ncamera_matrix: *b\n", "anchors or aliases in line 1"),
-    "a tag of Python": ("camera_matrix: !!python/object/apply:os.system [ls]\n", "tag .*python.* in line 1; allowed: !!opencv-matrix"),
-    "deep nesting": ("a: " + "[" * 30 + "]" * 30, "nested too deeply"),
+    "aliases of aliases": (LAUGHS, DAMAGED),
+    "a tag of Python": ("camera_matrix: !!python/object/apply:os.system [ls]\n", '"ls"; allowed: a finite number'),
+    "deep nesting": ("a: " + "[" * 500_000 + "]" * 500_000, DAMAGED),
     "deep JSON": ('{"a": ' + "[" * 100_000, "nested too deeply"),
-    "broken YAML": ("a: [1, 2\nb: {", "is no YAML in line 2"),
-    "a tab": ("a:\n\tb: 1\n", "is no YAML"),
-    "control characters": ("a: \0\n", "is no YAML"),
-    "broken XML": ("<opencv_storage><a></opencv_storage>", "is no XML"),
-    "entities": ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "document type or entities"),
-    "not UTF-8": (b"\xff\xfe\0a", "byte 0 is not UTF-8"),
+    "broken YAML": ("a: [1, 2\nb: {", DAMAGED),
+    "a tab": ("a:\n\tb: 1\n", DAMAGED),
+    "control characters": ("a: \0\n", DAMAGED),
+    "broken XML": ("<opencv_storage><a></opencv_storage>", DAMAGED),
+    "entities": ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage>&b;</opencv_storage>', "no intrinsics of a known format"),
+    "not UTF-8": (b"\xff\xfe\0a", DAMAGED),
     "four numbers": ("275 274.6 163.3 117", "the camera matrix has 4 numbers; allowed: 9"),
     "a projection": ("275 0 163.3 0\n0 274.6 117 0\n0 0 1 0\n", "the camera matrix has 12 numbers"),
     "decimal commas": ("275,0 0,0 163,3\n0,0 274,6 117,0\n0,0 0,0 1,0\n", "the camera matrix has 18 numbers"),
@@ -219,9 +221,9 @@ REFUSED = {
     "frames that differ": (json.dumps({"camera_angle_x": 1.0, "frames": FRAMES}), "its frames are of 2 cameras"),
     "a model of nerfstudio": (nerfstudio(camera_model="EQUIRECTANGULAR"), 'camera_model is "EQUIRECTANGULAR"'),
     "Kalibr, omni": ("cam0: {camera_model: omni, intrinsics: [1, 2, 3, 4]}", 'camera model is "omni"; allowed: pinhole'),
-    "a cut archive": (archive(mtx=K)[:200], "is no archive of NumPy's arrays: its reader failed"),
+    "a cut archive": (archive(mtx=K)[:200], DAMAGED),
     "an archive of objects": (archive(mtx=ODD), "no intrinsics of a known format"),
-    "an array of a shape that is not there": (array(K).replace(*SHAPES), "is no archive of NumPy's arrays"),
+    "an array of a shape that is not there": (array(K).replace(*SHAPES), DAMAGED),
     "a large file": (b" " * (2**20 + 1), "larger than 1 MiB"),
 }
 

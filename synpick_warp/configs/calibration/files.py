@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.calibration.documents import Tree, read_document
-from synpick_warp.errors import ConfigError, format_value
+from synpick_warp.errors import ConfigError, SynpickError, format_value
 
 PINHOLE = "pinhole"
 FISHEYE = "fisheye"
@@ -37,6 +37,8 @@ MAX_SIDE = 8192
 MAX_NUMBER = 1e6
 """Largest focal length, coordinate of the principal point [px] and coefficient of distortion: the limit of camera.matrix."""
 _MAX_NUMBERS = 64
+_SECONDS, _MEMORY = 3.0, 2**28
+"""Limits of reading a file: processor time [s] and memory [bytes]."""
 _NO_SKEW = 1e-9
 """Largest skew of a camera matrix, relative to fx."""
 _ROS_MODELS = {
@@ -81,6 +83,18 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
 
     Raises ConfigError: the file cannot be read or is of no such format, a value is missing or impossible, or a distortion model is not
     rendered."""
+    from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
+
+    (found,) = run_isolated(_read, [(path, model, pixel_center)], Limits(_SECONDS, _MEMORY))
+    if isinstance(found, Failure):
+        raise ConfigError(f"{path} is no calibration file: its reader {found.reason}")
+    if isinstance(found, SynpickError):
+        raise found
+    return found
+
+
+def _read(path: Path, model: str, pixel_center: float | None) -> Calibration:
+    """As `read_calibration`, in the isolated process."""
     tree = read_document(path)
     trees = [tree] if _format(tree) else [part for part in tree.values() if isinstance(part, dict) and _format(part)]
     if not trees:
