@@ -239,11 +239,8 @@ class Chunks:
 
     def _take_first(self, open_chunks: Sequence[tuple[int, tuple[int, int]]], leased: set[int]) -> Chunk | None:
         """Claim the first of these chunks that is free, by its lease's absence or age; None: none is, or other workers were faster.
-
-        Args:
-            open_chunks: Number and bounds of the chunks without end mark.
-            leased: Numbers of those that had a lease when they were listed. Of those that are not known to last, CHECKS are looked at.
-        """
+        `open_chunks`: number and bounds of the chunks without end mark. `leased`: numbers of those that had a lease when they were listed.
+        Of those that are not known to last, CHECKS are looked at."""
         now, seen = clock.time() + self.claims.offset, self.claims.seen
         free = [each for each in open_chunks if each[0] not in leased]
         held = [each for each in open_chunks if each[0] in leased and seen.get(self._key(each[0]), 0.0) <= now]

@@ -66,14 +66,9 @@ def _add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
 
 
 def unpack_bundle(data: bytes, folder: Path, indexed: re.Pattern[str], source: str) -> None:
-    """Unpack an episode's index file into a folder: files, and lines, which are appended to those of the episodes before.
-
-    Args:
-        data: The index file.
-        indexed: Pattern of the names of files that indices are made of.
-        source: Its object, for messages.
-
-    Raises DatasetError: it is damaged, too large, or has files that no index is made of; OutputError: the folder cannot be written."""
+    """Unpack an episode's index file into a folder: files, and lines, which are appended to those of the episodes before. `data`: the index
+    file. `indexed`: pattern of the names of files that indices are made of. `source`: its object, for messages. Raises DatasetError: it is
+    damaged, too large, or has files that no index is made of; OutputError: the folder cannot be written."""
     try:
         stream = zlib.decompressobj(31)
         plain = stream.decompress(data, MAX_BUNDLE)
@@ -137,13 +132,9 @@ class Delivery:
         permit: Callable[[int], None] = lambda _: None,
         delivered: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """
-        Args:
-            ledger: Commit log of the data set.
-            folder: Local data set that a bake fills.
-            permit: Called with an episode before its upload and before its mark; raises LeaseLostError to drop it.
-            delivered: Called with an episode after its mark. Both are called by several threads.
-        """
+        """`ledger`: commit log of the data set. `folder`: local data set that a bake fills. `permit`: called with an episode before its
+        upload and before its mark; raises LeaseLostError to drop it. `delivered`: called with an episode after its mark. Both are called by
+        several threads."""
         self._ledger, self._folder, self._permit, self._delivered = ledger, folder, permit, delivered
         self._settings, self._kinds = ExportSettings.of(ledger.config), load_exporter_classes(ledger.layout.formats)
         self._shared = shared_files(self._kinds, ledger.layout).folders

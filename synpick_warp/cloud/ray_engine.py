@@ -50,13 +50,9 @@ _LOCAL = {"RAY_AUTH_MODE": "token", "RAY_worker_niceness": "0"}
 
 def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew: Crew) -> BakeSummary:
     """Bake a data set into an object store by claiming workers on a Ray cluster; other claiming workers may take part. Other arguments as
-    of `workers.start_bake`.
-
-    Args:
-        engine: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is reached by Ray Client.
-        workers: Number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device` cpu.
-
-    Returns the summary of the workers that ended."""
+    of `workers.start_bake`. `engine`: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is
+    reached by Ray Client. `workers`: number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device`
+    cpu. Returns the summary of the workers that ended."""
     job = replace(job, config=with_measures(job.config, ()))
     address = find_address(engine)
     ray = import_ray(address)
@@ -87,12 +83,7 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew:
 
 def run_worker(version: str, data: bytes, cores: int) -> BakeSummary | str:
     """Ray task: claim and bake chunks until all episodes of a job are done; returns the summary, or an error that the user can correct.
-
-    Args:
-        version: Version of the driver's synpick_warp.
-        data: Pickled `Job`.
-        cores: CPU cores of this worker.
-    """
+    `version`: version of the driver's synpick_warp. `data`: pickled `Job`. `cores`: CPU cores of this worker."""
     if version != __version__:
         return f"a Ray worker has synpick-warp {__version__}, and this command {version}; install one version everywhere"
     limit_threads(cores)

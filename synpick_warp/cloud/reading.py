@@ -68,14 +68,9 @@ class Copier:
         self.folder = folder
 
     def fetch(self, name: str, digest: str | None = None, limit: int = MAX_JSON) -> bool:
-        """Download an object atomically, unless it is in the folder; returns whether it is there then.
-
-        Args:
-            digest: Expected SHA-256; None: unchecked.
-            limit: Largest size [B].
-
-        Raises DatasetError: its checksum differs, or its name leads out of the folder; OutputError: the folder cannot be written;
-        SizeError: it is larger."""
+        """Download an object atomically, unless it is in the folder; returns whether it is there then. `digest`: expected SHA-256; None:
+        unchecked. `limit`: largest size [B]. Raises DatasetError: its checksum differs, or its name leads out of the folder; OutputError:
+        the folder cannot be written; SizeError: it is larger."""
         path, state = path_inside(self.folder, name, self.store.url, DatasetError), hashlib.sha256()
         if path.exists():
             return True
@@ -294,13 +289,9 @@ class StoreDataSet(DataSet):
 
 
 def open_store_set(url: str, limit: int = CACHE_BYTES, episodes: range | None = None) -> DataSet:
-    """Open a data set in a store: downloads its records, constants and indices.
-
-    Args:
-        limit: Size of the cache of episodes [B]; the last one is kept whatever its size.
-        episodes: Indices of the episodes to show; None: all.
-
-    Raises DatasetError: the prefix has no data set; StoreError: the store cannot be read."""
+    """Open a data set in a store: downloads its records, constants and indices. `limit`: size of the cache of episodes [B]; the last one is
+    kept whatever its size. `episodes`: indices of the episodes to show; None: all. Raises DatasetError: the prefix has no data set;
+    StoreError: the store cannot be read."""
     return StoreDataSet(StoreCache(url, limit), episodes)
 
 

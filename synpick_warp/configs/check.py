@@ -38,14 +38,9 @@ def to_index(value: object) -> int | None:
 
 
 def check_value(key: str, value: object, item: Setting, source: str) -> Any:
-    """Validate a value; returns it in the type of its setting, for instance a list as a tuple.
-
-    Args:
-        key: Full key of the setting, for messages.
-        value: The value as parsed from TOML.
-        source: Where the value comes from, for messages, such as "in my.toml".
-
-    Raises ConfigError: the value has the wrong type or length, is not finite, or lies outside the setting's range."""
+    """Validate a value; returns it in the type of its setting, for instance a list as a tuple. `key`: full key of the setting, for
+    messages. `value`: the value as parsed from TOML. `source`: where the value comes from, for messages, such as "in my.toml". Raises
+    ConfigError: the value has the wrong type or length, is not finite, or lies outside the setting's range."""
     hint = ""
     try:
         result = _convert(item.parse(value) if item.parse else value, item.kind)

@@ -137,14 +137,9 @@ class DataLayout:
         return sum(map(len, self.plan()))
 
     def plan_shard(self, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
-        """Validate a shard and return its episode indices, ascending, one range per split.
-
-        Args:
-            names: Splits; empty: all.
-            shard: (i, n): only indices with index % n == i.
-            name: Name of the shard in messages, such as that of the option.
-
-        Raises ConfigError: an unknown split, an invalid shard, or a shard without episodes."""
+        """Validate a shard and return its episode indices, ascending, one range per split. `names`: splits; empty: all. `shard`: (i, n):
+        only indices with index % n == i. `name`: name of the shard in messages, such as that of the option. Raises ConfigError: an unknown
+        split, an invalid shard, or a shard without episodes."""
         check_shard(shard, name)
         planned = self.plan(names, shard)
         if not any(planned):

@@ -276,13 +276,9 @@ class View:
         return np.insert(rays, 2, 1.0, axis=-1) * np.asarray(depth, np.float64)[..., None]
 
     def points(self, frame: str = "camera", depth: np.ndarray | None = None) -> np.ndarray:
-        """Organized point cloud: the point at each pixel's centre (H, W, 3) float32 [m], NaN where there is no surface.
-
-        Args:
-            frame: Frame of the points, "camera" or "world".
-            depth: Planar depth (H, W) [m], 0 without a surface, such as the layer of a simulated sensor; None: `depth`.
-
-        Raises ValueError: there is no such frame."""
+        """Organized point cloud: the point at each pixel's centre (H, W, 3) float32 [m], NaN where there is no surface. `frame`: frame of
+        the points, "camera" or "world". `depth`: planar depth (H, W) [m], 0 without a surface, such as the layer of a simulated sensor;
+        None: `depth`. Raises ValueError: there is no such frame."""
         if frame not in _FRAMES:
             raise ValueError(f"there is no frame {format_value(frame)}; frames: {', '.join(_FRAMES)}")
         from synpick_warp.configs.calibration.lens import pixel_rays

@@ -118,12 +118,8 @@ class EpisodeCameras:
 
     def of_views(self, episode: np.ndarray, camera: np.ndarray, shaft: np.ndarray) -> dict[str, np.ndarray]:
         """Fields matrix, rotation and translation of `FrameBatch` for views of a group of the rig; none if all views have the rig's.
-
-        Args:
-            episode: Episode of each view (B).
-            camera: Camera of each view (B).
-            shaft: Pose of the gripper's shaft in each view: x, y, z [m], quaternion x, y, z, w (B, 7).
-        """
+        `episode`: episode of each view (B). `camera`: camera of each view (B). `shaft`: pose of the gripper's shaft in each view: x, y, z
+        [m], quaternion x, y, z, w (B, 7)."""
         if not len(camera) or not self.rig.is_placed(int(camera[0])):
             return {}
         drawn = [self._draw(*pair) for pair in zip(episode.tolist(), camera.tolist(), strict=True)]

@@ -75,12 +75,8 @@ def with_capacities(physics: Physics, count: int, catalog: Catalog, bins: Sequen
 
 
 def _contacts_of(entry: CatalogEntry, margin: float, fixtures: float, count: int) -> float:
-    """Contacts of a pile of `count` objects of a kind.
-
-    Args:
-        margin: Distance up to which two shapes have contacts [m].
-        fixtures: Shapes of a bin beside each object.
-    """
+    """Contacts of a pile of `count` objects of a kind. `margin`: distance up to which two shapes have contacts [m]. `fixtures`: shapes of a
+    bin beside each object."""
     sides = np.sort(oriented_sides(entry.pieces))
     neighbors = float(np.prod(sides + 2.0 * margin) / np.prod(sides)) - 1.0
     pairs = min(count * neighbors, count * (count - 1)) / 2.0 + fixtures * count
@@ -152,13 +148,9 @@ def count_entries(counts: Counts, catalog: Catalog) -> np.ndarray:
 
 
 def drop_height(most: np.ndarray, radius: np.ndarray, arrangement: Arrangement, sizes: BinSizes) -> float:
-    """Height of the stack from which a bin's objects begin to fall [m], by `kernels.sim.drop.drop_objects_kernel`.
-
-    Args:
-        most: Largest number of each object in an episode (entry).
-        radius: Bounding radii (entry) [m].
-        sizes: The bin; in layers its compartments are taken to have equal shares of the objects.
-    """
+    """Height of the stack from which a bin's objects begin to fall [m], by `kernels.sim.drop.drop_objects_kernel`. `most`: largest number
+    of each object in an episode (entry). `radius`: bounding radii (entry) [m]. `sizes`: the bin; in layers its compartments are taken to
+    have equal shares of the objects."""
     if arrangement.drop != LAYERED:
         return float(dot(most, 2.0 * radius + arrangement.clearance))
     pitch = float(2.0 * radius[most > 0].max(initial=0.0) + arrangement.clearance)

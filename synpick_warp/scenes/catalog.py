@@ -369,12 +369,9 @@ def _describe_specks(mesh: TriangleMesh, diameter: float, origin: str) -> list[s
 
 
 def describe_masses(raws: Sequence[RawObject], objects: Objects, masses: Sequence[float] = (), *, guesses: bool = False) -> str:
-    """Line on the masses [kg] of objects that have them by their density; empty: there are none.
-
-    Args:
-        masses: Their masses, if their collision shapes are known.
-        guesses: Those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the density.
-    """
+    """Line on the masses [kg] of objects that have them by their density; empty: there are none. `masses`: their masses, if their collision
+    shapes are known. `guesses`: those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the
+    density."""
     known = objects.mass_volume == MESH and objects.density != Objects.density
     pairs = zip(raws, masses or [_checked_mass(raw, objects) for raw in raws], strict=True)
     told = {raw.name: mass for raw, mass in pairs if raw.mass is None and not (known and bool(_solid(raw)) == guesses)}

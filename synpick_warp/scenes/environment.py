@@ -140,13 +140,8 @@ def replace_sun(radiance: np.ndarray, sun: Sun) -> ExtractedSun:
 
 def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndarray, radius_tangent: float) -> np.ndarray:
     """Render a sun as a uniform disc into a black map (rows, 2 rows, 3), with the given irradiance (3) on a surface that faces it, about a
-    unit direction (3) above the horizon.
-
-    Args:
-        bright: Texels where the map is bright (rows, 2 rows) bool. If any lies in the disc, the disc keeps only these: hills hide the
-            rest.
-        radius_tangent: Tangent of the disc's angular radius; the disc has at least one texel.
-    """
+    unit direction (3) above the horizon. `bright`: texels where the map is bright (rows, 2 rows) bool. If any lies in the disc, the disc
+    keeps only these: hills hide the rest. `radius_tangent`: tangent of the disc's angular radius; the disc has at least one texel."""
     directions, solid_angles = map_directions(len(bright))
     cosine = np.where(directions[..., 2] > 0.0, dot(directions, direction), -1.0)
     inside = cosine >= min(1.0 / np.sqrt(1.0 + radius_tangent**2), cosine.max())
@@ -189,12 +184,8 @@ class Lamp(NamedTuple):
 
 
 def extract_lamps(radiance: np.ndarray, max_lamps: int, points: int, whole: np.ndarray | None = None) -> tuple[np.ndarray, list[Lamp]]:
-    """Split a map (rows, 2 rows, 3) into at most `max_lamps` lamps above the horizon and the rest.
-
-    Args:
-        points: Sample points of each, a power of two.
-        whole: The map (rows, 2 rows, 3) that contrast and shares refer to, if a sun was taken from it before; None: `radiance`.
-
+    """Split a map (rows, 2 rows, 3) into at most `max_lamps` lamps above the horizon and the rest. `points`: sample points of each, a power
+    of two. `whole`: the map (rows, 2 rows, 3) that contrast and shares refer to, if a sun was taken from it before; None: `radiance`.
     Returns the map without the lamps, and the lamps, those with the largest irradiance of a surface that faces up first."""
     directions, solid_angles = map_directions(len(radiance))
     luminance = dot(radiance, LUMINANCE)

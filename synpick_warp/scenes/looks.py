@@ -64,14 +64,9 @@ def load_looks(randomize: Randomize, report: Callable[[str], None], strict: bool
 
 
 def load_textures(key: str, folder: str, report: Callable[[str], None], strict: bool = False) -> Textures:
-    """Load the images of a folder, in isolated processes; empty: none. Those that cannot be used are left out with a line each.
-
-    Args:
-        key: The setting that names the folder.
-        strict: Whether the first image that cannot be used is an error.
-
-    Raises CatalogError: the folder does not exist, or has no image that can be used, or too many, or time or memory of this machine does
-    not suffice for one."""
+    """Load the images of a folder, in isolated processes; empty: none. Those that cannot be used are left out with a line each. `key`: the
+    setting that names the folder. `strict`: whether the first image that cannot be used is an error. Raises CatalogError: the folder does
+    not exist, or has no image that can be used, or too many, or time or memory of this machine does not suffice for one."""
     if not folder:
         return ()
     try:

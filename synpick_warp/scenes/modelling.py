@@ -104,14 +104,9 @@ def lathe(profile: list[tuple[float, float]], points: int) -> np.ndarray:
 
 
 def sweep(path: np.ndarray, section: np.ndarray, scales: np.ndarray, hint: tuple[float, float, float]) -> np.ndarray:
-    """Rings (m, n, 3) of a swept surface: a cross-section that follows a path.
-
-    Args:
-        path: (m, 3) [m].
-        section: Counter-clockwise ring (n, 2) [m]; its first axis is aligned with `hint`.
-        scales: Scale of the section at each point of the path: (m, 1), or (m, 2) for each of its axes.
-        hint: Reference direction, nowhere parallel to the path.
-    """
+    """Rings (m, n, 3) of a swept surface: a cross-section that follows a path. `path`: (m, 3) [m]. `section`: counter-clockwise ring (n, 2)
+    [m]; its first axis is aligned with `hint`. `scales`: scale of the section at each point of the path: (m, 1), or (m, 2) for each of its
+    axes. `hint`: reference direction, nowhere parallel to the path."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     first = np.asarray(hint) - tangent * dot(tangent, np.asarray(hint))[:, None]

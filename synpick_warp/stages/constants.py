@@ -59,14 +59,10 @@ class SceneData:
 
 
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
-    """Make a struct whose members come from `derived`, else from the first section that has a field of that name.
-
-    Args:
-        kind: A `wp.struct`.
-        sections: Sections of the settings, or other objects with attributes; booleans become integers.
-        derived: Members that no section holds under their name or in their unit.
-
-    Raises AttributeError: a member is in neither; TypeError: `derived` names something that is no member."""
+    """Make a struct whose members come from `derived`, else from the first section that has a field of that name. `kind`: a `wp.struct`.
+    `sections`: sections of the settings, or other objects with attributes; booleans become integers. `derived`: members that no section
+    holds under their name or in their unit. Raises AttributeError: a member is in neither; TypeError: `derived` names something that is no
+    member."""
     unknown = derived.keys() - kind.vars.keys()
     if unknown:
         raise TypeError(f"{kind.key} has no members {sorted(unknown)}")

@@ -62,12 +62,7 @@ class JpegEncoder:
     """Encodes batches of views; `encode` only launches kernels."""
 
     def __init__(self, scratch: JpegScratch, width: int, height: int) -> None:
-        """
-        Args:
-            scratch: Scratch for the largest batch.
-            width: Of the images [px].
-            height: Of the images [px].
-        """
+        """`scratch`: scratch for the largest batch. `width`: of the images [px]. `height`: of the images [px]."""
         self.scratch, self.device = scratch, scratch.sample.device
         device = self.device
         self.tables = upload_huffman(device)
@@ -80,14 +75,8 @@ class JpegEncoder:
         self._samples = wp.array(ptr=rows.ptr, dtype=wp.uint8, shape=shape, device=device)
 
     def encode(self, image: wp.array, quality: wp.array, count: int, out: JpegBuffers) -> None:
-        """Encode the first `count` views.
-
-        Args:
-            image: RGB images (view, row, column) vec3ub.
-            quality: 1 to 100 (view) int32.
-            count: Views in use.
-            out: Written.
-        """
+        """Encode the first `count` views. `image`: RGB images (view, row, column) vec3ub. `quality`: 1 to 100 (view) int32. `count`: views
+        in use. `out`: written."""
         scratch, data = self.scratch, self.scratch.bundle
         blocks, intervals, lanes = ((count, *array.shape[1:]) for array in (scratch.nonzero, scratch.coded, scratch.stuffing))
         _, rows, columns = self._samples.shape
@@ -109,11 +98,7 @@ class Compressor:
     """JPEG files of batches of views."""
 
     def __init__(self, scratch: JpegScratch, width: int, height: int, quality: int) -> None:
-        """
-        Args:
-            scratch, width, height: As of `JpegEncoder`.
-            quality: JPEG quality of views without a sampled one.
-        """
+        """`scratch`, `width`, `height`: as of `JpegEncoder`. `quality`: JPEG quality of views without a sampled one."""
         self.encoder = JpegEncoder(scratch, width, height)
         self.fixed_quality, self.device = quality, self.encoder.device
         self.quality = wp.empty(scratch.sample.shape[0], dtype=wp.int32, device=self.device)
@@ -173,12 +158,7 @@ class DepthEncoder:
     """Encodes batches of depth images; `encode` only launches kernels."""
 
     def __init__(self, scratch: tuple[DepthScratch, Any, Any], width: int, height: int) -> None:
-        """
-        Args:
-            scratch: Scratch by `allocate_depth_scratch`.
-            width: Of the images [px].
-            height: Of the images [px].
-        """
+        """`scratch`: scratch by `allocate_depth_scratch`. `width`: of the images [px]. `height`: of the images [px]."""
         self.scratch, self.slots, self.groups = scratch
         self.device, self.width, self.height = self.scratch.slot.device, width, height
         device = self.device
@@ -198,13 +178,7 @@ class DepthEncoder:
         self.slots.bits[:, 0].fill_(prefix[1])
 
     def encode(self, image: wp.array, count: int, out: DepthBuffers) -> None:
-        """Encode the first `count` views.
-
-        Args:
-            image: Depth images (view, row, column) uint16.
-            count: Views in use.
-            out: Written.
-        """
+        """Encode the first `count` views. `image`: depth images (view, row, column) uint16. `count`: views in use. `out`: written."""
         scratch = self.scratch
         segments = (count, self.height, -(-self.width // SEGMENT))
         launch(png.encode_segments_kernel, segments, self, scratch, image=image, segment=SEGMENT, sums=self.slots)

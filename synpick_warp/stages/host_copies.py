@@ -75,11 +75,8 @@ class HostCopy:
     """Host mirror of device arrays: asynchronous copies into pinned memory on CUDA; on a CPU by default the arrays themselves."""
 
     def __init__(self, arrays: list[wp.array], target: list[wp.array] | None = None) -> None:
-        """
-        Args:
-            arrays: Arrays of one device.
-            target: Arrays on the host that they are copied to, pinned for a GPU; None: new ones for a GPU, on a CPU the arrays themselves.
-        """
+        """`arrays`: arrays of one device. `target`: arrays on the host that they are copied to, pinned for a GPU; None: new ones for a GPU,
+        on a CPU the arrays themselves."""
         self.source = arrays
         self.device = arrays[0].device
         if target is None:

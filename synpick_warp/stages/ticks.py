@@ -201,12 +201,8 @@ more. 1 GiB holds MAX_LEAD ticks of 180 worlds, or 30 ticks of 512 worlds whose 
 def queue_lead(tick_bytes: int, device: wp.Device) -> int:
     """Maximum lead of physics: as many ticks as the budget has room for beside the one being rendered, at least one, at most MAX_LEAD.
 
-    0 on a CPU, where physics and renderer do not overlap.
-
-    Args:
-        tick_bytes: Size of a `TickRecord` [bytes].
-        device: Device of the simulation.
-    """
+    0 on a CPU, where physics and renderer do not overlap. `tick_bytes`: size of a `TickRecord` [bytes]. `device`: device of the
+    simulation."""
     if not device.is_cuda:
         return 0
     budget = min(QUEUE_BYTES, device.total_memory // QUEUE_PART)
@@ -231,12 +227,8 @@ class TickQueue:
 
     @collection_paused()
     def __init__(self, record: TickRecord, slots: int) -> None:
-        """Allocate the ring.
-
-        Args:
-            record: Record of the simulation, which each tick overwrites.
-            slots: Capacity [ticks], including the tick being rendered.
-        """
+        """Allocate the ring. `record`: record of the simulation, which each tick overwrites. `slots`: capacity [ticks], including the tick
+        being rendered."""
         self.slots = slots
         self._device = device = record.snapshot.live.device
         self._source = [getattr(record.snapshot, item.name) for item in fields(Snapshot)]
@@ -272,13 +264,7 @@ class TickQueue:
 
 def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
     """Allocate a ring buffer: zeroed arrays with the shapes and types of `arrays` for each slot, views of one allocation per array.
-
-    Args:
-        arrays: Templates.
-        slots: Number of slots.
-        device: Where to allocate.
-        pinned: Whether to pin memory of the host.
-    """
+    `arrays`: templates. `slots`: number of slots. `device`: where to allocate. `pinned`: whether to pin memory of the host."""
     rings: list[Any] = allocate_rings(arrays, slots, device, pinned)
     rows = [array.shape[0] for array in arrays]
     return [[ring[slot * count : (slot + 1) * count] for ring, count in zip(rings, rows, strict=True)] for slot in range(slots)]

@@ -125,12 +125,8 @@ class CameraGroup:
     def write_views(
         self, lists: wp.array, world: np.ndarray, camera: np.ndarray, made: tuple[Any, Any] | None, placed: ViewExtrinsics
     ) -> Any:
-        """The struct `Views` of views of these cameras (world, camera), whose indices are written to `lists` (3, view) int32.
-
-        Args:
-            made: As of `allocate_cameras`; written.
-            placed: What its cameras are set to.
-        """
+        """The struct `Views` of views of these cameras (world, camera), whose indices are written to `lists` (3, view) int32. `made`: as of
+        `allocate_cameras`; written. `placed`: what its cameras are set to."""
         slot = self.slots(camera)
         padded = np.zeros(lists.shape, np.int32)
         padded[1] = self.cameras[0]
@@ -188,14 +184,8 @@ class ViewRing:
     """Batches of a group's views: on a GPU up to two are in flight while one is consumed."""
 
     def __init__(self, group: CameraGroup, layers: Collection[str], device: wp.Device, host: TransferSettings | None = None) -> None:
-        """Allocate the ring of batches.
-
-        Args:
-            group: Cameras and their renderer.
-            layers: Names of the layers to render.
-            device: Device of rendering.
-            host: Which images are copied to the host; None: all.
-        """
+        """Allocate the ring of batches. `group`: cameras and their renderer. `layers`: names of the layers to render. `device`: device of
+        rendering. `host`: which images are copied to the host; None: all."""
         sizes = group.sizes
         self.group, self.cameras, self.renderer = group, group.cameras, group.renderer
         self.host = host or TransferSettings()

@@ -44,13 +44,8 @@ def r2_points(index: np.ndarray, start: float = 0.0) -> np.ndarray:
 
 
 def sample_triangles(areas: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample points of triangles evenly by area.
-
-    Args:
-        areas: (F), in any unit.
-        count: Number of points S.
-
-    Returns the triangle (S) of each point by a golden-ratio sequence over the cumulative area, and its barycentric weights (S, 3) by R2."""
+    """Sample points of triangles evenly by area. `areas`: (F), in any unit. `count`: number of points S. Returns the triangle (S) of each
+    point by a golden-ratio sequence over the cumulative area, and its barycentric weights (S, 3) by R2."""
     cumulative = np.cumsum(areas)
     index = np.arange(1, count + 1)
     place = np.mod(index * _GOLDEN_STEP, 1.0) * cumulative[-1]

@@ -148,11 +148,7 @@ def _fill_allocations(value: int) -> None:
     """Make glibc initialize allocated memory with a byte (M_PERTURB), in this process and in the writers; other C libraries ignore it.
 
     Exception: in this process, blocks of up to 1 kB that come from glibc's thread cache (tcache) keep their contents. The writers run
-    without that cache.
-
-    Args:
-        value: The byte; not 255, whose complement, 0, would turn M_PERTURB off.
-    """
+    without that cache. `value`: the byte; not 255, whose complement, 0, would turn M_PERTURB off."""
     perturb = value ^ 0xFF
     os.environ["GLIBC_TUNABLES"] = "glibc.malloc.tcache_count=0"
     os.environ["MALLOC_PERTURB_"] = str(perturb)

@@ -25,16 +25,10 @@ class Probe:
         _probes.setdefault(owner, []).append(self)
 
     def __call__(self, *arguments: Any, device: Any = None) -> Any:
-        """Values of the function at rows of arguments, which broadcast as NumPy arrays.
-
-        Args:
-            arguments: Arrays, and structs that have some, which all rows share; all else by rows: NumPy arrays (..., components),
-                structured for structs, or one value for all.
-            device: The tests' default device if None.
-
-        Returns:
-            Array (..., components) of what the function returns, structured for a struct; several values: a list of arrays.
-        """
+        """Values of the function at rows of arguments, which broadcast as NumPy arrays. `arguments`: arrays, and structs that have some,
+        which all rows share; all else by rows: NumPy arrays (..., components), structured for structs, or one value for all. `device`: the
+        tests' default device if None. Returns array (..., components) of what the function returns, structured for a struct; several
+        values: a list of arrays."""
         if self.kernel is None:
             for each in _probes[self.owner]:
                 if each.kernel is None:

@@ -136,16 +136,8 @@ def differing(expected: Rows, found: Rows, row: int, other: int | None = None) -
 
 def check_arrays(simulation: Simulation, ticks: int, kinds: Counter[str]) -> Iterator[str]:
     """Run ticks twice from one state. The second time, before each tick, all is overwritten that is neither state nor constant, and the
-    state loaded into its own worlds.
-
-    Args:
-        simulation: The worlds.
-        ticks: Number of ticks.
-        kinds: Receives the numbers of arrays: state, constant, overwritten.
-
-    Yields:
-        Where the second run differs.
-    """
+    state loaded into its own worlds. `simulation`: the worlds. `ticks`: number of ticks. `kinds`: receives the numbers of arrays: state,
+    constant, overwritten. Yields where the second run differs."""
     simulation.tick()
     worlds = range(simulation.layout.worlds)
     state, queue = simulation.get_state(worlds), simulation.state.next_episode.numpy().copy()

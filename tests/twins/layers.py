@@ -96,17 +96,9 @@ def box_of(mask: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int
 
 
 def count_pixels(instance: np.ndarray, depth: np.ndarray, masks: np.ndarray, canvas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Expected pixel counts and boxes of one view.
-
-    Args:
-        instance: Segmentation ids (H, W).
-        depth: Counts (H, W).
-        masks: Amodal masks (I, H, W) bool.
-        canvas: Amodal masks (I, 3H, 3W) bool, with the image in the middle.
-
-    Returns:
-        px_count_all, px_count_valid, px_count_visib (I, 3); bbox_obj and bbox_visib (I, 2, 4).
-    """
+    """Expected pixel counts and boxes of one view. `instance`: segmentation ids (H, W). `depth`: counts (H, W). `masks`: amodal masks (I,
+    H, W) bool. `canvas`: amodal masks (I, 3H, 3W) bool, with the image in the middle. Returns px_count_all, px_count_valid, px_count_visib
+    (I, 3); bbox_obj and bbox_visib (I, 2, 4)."""
     height, width = instance.shape
     pixels, boxes = np.zeros((len(masks), 3), int), np.zeros((len(masks), 2, 4), int)
     for i, (full, inside) in enumerate(zip(canvas, masks, strict=True)):

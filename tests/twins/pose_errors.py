@@ -35,17 +35,8 @@ def te(estimated_translation, true_translation) -> float:
 
 
 def match_poses(scores: list[float], errors: np.ndarray, threshold: float, valid: list[bool]) -> dict[int, int]:
-    """Greedy matching in one image and object.
-
-    Args:
-        scores: Of each estimate.
-        errors: (estimates, instances).
-        threshold: Of correctness.
-        valid: Whether an instance can be matched.
-
-    Returns:
-        Instance -> estimate.
-    """
+    """Greedy matching in one image and object. `scores`: of each estimate. `errors`: (estimates, instances). `threshold`: of correctness.
+    `valid`: whether an instance can be matched. Returns instance -> estimate."""
     matched: dict[int, int] = {}
     for estimate in sorted(range(len(scores)), key=lambda index: scores[index], reverse=True):
         best, best_error = -1, threshold

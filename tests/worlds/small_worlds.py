@@ -125,14 +125,9 @@ def run_ticks(simulation: Simulation, ticks: int) -> list[TickReport]:
 
 
 def place_cubes(config: Config, device: wp.Device, pose: np.ndarray, velocity: np.ndarray | None = None) -> Physics:
-    """Build worlds with a cube each in the real physics, beside a gripper above the tote.
-
-    Args:
-        config: Settings of these worlds.
-        device: Device of the simulation.
-        pose: Position [m] and quaternion xyzw of the cubes (world, 7).
-        velocity: Their linear velocity (world, 3) [m/s]; None: at rest.
-    """
+    """Build worlds with a cube each in the real physics, beside a gripper above the tote. `config`: settings of these worlds. `device`:
+    device of the simulation. `pose`: position [m] and quaternion xyzw of the cubes (world, 7). `velocity`: their linear velocity (world, 3)
+    [m/s]; None: at rest."""
     built = build.build_model(config, catalog(CUBE), device)
     physics, worlds, first = Physics(config.physics, built), len(pose), build.GRIPPER_DOFS
     coordinates, velocities = (array.numpy().reshape(worlds, -1) for array in (physics.state.joint_q, physics.state.joint_qd))

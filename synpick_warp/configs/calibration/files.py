@@ -75,14 +75,10 @@ class Calibration:
 
 
 def read_calibration(path: Path, model: str = "", pixel_center: float | None = None) -> Calibration:
-    """Read the intrinsics of a camera from a file of any of the formats, which is detected from its content.
-
-    Args:
-        model: Distortion model, where the file does not name it: four coefficients in a file of OpenCV may be of both.
-        pixel_center: Image coordinates of the first pixel's centre in the file, 0 or 0.5 [px]; None: those of its format.
-
-    Raises ConfigError: the file cannot be read or is of no such format, a value is missing or impossible, or a distortion model is not
-    rendered."""
+    """Read the intrinsics of a camera from a file of any of the formats, which is detected from its content. `model`: distortion model,
+    where the file does not name it: four coefficients in a file of OpenCV may be of both. `pixel_center`: image coordinates of the first
+    pixel's centre in the file, 0 or 0.5 [px]; None: those of its format. Raises ConfigError: the file cannot be read or is of no such
+    format, a value is missing or impossible, or a distortion model is not rendered."""
     from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
     (found,) = run_isolated(_read, [(path, model, pixel_center)], Limits(_SECONDS, _MEMORY))

@@ -82,16 +82,10 @@ def load_config(
 
 
 def override_config(config: Config, settings: Mapping[str, object], source: str = "in the settings passed") -> Config:
-    """Override single settings of a finished configuration, and validate the result.
-
-    Args:
-        settings: Full key, such as "physics.step", -> value; or list of tables or section, such as "bin", -> its rows or content.
-        source: Where `settings` come from, for error messages.
-
-    Raises:
-        ConfigError: A key is unknown, a value is not allowed, values contradict each other, or a setting belongs to splits, which are
-            resolved when a configuration is loaded.
-    """
+    """Override single settings of a finished configuration, and validate the result. `settings`: full key, such as "physics.step", ->
+    value; or list of tables or section, such as "bin", -> its rows or content. `source`: where `settings` come from, for error messages.
+    Raises ConfigError: a key is unknown, a value is not allowed, values contradict each other, or a setting belongs to splits, which are
+    resolved when a configuration is loaded."""
     values: Values = {}
     for key, value in settings.items():
         if key in table_lists() or dataclasses.is_dataclass(value):

@@ -75,14 +75,9 @@ class WriterPool:
     """
 
     def __init__(self, processes: int, slot_bytes: int, *inherited_handles: int) -> None:
-        """
-        Args:
-            processes: Number of processes; 0: tasks run in the calling process.
-            slot_bytes: Maximum size of the images of one task, see `shared_bytes` [B].
-            inherited_handles: File handles that the processes keep open until they exit, such as one that holds a lock.
-
-        Raises OutputError if memory or processes cannot be allocated.
-        """
+        """`processes`: number of processes; 0: tasks run in the calling process. `slot_bytes`: maximum size of the images of one task, see
+        `shared_bytes` [B]. `inherited_handles`: file handles that the processes keep open until they exit, such as one that holds a lock.
+        Raises OutputError if memory or processes cannot be allocated."""
         self._waiting: deque[_QueuedTask] = deque()
         self._running: dict[pool.TaskFuture, _QueuedTask] = {}
         self._answered: deque[pool.TaskFuture] = deque()

@@ -247,14 +247,8 @@ def tile_texture(texture: np.ndarray, tiles: tuple[int, int], said: list[str]) -
 
 def clamp_texture(texture: Any, uv: np.ndarray, axes: tuple[bool, bool], ignored: list[str]) -> tuple[np.ndarray, np.ndarray]:
     """Extend a texture by its border texels as far as texture coordinates reach beyond it (clamp to edge), since textures repeat here.
-
-    Args:
-        texture: (H, W, 3) uint8.
-        uv: Texture coordinates (V, 2), v up.
-        axes: Whether u and v are clamped.
-        ignored: What is not done is added to it: an image that would exceed a quarter of the limit on pixels is not extended.
-
-    Returns the image, and coordinates in it."""
+    `texture`: (H, W, 3) uint8. `uv`: texture coordinates (V, 2), v up. `axes`: whether u and v are clamped. `ignored`: what is not done is
+    added to it: an image that would exceed a quarter of the limit on pixels is not extended. Returns the image, and coordinates in it."""
     sides = np.array(texture.shape[1::-1], np.float64)
     low, high = np.minimum(uv.min(axis=0), 0.0), np.maximum(uv.max(axis=0), 1.0)
     # One texel more, which filtering at the border reads.
@@ -268,14 +262,9 @@ def clamp_texture(texture: Any, uv: np.ndarray, axes: tuple[bool, bool], ignored
 
 
 def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: str, said: list[str]) -> tuple[list[np.ndarray], np.ndarray]:
-    """Merge the materials of several parts into one texture atlas, with base colour factors multiplied in.
-
-    Args:
-        parts: Texture coordinates (V, 2) in 0..1, or None, and the material, of each part.
-        said: Warnings are added to it.
-
-    Returns new texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, C) uint8. Raises
-    CatalogError: the atlas is too large."""
+    """Merge the materials of several parts into one texture atlas, with base colour factors multiplied in. `parts`: texture coordinates (V,
+    2) in 0..1, or None, and the material, of each part. `said`: warnings are added to it. Returns new texture coordinates of each part, one
+    row (1, 2) for parts without a texture; and the atlas (H, W, C) uint8. Raises CatalogError: the atlas is too large."""
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:

@@ -95,15 +95,10 @@ class Notes:
 def read_isolated(
     function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], limits: Limits, error: type[SynpickError], smaller: str, repair: str
 ) -> Iterator[Any]:
-    """Call a function for files, in a process each (`run_isolated`).
-
-    Args:
-        calls: Its arguments; the first is the path, or has it as `path`.
-        smaller: Advice for a file for which time or memory of this machine does not suffice.
-        repair: Advice for a file on which the process crashes.
-
-    Yields what the function returned, or as `error` why there is nothing. Raises SynpickError: as `error`: time or memory does not suffice,
-    so that elsewhere the same file might be read."""
+    """Call a function for files, in a process each (`run_isolated`). `calls`: its arguments; the first is the path, or has it as `path`.
+    `smaller`: advice for a file for which time or memory of this machine does not suffice. `repair`: advice for a file on which the process
+    crashes. Yields what the function returned, or as `error` why there is nothing. Raises SynpickError: as `error`: time or memory does not
+    suffice, so that elsewhere the same file might be read."""
     for (file, *_), result in zip(calls, run_isolated(function, calls, limits), strict=True):
         if isinstance(result, Failure):
             advice = smaller if result.by_machine else repair

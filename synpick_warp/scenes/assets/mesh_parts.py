@@ -52,15 +52,9 @@ def check_indices(faces: np.ndarray, count: int, path: Path) -> None:
 
 
 def find_concave(vertices: np.ndarray, flat: np.ndarray, lengths: np.ndarray, ignored: list[str]) -> np.ndarray:
-    """Find concave polygons: those with a corner that turns against the polygon's normal (Newell's).
-
-    Args:
-        vertices: Positions (V, 3).
-        flat: Vertices of all polygons, one after another (C,).
-        lengths: Number of corners of each polygon (P,).
-        ignored: What is left out is added to it: polygons with too many corners together.
-
-    Returns indices of polygons (N,), in order."""
+    """Find concave polygons: those with a corner that turns against the polygon's normal (Newell's). `vertices`: positions (V, 3). `flat`:
+    vertices of all polygons, one after another (C,). `lengths`: number of corners of each polygon (P,). `ignored`: what is left out is
+    added to it: polygons with too many corners together. Returns indices of polygons (N,), in order."""
     starts, found = np.cumsum(lengths) - lengths, []
     for count in np.unique(lengths[lengths > 3]):
         index = np.flatnonzero(lengths == count)

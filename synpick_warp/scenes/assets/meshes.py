@@ -139,14 +139,9 @@ class MeshFile(NamedTuple):
 
 def read_mesh(path: Path, unit: float, options: MeshOptions = MeshOptions(), report: Callable[[str], None] = ignore) -> MeshFile:
     """Read a mesh file. Parts are merged into one mesh, several materials into a texture atlas; vertex colours are baked into a texture.
-
-    Args:
-        path: A .ply, .obj, .glb, .gltf, .stl, .step or .stp file.
-        unit: Length of the file's unit [m]; STEP files name their own.
-        report: Called with one line if features of the file are ignored or replaced.
-
-    Raises CatalogError: the file cannot be read, has no triangles or invalid ones, or refers to a texture that is missing and is not
-    replaced."""
+    `path`: a .ply, .obj, .glb, .gltf, .stl, .step or .stp file. `unit`: length of the file's unit [m]; STEP files name their own. `report`:
+    called with one line if features of the file are ignored or replaced. Raises CatalogError: the file cannot be read, has no triangles or
+    invalid ones, or refers to a texture that is missing and is not replaced."""
     notes = Notes(options.substitute)
     if path.suffix.lower() in STEP_SUFFIXES:
         unit, options = 1.0, replace(options, unit=options.unit and "of the file")
@@ -187,12 +182,8 @@ def _read_measured(function: Callable[[Any], Any], settings: Any, file: str, own
 def read_cell_mesh(
     file: str, unit: str, sides: tuple[float, float], likely: tuple[float, float], key: str, report: Callable[[str], None] = ignore
 ) -> MeshFile:
-    """Read the mesh of a part of the cell: a bin, or a tool's body.
-
-    Args:
-        file, unit, report: As of `read_mesh`; the unit by its name.
-        sides, likely: Least and largest longest side [m], and those by which another unit is proposed, as value of the setting `key`.
-
+    """Read the mesh of a part of the cell: a bin, or a tool's body. `file`, `unit`, `report`: as of `read_mesh`; the unit by its name.
+    `sides`, `likely`: least and largest longest side [m], and those by which another unit is proposed, as value of the setting `key`.
     Raises CatalogError: as `read_mesh`; or the file is no mesh, has too many triangles, or is too small or too large."""
     path = Path(file)
     if path.suffix.lower() not in SUFFIXES:

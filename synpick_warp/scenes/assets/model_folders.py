@@ -51,13 +51,8 @@ class ModelFile:
 
 
 def list_models(folder: Path, report: Say, fault: Fault) -> list[ModelFile]:
-    """List the objects of a model folder.
-
-    Args:
-        report: Called with each line on what is ignored.
-        fault: Called with the error of each object that cannot be used; it may raise it.
-
-    Raises CatalogError: the folder is missing, cannot be listed or contains no models."""
+    """List the objects of a model folder. `report`: called with each line on what is ignored. `fault`: called with the error of each object
+    that cannot be used; it may raise it. Raises CatalogError: the folder is missing, cannot be listed or contains no models."""
     if not folder.is_dir():
         raise CatalogError(f"models folder {folder}: no such folder; give one of BOP models, or of {_READ}; {PATH_RULE}")
     try:
@@ -116,11 +111,7 @@ def _list_bop(files: list[Path], folder: Path, report: Say) -> tuple[list[ModelF
 
 def _list_own(files: list[Path], found: list[tuple[Path, Path]], folder: Path) -> tuple[list[ModelFile], list[CatalogError]]:
     """Meshes that are not BOP models, and the errors of those that cannot be used. Their obj_ids are positions, also of unusable ones.
-
-    Args:
-        files: Meshes side by side.
-        found: Folder of an object, and its mesh.
-    """
+    `files`: meshes side by side. `found`: folder of an object, and its mesh."""
     models: list[ModelFile] = []
     faults: list[CatalogError] = []
     names: dict[str, Path] = {}

@@ -93,14 +93,9 @@ def _raise(error: CatalogError) -> None:
 
 
 def read_models_info(path: Path, obj_ids: Iterable[int], fault: Callable[[CatalogError], None] = _raise) -> dict[int, FileModelInfo]:
-    """Read models_info.json; an empty dictionary if the file is missing, which is no error.
-
-    Args:
-        obj_ids: Objects that must have an entry; other entries are ignored.
-        fault: Called with the error of an object that has no entry, or one whose diameter or symmetries are invalid. If it does not
-            raise it, the object has no entry in the result.
-
-    Raises CatalogError: the file is not valid JSON."""
+    """Read models_info.json; an empty dictionary if the file is missing, which is no error. `obj_ids`: objects that must have an entry;
+    other entries are ignored. `fault`: called with the error of an object that has no entry, or one whose diameter or symmetries are
+    invalid. If it does not raise it, the object has no entry in the result. Raises CatalogError: the file is not valid JSON."""
     entries = read_entries(path)
     infos = {}
     for obj_id in obj_ids if entries is not None else ():

@@ -31,15 +31,9 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, angle: float) -> tup
     """Compute vertex normals with creases: at each position the triangles form smoothing groups, each with an area-weighted mean.
 
     Two triangles at a position are in one group if their normals differ by at most the crease angle, or by a chain of such. Vertices are
-    matched by position, so that texture seams do not show; a vertex in several groups is split.
-
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3); each vertex is used.
-        angle: Crease angle [°].
-
-    Returns the vertex that each new vertex is a copy of (W,), the first V being 0 to V - 1; faces (F, 3) of new vertices; and their unit
-    normals (W, 3) float32."""
+    matched by position, so that texture seams do not show; a vertex in several groups is split. `vertices`: (V, 3). `faces`: (F, 3); each
+    vertex is used. `angle`: crease angle [°]. Returns the vertex that each new vertex is a copy of (W,), the first V being 0 to V - 1;
+    faces (F, 3) of new vertices; and their unit normals (W, 3) float32."""
     doubled = _doubled_areas(vertices, faces)
     group = _smoothing_groups(_positions(vertices)[faces.reshape(-1)], doubled, angle)
     sums = np.stack([np.bincount(group, np.repeat(doubled[:, axis], 3)) for axis in range(3)], axis=1)

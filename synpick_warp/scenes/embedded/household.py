@@ -77,12 +77,8 @@ def pitcher() -> Shape:
 
 
 def _handle(reach: tuple[float, float, float], section: tuple[float, float], rect: Rect) -> Patch:
-    """Handle towards +x, swept along a superellipse, whose ends lie inside the wall.
-
-    Args:
-        reach: x of its ends, its extent from there, and half the distance between its ends.
-        section: Width and thickness.
-    """
+    """Handle towards +x, swept along a superellipse, whose ends lie inside the wall. `reach`: x of its ends, its extent from there, and
+    half the distance between its ends. `section`: width and thickness."""
     start, out, half = reach
     angles = np.linspace(np.pi / 2, -np.pi / 2, 33)
     bend = 2 / 2.8

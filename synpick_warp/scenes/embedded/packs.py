@@ -160,14 +160,9 @@ def tin(
     twice: bool = False,
     sides: bool = False,
 ) -> Shape:
-    """Make a tin: metal rims at both ends, the label between them.
-
-    Args:
-        ring: Width and depth of an ellipse, or width, depth and radius of the corners of a rounded rectangle [m].
-        top: Print of the upper end: see `_draw_end`.
-        twice: Whether the label has its front twice.
-        sides: Whether the label has its sides alone; the front is printed on the lid.
-    """
+    """Make a tin: metal rims at both ends, the label between them. `ring`: width and depth of an ellipse, or width, depth and radius of the
+    corners of a rounded rectangle [m]. `top`: print of the upper end: see `_draw_end`. `twice`: whether the label has its front twice.
+    `sides`: whether the label has its sides alone; the front is printed on the lid."""
     across, deep, *radius = ring
     outline = modelling.rounded_rectangle(across, deep, radius[0], 10) if radius else modelling.ellipse(across, deep, SIDES)
     # As wide as the texture atlas without padding, as high as the tin between its rims.
@@ -220,15 +215,9 @@ def bottle(
     cap: dict[str, Any],
     label: Label,
 ) -> Shape:
-    """Make a bottle with a screw cap.
-
-    Args:
-        levels: Cross-sections (width, depth, superellipse exponent, z) of the body from the bottom to the neck [m].
-        neck: (radius, z) of the cap's profile, from its lower edge to its top [m].
-        band: First and last level with the label.
-        label_height: [px]
-        body: Colour and seed of the body's plastic.
-    """
+    """Make a bottle with a screw cap. `levels`: cross-sections (width, depth, superellipse exponent, z) of the body from the bottom to the
+    neck [m]. `neck`: (radius, z) of the cap's profile, from its lower edge to its top [m]. `band`: first and last level with the label.
+    `label_height`: [px]. `body`: colour and seed of the body's plastic."""
     images = {"label": wrapper(SHEET - 6, label_height, label), "body": paint.plain(**body), "cap": paint.plain(**cap)}
     texture, at = paint.pack(images, SHEET)
     rings = np.stack([modelling.at_height(modelling.ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])

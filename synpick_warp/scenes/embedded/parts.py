@@ -151,13 +151,9 @@ PIECES = {
 
 
 def _profile(profile: Sequence[tuple[float, float]], width: float, holes: Sequence[Hole]) -> Patch:
-    """Extrude a profile along y, with holes through pairs of parallel edges.
-
-    Args:
-        profile: Corners (x, z), counter-clockwise with x to the right and z up.
-        width: Extent along y, about 0.
-        holes: See `Hole`; the edges are parallel to x or z, and the place is that coordinate.
-    """
+    """Extrude a profile along y, with holes through pairs of parallel edges. `profile`: corners (x, z), counter-clockwise with x to the
+    right and z up. `width`: extent along y, about 0. `holes`: see `Hole`; the edges are parallel to x or z, and the place is that
+    coordinate."""
     corners = np.array(profile)
     ends = [np.column_stack([corners[:, 0], np.full(len(corners), y), corners[:, 1]]) for y in (-width / 2, width / 2)]
     cut: dict[int, list[np.ndarray]] = {edge: [] for edge in range(len(corners))}

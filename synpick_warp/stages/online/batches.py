@@ -121,14 +121,9 @@ class DeviceArray:
         dl_device: tuple[int, int] | None = None,
         copy: bool | None = None,
     ) -> Any:
-        """Export the array; called by `from_dlpack` of the consumer's library.
-
-        Args:
-            stream: The consumer's stream, which will wait for the rendering; -1: it does not.
-            max_version: Not used: the capsule is of the first version, which all libraries read.
-            dl_device: Device that the consumer asks for.
-            copy: Whether the consumer asks for a copy, which stays valid when the batch has expired.
-
+        """Export the array; called by `from_dlpack` of the consumer's library. `stream`: the consumer's stream, which will wait for the
+        rendering; -1: it does not. `max_version`: not used: the capsule is of the first version, which all libraries read. `dl_device`:
+        device that the consumer asks for. `copy`: whether the consumer asks for a copy, which stays valid when the batch has expired.
         Raises BufferError: the batch has expired, or the consumer asks for another device."""
         if dl_device is not None and tuple(dl_device) != self.__dlpack_device__():
             raise BufferError(f"this array lies on {self.device}; import it there, then move it")
@@ -322,13 +317,8 @@ class BatchRing:
     """Renders batches of views into a ring of slots; `render` only launches kernels."""
 
     def __init__(self, group: CameraGroup, layers: tuple[str, ...], depth_scale: float) -> None:
-        """Allocate the slots.
-
-        Args:
-            group: Cameras and their renderer.
-            layers: Names of the layers to render.
-            depth_scale: Millimetres per count of the depth image.
-        """
+        """Allocate the slots. `group`: cameras and their renderer. `layers`: names of the layers to render. `depth_scale`: millimetres per
+        count of the depth image."""
         renderer, sizes = group.renderer, group.sizes
         self.group, self.renderer, self.device, self.depth_scale = group, renderer, renderer.scene.device, depth_scale
         self.views, self.instances = sizes["view"], sizes["instance"]

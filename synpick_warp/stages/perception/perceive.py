@@ -61,13 +61,8 @@ class GraspPlanner:
     """Chooses a target and its suction grasp for the worlds of a batch. Owns its scratch; `plan` only launches kernels."""
 
     def __init__(self, settings: schema.Perception, images: PerceptionImages, arrays: PerceptionArrays) -> None:
-        """Allocate scratch for the views and instances of a batch.
-
-        Args:
-            settings: Settings of perception.
-            images: G-buffers of a batch; unused views have world -1.
-            arrays: Components and contours of the batch.
-        """
+        """Allocate scratch for the views and instances of a batch. `settings`: settings of perception. `images`: g-buffers of a batch;
+        unused views have world -1. `arrays`: components and contours of the batch."""
         self.images, self.arrays = images, arrays
         self.flat = settings.grasp_point == FLAT
         self.device = arrays.largest.device

@@ -20,14 +20,8 @@ class Annotator:
     """Counts the instances' pixels and bounds them by boxes. Owns its scratch; `annotate` only launches."""
 
     def __init__(self, scene: RenderScene, instances: int, views: int, kept: int = 0) -> None:
-        """Allocate scratch.
-
-        Args:
-            scene: Constant data.
-            instances: Instance capacity of a world.
-            views: Maximum number of views of a batch.
-            kept: Number of views whose counts beyond the image are kept from frame to frame.
-        """
+        """Allocate scratch. `scene`: constant data. `instances`: instance capacity of a world. `views`: maximum number of views of a batch.
+        `kept`: number of views whose counts beyond the image are kept from frame to frame."""
         self.scene = scene
         self.border_boxes: Any = allocate_struct(BORDER_BOXES, {"view_instance": views * instances, "one": 1}, scene.device)
         sizes = {"view": views, "world_camera": kept, "instance": instances, "one": 1, "side": 4}

@@ -71,16 +71,10 @@ def allocate_lenses(sizes: dict[str, int], device: wp.Device) -> Any:
 def place_cameras(
     made: Any, cameras: Any, slot: np.ndarray, placed: Mapping[str, np.ndarray], lenses: Sequence[LensMap | None] = ()
 ) -> None:
-    """Set the cameras of the first views of a batch on the host.
-
-    Args:
-        made: As of `allocate_view_cameras`; written.
-        cameras: The scene's.
-        slot: Row of each view's camera in these (view) int32.
-        placed: Matrix, rotation and translation of each view, as fields of `FrameBatch`.
-        lenses: Lens of each of the scene's cameras (None: a pinhole), if views have lenses of their own, by `allocate_lenses`: the same
-            lens before a sensor with the view's matrix. The rays of its pixels are computed from those of the scene.
-    """
+    """Set the cameras of the first views of a batch on the host. `made`: as of `allocate_view_cameras`; written. `cameras`: the scene's.
+    `slot`: row of each view's camera in these (view) int32. `placed`: matrix, rotation and translation of each view, as fields of
+    `FrameBatch`. `lenses`: lens of each of the scene's cameras (None: a pinhole), if views have lenses of their own, by `allocate_lenses`:
+    the same lens before a sensor with the view's matrix. The rays of its pixels are computed from those of the scene."""
     values = camera_arrays(*(placed[key] for key in CAMERA_KEYS))
     if cameras.lenses.ray is not None:
         values["lens"] = cameras.lens.numpy()[slot]

@@ -276,13 +276,8 @@ class DenoisedRenderer:
         self.kept_sources = allocate_struct(KEPT_SOURCES, kept, scene.device)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
-        """Render the radiance of a batch of views, for which `find_damage` was called.
-
-        Args:
-            snapshot: The worlds.
-            shot: The struct `ShotData`.
-            image: The struct `ShadedImage`; written.
-        """
+        """Render the radiance of a batch of views, for which `find_damage` was called. `snapshot`: the worlds. `shot`: the struct
+        `ShotData`. `image`: the struct `ShadedImage`; written."""
         device = self.scene.device
         if self.traces_paths:
             with scope("trace coarse paths", device):

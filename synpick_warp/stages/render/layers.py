@@ -70,18 +70,9 @@ class LayerRenderer:
     """Renders annotation layers. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
 
     def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, instances: int, views: int) -> None:
-        """Allocate scratch, if a layer needs motions.
-
-        Args:
-            names: Layers to render, from `layers.LAYER_TABLE`.
-            sensor: The struct `SensorParameters`.
-            scene: Constant data.
-            instances: Instance capacity of a world.
-            views: Largest number of views in a batch.
-
-        Raises:
-            CatalogError: `names` has classes, and an obj_id is 0 or does not fit into 16 bits.
-        """
+        """Allocate scratch, if a layer needs motions. `names`: layers to render, from `layers.LAYER_TABLE`. `sensor`: the struct
+        `SensorParameters`. `scene`: constant data. `instances`: instance capacity of a world. `views`: largest number of views in a batch.
+        Raises CatalogError: `names` has classes, and an obj_id is 0 or does not fit into 16 bits."""
         self.scene = scene
         self.names = names
         self.sensor = sensor
@@ -95,14 +86,8 @@ class LayerRenderer:
         self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
 
     def render(self, snapshot: Snapshot, shot: Any, out: LayerBuffers, last: Any) -> None:
-        """Render the layers of a batch of views.
-
-        Args:
-            snapshot: The worlds.
-            shot: The struct `ShotData`.
-            out: The arrays of the named layers are written.
-            last: The cameras of the views in the frame before, as those of the views; the same if they do not move.
-        """
+        """Render the layers of a batch of views. `snapshot`: the worlds. `shot`: the struct `ShotData`. `out`: the arrays of the named
+        layers are written. `last`: the cameras of the views in the frame before, as those of the views; the same if they do not move."""
         scene, layer, views = self.scene, layer_scene(self.scene), shot.views
         layer.sensor, layer.follows = self.sensor, snapshot.follows
         if self.motions is not None:

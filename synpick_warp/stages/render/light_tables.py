@@ -70,13 +70,7 @@ def sh_basis(directions: np.ndarray) -> np.ndarray:
 
 def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
     """Prefiltered specular map: the map convolved with GGX lobes, view direction = normal = reflection (split sum; Karis, 2013).
-
-    Args:
-        radiance: (rows, 2 rows, 3).
-
-    Returns:
-        (PREFILTER_LEVELS, rows, 2 rows, 3), for growing roughness.
-    """
+    `radiance`: (rows, 2 rows, 3). Returns (PREFILTER_LEVELS, rows, 2 rows, 3), for growing roughness."""
     rows = radiance.shape[0]
     directions, solid_angles = environment.map_directions(rows)
     incoming = directions.reshape(-1, 3)
@@ -97,11 +91,8 @@ def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
 def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, np.ndarray, list[environment.Lamp]]:
     """Split an environment map into its lamps and the rest.
 
-    A sun that its sIBL set names is the first lamp, with the set's direction; a wide one is treated as any other light of the map.
-
-    Returns:
-        The whole map (BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3), with the set's sun drawn as a disc; the map without its lamps; the lamps.
-    """
+    A sun that its sIBL set names is the first lamp, with the set's direction; a wide one is treated as any other light of the map. Returns
+    the whole map (BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3), with the set's sun drawn as a disc; the map without its lamps; the lamps."""
     radiance = environment.resize_map(light.radiance, environment.BACKGROUND_ROWS)
     if light.sun is None:
         return radiance, *environment.extract_lamps(radiance, max_lamps, int(LAMP_POINTS))
@@ -115,13 +106,8 @@ def separate_lamps(light: EnvironmentMap, max_lamps: int) -> tuple[np.ndarray, n
 
 
 def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None, max_lamps: int = int(MAX_LAMPS)) -> EnvironmentTables:
-    """Precompute the tables of one environment map.
-
-    Args:
-        light: The map.
-        ground: Linear albedo (3) of the table, which replaces the map below the horizon in unoccluded lighting; None: no table.
-        max_lamps: Maximum number of lamps.
-    """
+    """Precompute the tables of one environment map. `light`: the map. `ground`: linear albedo (3) of the table, which replaces the map
+    below the horizon in unoccluded lighting; None: no table. `max_lamps`: maximum number of lamps."""
     radiance, lampless, lamps = separate_lamps(light, max_lamps)
     directions, solid_angles = environment.map_directions(environment.BACKGROUND_ROWS)
     upward = np.maximum(directions[..., 2], 0.0) * solid_angles
@@ -143,19 +129,12 @@ def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None, max
 def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Marginal and conditional CDF of a map's texels, weighted by luminance times solid angle; uniform where the map is black.
 
-    Light from near the horizon has less weight, because most lit surfaces face up and totes have walls. With a table, light from below
-    the horizon has none, because the table blocks it.
+    Light from near the horizon has less weight, because most lit surfaces face up and totes have walls. With a table, light from below the
+    horizon has none, because the table blocks it.
 
     The map is looked up bilinearly, which spreads light half a texel beyond a lamp's edge. So a texel is weighted by the mean of the
-    interpolated map over it: no direction with light has probability 0.
-
-    Args:
-        radiance: (rows, 2 rows, 3).
-        table: Whether a table hides the map below the horizon.
-
-    Returns:
-        Marginal (rows + 1) and conditional (rows, 2 rows + 1), both float32.
-    """
+    interpolated map over it: no direction with light has probability 0. `radiance`: (rows, 2 rows, 3). `table`: whether a table hides the
+    map below the horizon. Returns marginal (rows + 1) and conditional (rows, 2 rows + 1), both float32."""
     rows, columns = radiance.shape[:2]
     directions, solid_angles = environment.map_directions(rows)
     height = directions[..., 2]

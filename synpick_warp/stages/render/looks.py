@@ -64,13 +64,8 @@ _ROW: Any = LookDistribution.numpy_dtype()
 
 
 def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
-    """The struct `LookTable`.
-
-    Args:
-        looks: Distributions and textures.
-        first_texture: Row of `Surfaces` of the first texture, of those in the order of `Looks.all_textures`.
-        device: Device of the arrays.
-    """
+    """The struct `LookTable`. `looks`: distributions and textures. `first_texture`: row of `Surfaces` of the first texture, of those in the
+    order of `Looks.all_textures`. `device`: device of the arrays."""
     drawn: dict[tuple[int, int], tuple[Distribution, float, float]] = {}
     for place, name in SETTINGS.items():
         bounds = settings_of(Randomize)[name].bounds
@@ -177,11 +172,8 @@ def shade_floor(scene: RenderScene, shot: Any, image: Any) -> None:
 
 
 def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[LookPart, int]]) -> tuple[np.ndarray, np.ndarray]:
-    """Sample all parameters of bodies (part, index within it) on the CPU, by the function that the renderer calls.
-
-    Returns:
-        `LookKind` of each parameter (part, look), and the values (body, look, 3) float32.
-    """
+    """Sample all parameters of bodies (part, index within it) on the CPU, by the function that the renderer calls. Returns `LookKind` of
+    each parameter (part, look), and the values (body, look, 3) float32."""
     table = build_look_table(looks, 0, "cpu")
     part, body = (wp.array(column, dtype=wp.int32, device="cpu") for column in zip(*parts, strict=True))
     values = wp.zeros((len(parts), len(Look)), dtype=wp.vec3, device="cpu")
@@ -193,15 +185,9 @@ def draw_parameters(looks: Looks, seed: int, episode: int, parts: list[tuple[Loo
 def draw_looks(looks: Looks, seed: int, episode: int, objects: int, distractors: Mapping[int, str] | None = None) -> dict[str, Any]:
     """Record of the looks of an episode: by part and parameter, of each object and distractor. Textures by index, colours in sRGB.
 
-    Computed on the CPU by the function that the renderer calls; a GPU's values differ by the rounding of logarithms and cosines.
-
-    Args:
-        looks: What is drawn from.
-        seed: Seed of the bake.
-        episode: Index of the episode.
-        objects: Number of the first instances, whose looks are wanted.
-        distractors: Names of the distractors by instance; None: none can be drawn.
-    """
+    Computed on the CPU by the function that the renderer calls; a GPU's values differ by the rounding of logarithms and cosines. `looks`:
+    what is drawn from. `seed`: seed of the bake. `episode`: index of the episode. `objects`: number of the first instances, whose looks are
+    wanted. `distractors`: names of the distractors by instance; None: none can be drawn."""
     distractors = distractors or {}
     instances = [(LookPart.OBJECT, index) for index in (*range(objects), *distractors)]
     scene = (LookPart.EPISODE, LookPart.BACKGROUND, LookPart.BIN, LookPart.TABLE)

@@ -41,14 +41,8 @@ def boundary_sizes(view_sizes: dict[str, int]) -> dict[str, int]:
 
 
 def list_boundaries(scratch: BoundaryScratch, count: int, images: ViewBuffers, out: BoundaryBuffers) -> None:
-    """List the run boundaries of the first `count` views' segmentation ids and amodal masks.
-
-    Args:
-        scratch: Overwritten.
-        count: Views in use.
-        images: Its ids and masks are read.
-        out: Written.
-    """
+    """List the run boundaries of the first `count` views' segmentation ids and amodal masks. `scratch`: overwritten. `count`: views in use.
+    `images`: its ids and masks are read. `out`: written."""
     instance, masks, device = images.instance, masks_of(images), scratch.column_count.device
     counts, runs = scratch.bundle, out.bundle
     scratch.column_count.zero_()

@@ -97,13 +97,8 @@ class PostProcessor:
             self.filtered = allocate(LensArrays, sizes, scene.device).radiance
 
     def process(self, shot: Any, image: Any, out: ViewBuffers) -> None:
-        """Compute the colour images of a batch of views.
-
-        Args:
-            shot: The struct `ShotData`.
-            image: The struct `ShadedImage`.
-            out: `color` is written, and `effects` if any effect is on; else it stays zero.
-        """
+        """Compute the colour images of a batch of views. `shot`: the struct `ShotData`. `image`: the struct `ShadedImage`. `out`: `color`
+        is written, and `effects` if any effect is on; else it stays zero."""
         scene, count = self.scene, shot.views.count
         if self.effects is None:
             color = self.kept if self.kept.size else out.color

@@ -76,15 +76,9 @@ class Rasterizer:
                 render_background(scene, self.background)
 
     def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers | None = None, damage: Any = None) -> None:
-        """Render the G-buffer of a batch of views.
-
-        Args:
-            bodies: The struct `ViewBodies` of these views.
-            views: The struct `Views`.
-            gbuffer: The struct `GBuffer`; written.
-            out: `instance`, `depth` and the amodal masks are written; None: only the G-buffer is needed.
-            damage: The struct `Damage`, if visibility and masks are kept; None: all is damaged.
-        """
+        """Render the G-buffer of a batch of views. `bodies`: the struct `ViewBodies` of these views. `views`: the struct `Views`.
+        `gbuffer`: the struct `GBuffer`; written. `out`: `instance`, `depth` and the amodal masks are written; None: only the G-buffer is
+        needed. `damage`: the struct `Damage`, if visibility and masks are kept; None: all is damaged."""
         scene, visibility, device, masks = self.scene, self.visibility, self.scene.device, masks_of(out)
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         instance, depth = (None, None) if out is None else (out.instance, out.depth)

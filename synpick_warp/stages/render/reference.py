@@ -29,12 +29,7 @@ class ReferenceRenderer:
     """Path tracer for reference images in linear radiance. `shade` only launches kernels."""
 
     def __init__(self, render: Render, seed: int, scene: RenderScene) -> None:
-        """
-        Args:
-            render: Render settings: `samples` and `bounces`.
-            seed: Seed of the data set.
-            scene: Constant data.
-        """
+        """`render`: render settings: `samples` and `bounces`. `seed`: seed of the data set. `scene`: constant data."""
         self.scene = scene
         self.rules = make_path_rules(render, seed, render.samples, ROULETTE)
 

@@ -98,18 +98,10 @@ class Renderer:
     def render(
         self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None, placed: tuple[Any, Any] | None = None
     ) -> None:
-        """Render and annotate a batch of views: the one place that knows the order of the passes.
-
-        Args:
-            snapshot: State of the worlds.
-            views: The struct `Views`; the renderer brings their cameras.
-            out: Written.
-            layers: Written; None: no layers.
-            placed: Cameras of the views in this frame and in the one before, by `place_cameras`; None: the scene has them.
-
-        Raises:
-            ValueError: The batch has more views than there is scratch for.
-        """
+        """Render and annotate a batch of views: the one place that knows the order of the passes. `snapshot`: state of the worlds. `views`:
+        the struct `Views`; the renderer brings their cameras. `out`: written. `layers`: written; None: no layers. `placed`: cameras of the
+        views in this frame and in the one before, by `place_cameras`; None: the scene has them. Raises ValueError: the batch has more views
+        than there is scratch for."""
         if views.count > self.views:
             raise ValueError(f"{views.count} views in a batch; this renderer has scratch for {self.views}")
         if views.count == 0:

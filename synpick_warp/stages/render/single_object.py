@@ -20,14 +20,8 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camera], device: wp.Device) -> RenderScene:
-    """Scene of objects alone, enough to rasterize.
-
-    Args:
-        meshes: The struct `Meshes`.
-        keep: Their owners.
-        cameras: Cameras of one image size.
-        device: Device of the arrays.
-    """
+    """Scene of objects alone, enough to rasterize. `meshes`: the struct `Meshes`. `keep`: their owners. `cameras`: cameras of one image
+    size. `device`: device of the arrays."""
     return replace(
         blank_scene(len(cameras), *cameras[0].resolution, device),
         meshes=meshes,
@@ -39,16 +33,9 @@ def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camer
 
 
 def render_object(scene: RenderScene, model: int, pose: Sequence[float] | np.ndarray = IDENTITY) -> Any:
-    """Render a model from all cameras of a scene.
-
-    Args:
-        scene: The scene; see `object_scene`.
-        model: Row of its meshes.
-        pose: Object to world: x, y, z [m] and quaternion x, y, z, w.
-
-    Returns:
-        The struct `GBuffer`, one view a camera; segmentation id 1 and depth [m] where the object is, 0 and `FAR` elsewhere.
-    """
+    """Render a model from all cameras of a scene. `scene`: the scene; see `object_scene`. `model`: row of its meshes. `pose`: object to
+    world: x, y, z [m] and quaternion x, y, z, w. Returns the struct `GBuffer`, one view a camera; segmentation id 1 and depth [m] where the
+    object is, 0 and `FAR` elsewhere."""
     device, count = scene.device, scene.camera_count
     world = allocate(Snapshot, {"world": 1, "instance": 1, "fixture": len(FIXTURES)}, device)
     world.catalog_index.fill_(model)

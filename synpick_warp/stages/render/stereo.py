@@ -57,14 +57,8 @@ class StereoRenderer:
     """Renders infrared pairs and matches them. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
 
     def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, views: int) -> None:
-        """Allocate scratch.
-
-        Args:
-            names: Layers to render; those that are none of `STEREO_LAYERS` are ignored.
-            sensor: The struct `SensorParameters`.
-            scene: Constant data.
-            views: Largest number of views in a batch.
-        """
+        """Allocate scratch. `names`: layers to render; those that are none of `STEREO_LAYERS` are ignored. `sensor`: the struct
+        `SensorParameters`. `scene`: constant data. `views`: largest number of views in a batch."""
         self.scene, self.sensor = scene, sensor
         self.matches = DEPTH in names
         disparities = count_disparities(sensor.max_disparity)

@@ -84,10 +84,7 @@ def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
 
 def build_levels(shape: TriangleMesh) -> tuple[BinaryBvh, list[BvhLevel]]:
     """Build the binary and the wide BVH of a mesh: by the surface area heuristic, or by medians if that tree is too deep for the stack.
-
-    Raises:
-        CatalogError: Even the balanced tree is too deep.
-    """
+    Raises CatalogError: even the balanced tree is too deep."""
     for constructor in ("sah", "median"):
         binary = build_binary_bvh(shape, constructor)
         if binary.has_one_triangle_leaves():
@@ -164,12 +161,9 @@ def encode_nodes(binary: BinaryBvh, levels: list[BvhLevel], first_node: int, fir
 
 
 def quantize_boxes(binary: BinaryBvh, child: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Quantize the boxes of children (node, WIDTH), enlarged by MARGIN.
-
-    Returns:
-        Corner of each node's box (node, 3) float32 [m], binary exponents of the steps (node, 3), lower and upper corners of the children's
-        boxes (node, WIDTH, 3) uint8 [steps from the node's corner]; those of absent children are inverted.
-    """
+    """Quantize the boxes of children (node, WIDTH), enlarged by MARGIN. Returns corner of each node's box (node, 3) float32 [m], binary
+    exponents of the steps (node, 3), lower and upper corners of the children's boxes (node, WIDTH, 3) uint8 [steps from the node's corner];
+    those of absent children are inverted."""
     absent = (child == ABSENT)[..., None]
     margin = MARGIN * (1.0 + np.abs(np.stack([binary.lower, binary.upper])).max(initial=0.0))
     low = np.where(absent, np.inf, binary.lower[child] - margin)

@@ -35,12 +35,8 @@ _GROUPS = Path("sys/fs/cgroup")
 def list_control_groups(controller: str, root: Path) -> Iterator[tuple[int, Path]]:
     """List the groups that limit this process: version (1 or 2) and folder of each, from its own group up to the root of the hierarchy.
 
-    A container sees its own group as the root. Folders may not exist.
-
-    Args:
-        controller: "memory" or "cpu".
-        root: Folder in which /proc and /sys lie; tests pass another one.
-    """
+    A container sees its own group as the root. Folders may not exist. `controller`: "memory" or "cpu". `root`: folder in which /proc and
+    /sys lie; tests pass another one."""
     for line in read_text(root / "proc/self/cgroup").splitlines():
         _, controllers, path = [*line.split(":", 2), "", ""][:3]
         parts = [part for part in path.split("/") if part not in ("", "..")]

@@ -264,13 +264,9 @@ class Compiler:
     """
 
     def __init__(self, report: Callable[[int, int], None], last: ModuleBuild | None = None) -> None:
-        """Start no thread yet.
-
-        Args:
-            report: Progress callback (ready, total): whenever a module begins or is ready, and every `REPORT_INTERVAL` meanwhile; not
-                called if the kernel cache has all.
-            last: A module that is compiled after all others, so that the kernel cache has all if it has this one.
-        """
+        """Start no thread yet. `report`: progress callback (ready, total): whenever a module begins or is ready, and every
+        `REPORT_INTERVAL` meanwhile; not called if the kernel cache has all. `last`: a module that is compiled after all others, so that the
+        kernel cache has all if it has this one."""
         self.compiled = 0
         self._last = last
         self._report = report

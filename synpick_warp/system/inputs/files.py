@@ -96,14 +96,9 @@ MAX_NAME = 4096
 def path_inside(folder: Path, name: str, source: object, error: type[SynpickError]) -> Path:
     """Resolve a relative name to a path inside a folder. Nothing has to exist there.
 
-    Symbolic links may lead to other places inside the folder, never out of it.
-
-    Args:
-        folder: The folder that must contain the path.
-        name: Relative name with "/" between its parts, as read from the file `source`.
-
-    Raises SynpickError: as `error`: the name is empty, absolute, has parts "..", control characters, or leads out of the folder by a link.
-    """
+    Symbolic links may lead to other places inside the folder, never out of it. `folder`: the folder that must contain the path. `name`:
+    relative name with "/" between its parts, as read from the file `source`. Raises SynpickError: as `error`: the name is empty, absolute,
+    has parts "..", control characters, or leads out of the folder by a link."""
     parts = PurePosixPath(name).parts
     if not parts or len(name) > MAX_NAME or ".." in parts or name.startswith("/") or not name.isprintable():
         raise error(f"{source} names the file {_quote(name)}; allowed: a relative name without .. inside {folder}")
@@ -137,14 +132,9 @@ _Content = TypeVar("_Content")
 
 
 def decode_json(data: bytes, schema: type[_Content], source: object, error: type[SynpickError], advice: str = "") -> _Content:
-    """Decode JSON and validate it against a schema.
-
-    Args:
-        schema: Type of the content as msgspec understands it: a Struct, a TypedDict, `dict[str, int]`, `Any`.
-        source: Where it comes from, for messages: a path, or a path with a line number.
-        advice: End of the message: what to do.
-
-    Raises SynpickError: as `error`, in one line: not JSON, or not of this schema."""
+    """Decode JSON and validate it against a schema. `schema`: type of the content as msgspec understands it: a Struct, a TypedDict,
+    `dict[str, int]`, `Any`. `source`: where it comes from, for messages: a path, or a path with a line number. `advice`: end of the
+    message: what to do. Raises SynpickError: as `error`, in one line: not JSON, or not of this schema."""
     try:
         return msgspec.json.decode(data, type=schema)
     except (ValueError, RecursionError) as fault:  # msgspec's errors are ValueErrors.

@@ -46,13 +46,9 @@ def decode_image(
     data: bytes, source: object, error: type[SynpickError], flags: int = -1, size: tuple[int, int] | None = None
 ) -> np.ndarray:
     """Decode a PNG or JPEG file's content by OpenCV; unchanged greyscale PNG files as a bake writes them by ISA-L, which is faster.
-
-    Args:
-        source: Where it comes from, for messages.
-        flags: OpenCV's `IMREAD_` flags; -1: unchanged.
-        size: Width and height that it must have [px]; None: any up to MAX_SIDE.
-
-    Returns the image (H, W[, 3]), blue first. Raises SynpickError: as `error`, in one line: it is not an image of that size."""
+    `source`: where it comes from, for messages. `flags`: OpenCV's `IMREAD_` flags; -1: unchanged. `size`: width and height that it must
+    have [px]; None: any up to MAX_SIDE. Returns the image (H, W[, 3]), blue first. Raises SynpickError: as `error`, in one line: it is not
+    an image of that size."""
     stated = None if data.startswith(_TIFF) else image_size(data)
     if stated is None:
         raise error(f"{source} is not an image: neither PNG nor JPEG")

@@ -22,14 +22,8 @@ _WIDE = 512
 
 
 def decode_grey_crop(data: bytes, size: tuple[int, int], rows: slice, columns: slice, bits: int = 8) -> np.ndarray | None:
-    """Decode a crop of a greyscale PNG file whose rows are not filtered, or filtered by "up".
-
-    Args:
-        data: Content of the file.
-        size: Width and height that it must have [px].
-        rows, columns: Of the crop, within the image.
-        bits: Bit depth that it must have: 8 or 16.
-
+    """Decode a crop of a greyscale PNG file whose rows are not filtered, or filtered by "up". `data`: content of the file. `size`: width
+    and height that it must have [px]. `rows`, `columns`: of the crop, within the image. `bits`: bit depth that it must have: 8 or 16.
     Returns the crop (rows, columns), uint8 or big-endian uint16; None: the file is of another kind or size, or damaged."""
     width, height = size
     stream = _join_data(data, width, height, bits)

@@ -22,16 +22,10 @@ _ADVICE = "restore the file, or bake the data set again"
 def list_members(shard: Path, advice: str = _ADVICE, *, extended: bool = False) -> list[tuple[str, int, int]]:
     """List the members of a tar file: name, offset and size [B]. Only headers are read; members must be regular files, as in shards.
 
-    Python's tarfile calls itself for each extended header, and so ends in a RecursionError on a chain of them.
-
-    Args:
-        shard: The file.
-        advice: What to do if it is damaged.
-        extended: Whether extended headers (POSIX.1-2001) are passed over, which shards of others have for times of fractions of a second;
-            those that rename or resize a member are never taken.
-
-    Raises DatasetError: the file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
-    """
+    Python's tarfile calls itself for each extended header, and so ends in a RecursionError on a chain of them. `shard`: the file. `advice`:
+    what to do if it is damaged. `extended`: whether extended headers (POSIX.1-2001) are passed over, which shards of others have for times
+    of fractions of a second; those that rename or resize a member are never taken. Raises DatasetError: the file cannot be read, is
+    truncated, or has another member: a link, a device, a sparse file, an extended header."""
     check_regular_file(shard, MAX_SHARD, DatasetError)
     members = []
     try:

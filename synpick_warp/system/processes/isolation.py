@@ -110,11 +110,8 @@ atexit.register(_server.stop)
 
 
 def run_isolated(function: Callable[..., Any], calls: Sequence[tuple[Any, ...]], limits: Limits) -> Iterator[Any]:
-    """Call a function with each tuple of arguments, in a process each, as many at a time as there are usable cores.
-
-    Args:
-        function: Function at the top of a module: it is pickled by name, and the process imports it.
-        calls: Arguments of each call; they are pickled.
+    """Call a function with each tuple of arguments, in a process each, as many at a time as there are usable cores. `function`: function at
+    the top of a module: it is pickled by name, and the process imports it. `calls`: arguments of each call; they are pickled.
 
     Yields, for each call, in order and as soon as it and all before it have ended: its result, the `SynpickError` that it raised, or a
     `Failure`. Raises ProcessError: no process can be started."""
@@ -191,12 +188,8 @@ def _open_scratch() -> BinaryIO:
 
 
 def _outcome(end: tuple[int, bool] | None, stream: BinaryIO, limits: Limits) -> Any:
-    """Result of a call, unpickled from `stream`, or a `Failure`, by how its process ended.
-
-    Args:
-        end: Exit status, as of subprocess, and whether the time was over; None: the link was closed.
-        stream: The file into which the process wrote its result.
-    """
+    """Result of a call, unpickled from `stream`, or a `Failure`, by how its process ended. `end`: exit status, as of subprocess, and
+    whether the time was over; None: the link was closed. `stream`: the file into which the process wrote its result."""
     if end is None:
         return _STOPPED
     code, timed_out = end

@@ -225,15 +225,10 @@ class WorkerPool:
 
     def submit(self, task: Callable[[Any], Any], affinity: int | None = None, *, drain: bool = True) -> TaskFuture:
         """Send a task to the process with the fewest unanswered tasks; returns its future, which later calls of `receive`, `wait` and
-        `submit` set.
-
-        Args:
-            task: The task; see `WorkerProgram`.
-            affinity: Equal numbers choose the same process, unless it has `_SLACK` more than another; None: any.
-            drain: Receive available results first, so that a process that waits for its answer to be read takes the task. Needless if
-                the caller bounds the unanswered tasks, and both tasks and results are small.
-
-        Raises DeadProcessError: a process died."""
+        `submit` set. `task`: the task; see `WorkerProgram`. `affinity`: equal numbers choose the same process, unless it has `_SLACK` more
+        than another; None: any. `drain`: receive available results first, so that a process that waits for its answer to be read takes the
+        task. Needless if the caller bounds the unanswered tasks, and both tasks and results are small. Raises DeadProcessError: a process
+        died."""
         future: TaskFuture = TaskFuture()
         if self._runs_here:
             try:

@@ -63,13 +63,8 @@ class SharedSlots:
     """Slots of equal size in shared memory, each for the arrays of one task. The caller closes `handle` when it has been passed on."""
 
     def __init__(self, count: int, slot_bytes: int, copy_threads: int = 0) -> None:
-        """
-        Args:
-            count: Number of slots.
-            slot_bytes: Maximum size of the arrays of one task, see `shared_bytes` [B].
-            copy_threads: Threads that copy arrays; 0: `put` itself does.
-
-        Raises OSError: memory or descriptors are used up."""
+        """`count`: number of slots. `slot_bytes`: maximum size of the arrays of one task, see `shared_bytes` [B]. `copy_threads`: threads
+        that copy arrays; 0: `put` itself does. Raises OSError: memory or descriptors are used up."""
         self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
         self.free = list(range(count))
         """Indices of the slots that no task uses."""

@@ -201,12 +201,8 @@ COSINE = 0.8
 
 def shadow(device: wp.Device, size: int, degrees: float, height: float, turn: float) -> tuple[np.ndarray, np.ndarray]:
     """Visible fraction of a lamp on a plane beside a sheet at `height` [m]: rendered and exact (row, column), NaN where the sheet is seen.
-
-    Args:
-        size: Width of coarse pixels [px].
-        degrees: Angular radius of the lamp.
-        turn: Angle of the sheet's straight edge to the columns of pixels [rad].
-    """
+    `size`: width of coarse pixels [px]. `degrees`: angular radius of the lamp. `turn`: angle of the sheet's straight edge to the columns of
+    pixels [rad]."""
     along = np.array([np.cos(turn), np.sin(turn)])
     pose = (-along[0], -along[1], height, 0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
     config = with_render(coarse_pixel=size, coarse_paths=1, bounces=1, antialias=False)
