@@ -78,10 +78,13 @@ class RenderScene:
     """Owners of the meshes whose handles `meshes` holds."""
     looks: Looks | None = None
     """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
-    has_maps: bool = False
-    """Whether a material has normal, roughness or metallic maps."""
     suction_maps: Any = None
     """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether a material has normal, roughness or metallic maps."""
+        return self.surfaces is not None and self.surfaces.detail.size > 1
 
     @property
     def width(self) -> int:
@@ -408,6 +411,5 @@ def build_render_scene(
         device=device,
         keep=keep,
         looks=looks,
-        has_maps=any(material.maps is not None for material in materials),
         suction_maps=build_suction_scene(catalog, cup_radius, device),
     )

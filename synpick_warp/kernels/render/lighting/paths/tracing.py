@@ -23,6 +23,7 @@ from synpick_warp.kernels.render.lighting.materials import (
     make_table_surface,
     map_table,
     material_at,
+    wear_at,
 )
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
@@ -171,7 +172,7 @@ def make_vertex(
     vertex = Vertex()
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
-    material = material_at(scene.surfaces, surface)
+    material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface))
     roughness = wp.max(material.roughness, min_roughness)
     vertex.brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return vertex
