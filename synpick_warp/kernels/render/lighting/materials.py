@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
-from synpick_warp.kernels.render.lighting.wear import Wear, apply_wear, find_wear
+from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
@@ -116,9 +116,9 @@ class Surface:
     """Direction of growing u in the world, not normalized, and the side of growing v: 1 or -1 times the cross product of normal and
     direction; zero without maps, or where u does not grow."""
     place: wp.vec3
-    """Position in the body's frame, in radii of its bounding sphere; zero without wear."""
+    """Position in the body's frame, in the unit of `lighting.wear`; zero without wear."""
     place_footprint: float
-    """Width of the pixel's footprint on the surface, in these radii."""
+    """Width of the pixel's footprint on the surface, in the same unit."""
 
 
 @wp.struct
@@ -232,8 +232,9 @@ def place_details(  # noqa: F811
     other = meshes.corner[3 * first + 2] - a
     if wp.length_sq(surfaces.wear[surface.row]) > 0.0:
         point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
-        result.place = (point - meshes.center[mesh]) / meshes.radius[mesh]
-        result.place_footprint = footprint / meshes.radius[mesh]
+        unit = wp.min(meshes.radius[mesh], WEAR_LENGTH)
+        result.place = (point - meshes.center[mesh]) / unit
+        result.place_footprint = footprint / unit
     if (surfaces.maps[surface.row] & NORMAL_MAP) != 0:
         u = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first)[3]
         v = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 3)

@@ -5,6 +5,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+WEAR_LENGTH = wp.constant(0.06)
+"""Unit of length of all wear [m]; of smaller bodies, the radius of their bounding sphere."""
 OCTAVES, STAIN_OCTAVES = wp.constant(4), wp.constant(2)
 """Octaves of the noise of rust and dust, and of stains, each of half the amplitude and twice the frequency of the one before."""
 NOISE_SPREAD, STAIN_SPREAD = wp.constant(0.22), wp.constant(0.21)
@@ -14,13 +16,13 @@ LOGISTIC = wp.constant(0.5513)
 EDGE = wp.constant(0.1)
 """Half width of the border of a patch, in units of the noise."""
 RUST_SCALE, STAIN_SCALE, SCRATCH_SCALE = wp.constant(2.5), wp.constant(1.2), wp.constant(2.5)
-"""Lowest frequencies of the noise: cells per radius of the body's bounding sphere; of scratches, along them."""
+"""Lowest frequencies of the noise: cells per unit; of scratches, along them."""
 SCRATCH_FAMILIES = wp.constant(3)
 """Directions of scratches."""
 SCRATCH_DENSITY = wp.constant(22.0)
-"""Frequency of their noise across them, per radius."""
+"""Frequency of their noise across them, per unit."""
 SCRATCH_WIDTH, SCRATCH_BEND = wp.constant(0.06), wp.constant(0.06)
-"""Half width of a scratch where there are most, in units of the noise; and by how much scratches are bent, in radii."""
+"""Half width of a scratch where there are most, in units of the noise; and by how much scratches are bent, in units of length."""
 SCRATCH_BLUR = wp.constant(0.4)
 """Largest blur of a scratch by a pixel's width, in units of the noise: about its range, at which scratches are an even haze."""
 RUST_DARK, RUST_BRIGHT = wp.constant(wp.vec3(0.06, 0.016, 0.006)), wp.constant(wp.vec3(0.29, 0.085, 0.022))
@@ -80,7 +82,7 @@ def patches(noise: float, spread: float, footprint: float, coverage: float) -> f
 @wp.func
 def scratches(state: wp.uint32, place: wp.vec3, footprint: float, amount: float, bend: float) -> float:
     """Mask of scratches, 0 to 1: where sheets in space cut the surface, in a few directions. Sheets are zeros of noise along a normal,
-    bent by `bend` radii, and end where another noise is low."""
+    bent by `bend`, and end where another noise is low."""
     total = float(0.0)
     width = SCRATCH_WIDTH * amount
     blur = wp.min(SCRATCH_DENSITY * footprint, SCRATCH_BLUR)
@@ -98,7 +100,7 @@ def scratches(state: wp.uint32, place: wp.vec3, footprint: float, amount: float,
 @wp.func
 def find_wear(amount: wp.vec4, pattern: int, place: wp.vec3, footprint: float) -> Wear:
     """Wear at a place in the body's frame, for amounts, 0 to 1, of scratches, rust, stains and dust; `footprint` is the pixel's width on
-    the surface, both in radii of the body's bounding sphere; `pattern` is the seed of the noise."""
+    the surface, both in the unit of wear; `pattern` is the seed of the noise."""
     result = Wear()
     state = wp.rand_init(pattern)
     noise = fractal_noise(state, RUST_SCALE * place, RUST_SCALE * footprint, OCTAVES)
@@ -110,7 +112,7 @@ def find_wear(amount: wp.vec4, pattern: int, place: wp.vec3, footprint: float) -
     if amount[2] > 0.0:
         stain = fractal_noise(state + wp.uint32(1), STAIN_SCALE * place, STAIN_SCALE * footprint, STAIN_OCTAVES)
         share[2] = patches(stain[0], STAIN_SPREAD, STAIN_SCALE * footprint, amount[2])
-    share[3] = amount[3] * wp.clamp(0.5 - 1.2 * noise[0], 0.1, 1.0)
+    share[3] = amount[3] * wp.clamp(0.5 - 0.7 * noise[0], 0.1, 1.0)
     result.share = share
     result.tone = wp.clamp(0.5 + 2.0 * noise[1], 0.0, 1.0)
     return result
