@@ -3,7 +3,6 @@
 import contextlib
 import heapq
 import itertools
-import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
@@ -116,7 +115,7 @@ class Ledger:
             elif self.store.stat(MANIFEST_FILE) is None:  # Another worker may have started meanwhile.
                 self.store.put(MANIFEST_FILE, data)
             self.manifest = self.store.get(MANIFEST_FILE, MAX_JSON)
-        ours, theirs = json.loads(data), self._decode(self.manifest)
+        ours, theirs = self._decode(data), self._decode(self.manifest)
         if said := describe_differences(ours, theirs) or describe_inputs(ours.get(INPUTS, {}), theirs.get(INPUTS, {})):
             raise ConfigError(f"{self.store.url} was started by another worker with other settings, objects or lights: {said}; {_ADVICE}")
 

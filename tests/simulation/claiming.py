@@ -16,6 +16,7 @@ import pytest
 from synpick_warp.cloud import ledger, run
 from synpick_warp.cloud.claims import CLAIMS, Claims, LeaseLostError
 from synpick_warp.cloud.ledger import ENTRY, FINISHED, INDEX, Ledger
+from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import config_to_toml
 from synpick_warp.dataset.commit.manifest import encode_manifest, episode_entry, make_manifest
 from synpick_warp.system import clock
@@ -41,7 +42,7 @@ DEATH, FREEZE = 0.005, 0.1
 """Probability of a death at a scheduling point, and of a freeze at an episode."""
 CONFIG = tiny(EPISODES)
 MANIFEST, SETTINGS = make_manifest(CONFIG), config_to_toml(CONFIG)
-MANIFEST_FILE = encode_manifest(MANIFEST)
+MANIFEST_FILE, LAYOUT = encode_manifest(MANIFEST), DataLayout.of(CONFIG)
 
 
 class Report(NamedTuple):
@@ -57,10 +58,13 @@ class Report(NamedTuple):
 
 
 def without_formats(patch: pytest.MonkeyPatch) -> None:
-    """Finalize by marks alone, and make manifest, settings and messages once: tested elsewhere, they take most of the time."""
+    """Finalize by marks alone; make and read manifest, layout, settings and messages once: tested elsewhere, they take most of the time."""
+    decode = Ledger._decode
     patch.setattr(store, "describe_fault", str)
     patch.setattr(run, "finalize_store", _finalize)
     patch.setattr(ledger, "make_manifest", lambda config: MANIFEST)
+    patch.setattr(ledger.DataLayout, "of", lambda config: LAYOUT)
+    patch.setattr(Ledger, "_decode", lambda self, data: MANIFEST if data == MANIFEST_FILE else decode(self, data))
     patch.setattr(ledger, "config_to_toml", lambda config: SETTINGS)
     patch.setattr(ledger, "describe_differences", lambda ours, theirs: "" if ours == theirs else "all")
 

@@ -130,8 +130,9 @@ class FaultyStore:
 
     def list(self, _: Process, folder: str | None, offset: str | None, chunk_size: int) -> Iterator[list[dict[str, Any]]]:
         def carry_out() -> list[dict[str, Any]]:
-            inside = (key for key in sorted(self.objects) if key.startswith(f"{folder}/" if folder else "") and key > (offset or ""))
-            return [self._meta(key) for key, _ in zip(inside, range(chunk_size), strict=False)]
+            prefix, after = f"{folder}/" if folder else "", offset or ""
+            inside = sorted(key for key in self.objects if key.startswith(prefix) and key > after)
+            return [self._meta(key) for key in inside[:chunk_size]]
 
         return iter([self._request(carry_out)])
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 from msgspec import UNSET
-from scipy.signal import fftconvolve
 
 from synpick_warp.apps.validation.scene_files import StoredMask, crop_mask
 from synpick_warp.apps.validation.subjects import ViewSubject
@@ -319,10 +318,11 @@ def _outline(mask: np.ndarray) -> int:
 
 def best_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int]:
     """Columns and rows by which a mask (h, w) is shifted from a silhouette: where their overlap is largest (cross-correlation by FFT)."""
+    from scipy.signal import fftconvolve  # which takes half a second to import
+
     overlap = fftconvolve(mask.astype(np.float32), silhouette[::-1, ::-1].astype(np.float32), mode="full")
     height, width = mask.shape
-    rows = slice(max(0, height - 1 - MARGIN), height + MARGIN)
-    columns = slice(max(0, width - 1 - MARGIN), width + MARGIN)
+    rows, columns = (slice(max(0, size - 1 - MARGIN), size + MARGIN) for size in mask.shape)
     part = np.rint(overlap[rows, columns])
     # Of equal overlaps the smallest shift.
     down, right = np.nonzero(part == part.max())

@@ -52,15 +52,15 @@ _ADVICE = (
 _PASSING = (
     "status code: 5",
     "status code: 429",
-    "SlowDown",
+    "slowdown",
     "timed out",
     "timeout",
     "connection",
     "error sending request",
-    "IncompleteBody",
+    "incompletebody",
     "error decoding",
 )
-"""Signs of transient errors in their text, in upper or lower case. They go before advice, whose signs may be in a key or an answer."""
+"""Signs of transient errors in their text, in lower case. They go before advice, whose signs may be in a key or an answer."""
 _LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
 _SECRETS = re.compile(r"(?:AWS|AZURE|GOOGLE)_.*(?:KEY|SECRET|TOKEN|SAS|PASSWORD|CREDENTIAL).*")
@@ -126,8 +126,8 @@ class Store:
             except (self._errors.AlreadyExistsError, self._errors.PreconditionError):
                 raise
             except (self._errors.BaseError, OSError, NotImplementedError) as error:
-                text = str(error)
-                if any(sign.lower() in text.lower() for sign in _PASSING) and not any(sign in text for sign in _LASTING):
+                text, small = str(error), str(error).lower()
+                if any(sign in small for sign in _PASSING) and not any(sign in text for sign in _LASTING):
                     raise TransientError(describe_fault(error)) from None
                 advice = next((said for signs, said in _ADVICE if any(sign in text for sign in signs)), "")
                 if advice:
