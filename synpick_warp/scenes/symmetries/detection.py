@@ -191,7 +191,7 @@ def _refine(surface: SampledSurface, axis: np.ndarray, point: np.ndarray, fold: 
     matrix = turn_matrix(axis, point, 2.0 * np.pi / fold)
     for _ in range(_STEPS):
         moved = matmul(points, matrix[:3, :3].T) + matrix[:3, 3]
-        distance, index = surface.tree.query(moved)
+        distance, index = surface.exact.query(moved)
         normals = surface.normals[index]
         weight = (dot(matmul(own, matrix[:3, :3].T), normals) > 0.3) / (1.0 + (distance / (2.0 * np.median(distance) + 1e-12)) ** 2)
         rows_of = np.concatenate([np.cross(moved - center, normals), normals], axis=1)

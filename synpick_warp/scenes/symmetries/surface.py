@@ -20,8 +20,9 @@ _TRIANGLES = 8
 """Points of the dense sample to whose triangles distances are measured where those to tangent planes are too large."""
 _APPROXIMATE = 2.0
 """Relative error of the nearest point of the sample where it only has to be within a distance."""
-_NEIGHBOURS = 4
-"""Points of the dense sample whose tangent planes are tried: beside an edge, the nearest point may lie on the other side of it."""
+_NEIGHBOURS, _LEAF = 4, 20
+"""Points of the dense sample whose tangent planes are tried: beside an edge, the nearest point may lie on the other side of it; and of a
+leaf of the tree by which they are found, a fifth faster than with SciPy's 10, which stay where neighbours are approximated."""
 _THIN, _COARSE = 6_000, 150
 """Points of the samples by which candidates are ranked."""
 _GAP = 2.0
@@ -59,7 +60,7 @@ class SampledSurface:
         self.covariance = matmul(offsets.T, offsets) / _DENSE
         used = np.unique(faces)
         picked = [random.permutation(_DENSE)[:_QUERIES], random.permutation(used)[:_QUERIES]]
-        self.tree, self.thin = KDTree(self.points), KDTree(self.points[:: _DENSE // _THIN])
+        self.tree, self.exact, self.thin = KDTree(self.points), KDTree(self.points, _LEAF), KDTree(self.points[:: _DENSE // _THIN])
         queries = np.concatenate([self.points[picked[0]], positions[picked[1]]])
         # In the order of the tree: neighbours are found a third faster one after another.
         self.queries = queries[np.argsort(np.argsort(self.tree.indices, kind="stable")[self.tree.query(queries)[1]], kind="stable")]
@@ -72,7 +73,7 @@ class SampledSurface:
 
     def distances(self, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
         """Distances (N) of points to the surface [m], exact up to twice the limit."""
-        distance, index = self.tree.query(points, _NEIGHBOURS, distance_upper_bound=2.0 * (limit + self.gap))
+        distance, index = self.exact.query(points, _NEIGHBOURS, distance_upper_bound=2.0 * (limit + self.gap))
         index = np.minimum(index, _DENSE - 1)  # Of none within the bound the distance is infinite.
         along = dot(points[:, None] - self.points[index], self.normals[index])
         aside = np.sqrt(np.maximum(distance**2 - along**2, 0.0))
@@ -96,12 +97,11 @@ class SampledSurface:
         off = max(self.distances(moved, limit).max() for moved in _both_ways(self.coarse, matrix))
         if off > limit:
             return float(off)
-        pairs = list(zip(_both_ways(self.queries, matrix), _both_ways(self.every, matrix), strict=True))
-        known = [self.distances(queries, limit) for queries, _ in pairs]
+        known = [self.distances(moved, limit) for moved in _both_ways(self.queries, matrix)]
         off = max(off, *(distances.max() for distances in known))
-        for distances, (_, moved) in zip(known, pairs, strict=True):
+        for way, distances in enumerate(known):
             within = off if limit == np.inf else limit
-            left = moved[distances[self.nearest] + self.spread > within]
+            left = _both_ways(self.every[distances[self.nearest] + self.spread > within], matrix)[way]
             left = left[np.isinf(self.tree.query(left, eps=_APPROXIMATE, distance_upper_bound=within)[0])]
             far = self.distances(left, limit)
             beyond = far > within
