@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,6 +23,7 @@ from synpick_warp.kernels import rng as kernels
 from synpick_warp.system import linear_algebra
 from synpick_warp.system.random_numbers import r2_points, sample_triangles
 from tests.harness.probe import probe
+from tests.harness.processes import module_command
 from tests.twins import rng
 
 # A test below fails by chance once in 10⁵ fixed seeds, so never.
@@ -187,7 +187,7 @@ PROCESSORS = {
 
 
 def fingerprints(folder: Path, core: str) -> dict[str, str]:
-    command = [sys.executable, "-m", "tests.harness.fingerprints", str(folder / core)]
+    command = [*module_command("tests.harness.fingerprints"), str(folder / core)]
     environment = os.environ | {"OPENBLAS_CORETYPE": core} | PROCESSORS[core]
     return json.loads(subprocess.run(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, check=True).stdout.splitlines()[-1])
 

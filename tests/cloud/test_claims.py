@@ -1,7 +1,5 @@
 """Claims: one owner at a time, who learns of his loss before he commits; workers that die are replaced; the set is that of one bake."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import subprocess
@@ -26,6 +24,7 @@ from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
 from tests.cloud.conftest import EPISODES, files, stored, tiny, together
 from tests.harness import scripted_bake
+from tests.harness.processes import module_command
 
 
 def work(url: str, **given):
@@ -277,7 +276,7 @@ def test_a_damaged_plan_is_refused(memory):
 @pytest.mark.slow
 def test_a_killed_worker_leaves_the_set_of_one_bake(prefix, tmp_path):
     """Of three processes one is killed, and its chunk claimed again: a smoke test of what simulations assume."""
-    command = [sys.executable, "-m", "tests.cloud.claiming_worker", prefix, "12", "4", tmp_path / "died"]
+    command = [*module_command("tests.cloud.claiming_worker"), prefix, "12", "4", tmp_path / "died"]
     places = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path / "tmp"), "PYTHONPATH": os.pathsep.join(sys.path)}
     (tmp_path / "tmp").mkdir()
     assert subprocess.run(command, env=os.environ | places, stdout=subprocess.PIPE, check=True).stdout == b"[-9, 0, 0]\n"

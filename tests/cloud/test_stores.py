@@ -36,6 +36,7 @@ from synpick_warp.system.stores.opening import Probe, open_store, probe
 from tests.builders import mistake
 from tests.cloud.conftest import files, stored, tiny
 from tests.harness import scripted_bake
+from tests.harness.processes import module_command
 
 
 @pytest.fixture(params=["memory", "prefix"])
@@ -361,7 +362,7 @@ def test_a_killed_worker_leaves_the_set_of_one_bake_and_home_untouched(prefix, t
     (tmp_path / "home").mkdir()
     with tempfile.TemporaryDirectory(dir="/tmp") as short:  # Paths of sockets have 107 characters.
         places = {"HOME": str(tmp_path / "home"), "TMPDIR": short, "PYTHONPATH": os.pathsep.join(sys.path)}
-        command = [sys.executable, "-m", "tests.cloud.ray_driver", prefix, "6", "2", str(tmp_path / "died")]
+        command = [*module_command("tests.cloud.ray_driver"), prefix, "6", "2", str(tmp_path / "died")]
         ran = subprocess.run(command, env=os.environ | places, capture_output=True, text=True, timeout=300)
         assert ran.returncode == 0, ran.stdout + ran.stderr
         assert not list(Path(short).glob("ray-*"))

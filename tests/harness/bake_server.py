@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+from tests.harness.processes import module_command
 from tests.worlds.small_worlds import QUICK, QUICK_PICKS, catalog
 
 TINY = {
@@ -58,14 +60,8 @@ class BakeServer:
         self._running = False
 
     def __enter__(self) -> BakeServer:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.harness.bake_server"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=Path(__file__).parents[2],
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )
+        command, pipe, environment = module_command("tests.harness.bake_server"), subprocess.PIPE, os.environ | {"OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=Path(__file__).parents[2], env=environment)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -124,6 +120,8 @@ def _serve() -> None:
     os.dup2(2, 1)
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
+    gc.freeze()  # Collections of forks pass over modules.
+    gc.enable()
     warm = False
     for line in sys.stdin:
         request = json.loads(line)

@@ -1,7 +1,5 @@
 """Object store in memory for simulations: requests take virtual time, are refused, lose their answers, arrive late, and are observed."""
 
-from __future__ import annotations
-
 import contextlib
 import types
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Claiming workers under a virtual clock: thousands of schedules with deaths, freezes and faults; nothing is lost, nothing made twice."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import pytest
