@@ -25,6 +25,7 @@ from synpick_warp.exporters.usd.parts import new_asset, save_layer
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.types import MAP_CENTER
 from synpick_warp.testing.exporters import ExporterContract, digests
 from tests.builders import STIRRING, bake_boxes
 from tests.harness import scripted_bake
@@ -108,7 +109,8 @@ def test_a_writer_has_no_thread_beside_its_own(tmp_path, monkeypatch):
 def test_one_file_per_episode_and_shared_assets(folder):
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assets = {f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")}
-    assets |= {"assets/textures/obj_000002.png", *(f"assets/lights/light_00{index}.exr" for index in range(2))}
+    assets |= {f"assets/textures/obj_000002{ending}" for ending in (".png", "_normal.png", "_values.png")}
+    assets |= {*(f"assets/lights/light_00{index}.exr" for index in range(2))}
     assert names == assets | {"000000.usdc", "000004.usdc"}
     assert (folder / "000000.usdc").stat().st_size < 60_000
 
@@ -175,8 +177,8 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
     material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
     shader, _, _ = material.ComputeSurfaceSource()
     assert shader.GetShaderId() == "UsdPreviewSurface"
-    assert shader.GetInput("metallic").Get() == pytest.approx(entry.material.metallic)
-    assert shader.GetInput("roughness").Get() == pytest.approx(entry.material.roughness)
+    metallic, roughness, normal = (shader.GetInput(name) for name in ("metallic", "roughness", "normal"))
+    assert (metallic.Get(), roughness.Get()) == pytest.approx((entry.material.metallic, entry.material.roughness))
     linear, color = srgb_to_linear(entry.material.color), shader.GetInput("diffuseColor")
     if entry.material.texture is None:
         np.testing.assert_allclose(color.Get(), linear, rtol=1e-6)
@@ -188,6 +190,21 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
     np.testing.assert_array_equal(picture[..., ::-1], entry.material.texture)
     reader = UsdShade.Shader(image.GetInput("st").GetConnectedSources()[0][0].source.GetPrim())
     assert reader.GetInput("varname").Get() == "st"
+    expected = (entry.material.maps[..., :2].astype(float) - MAP_CENTER) / (MAP_CENTER - 1)
+    np.testing.assert_allclose(sampled(normal)[..., :2], expected, atol=0.005)
+    np.testing.assert_allclose(np.linalg.norm(sampled(normal), axis=2), 1.0, atol=0.01)
+    assert [each.GetConnectedSources()[0][0].sourceName for each in (roughness, metallic)] == ["g", "b"]
+    np.testing.assert_allclose(sampled(roughness)[..., 1], entry.material.maps[..., 2] / 255.0)
+    np.testing.assert_allclose(sampled(metallic)[..., 2], entry.material.maps[..., 3] / 255.0)
+
+
+def sampled(value: UsdShade.Input) -> np.ndarray:
+    """Texels (H, W, 3) of the texture that an input is connected to, scaled and biased as the node says; it is not a colour."""
+    image = UsdShade.Shader(value.GetConnectedSources()[0][0].source.GetPrim())
+    assert image.GetInput("sourceColorSpace").Get() == "raw"
+    texels = cv2.imread(image.GetInput("file").Get().resolvedPath)[..., ::-1] / 255.0
+    bias = image.GetInput("bias")
+    return texels * list(image.GetInput("scale").Get())[:3] + (list(bias.Get())[:3] if bias else [0.0, 0.0, 0.0])
 
 
 def test_every_visible_mesh_has_a_material_every_collider_friction_and_the_dome_its_map(folder, config):
