@@ -1,6 +1,6 @@
-"""Generator of the documentation's pictures: layers of a view, an animated pick, a grid of training views, a robot cell (CELL.md).
+"""Generator of the documentation's pictures: layers of a view, an animated pick, grids of training views, a robot cell (CELL.md).
 
-Bakes (simulates and renders) three small data sets of embedded objects under embedded environment maps, and runs the first code blocks of
+Bakes (simulates and renders) four small data sets of embedded objects under embedded environment maps, and runs the first code blocks of
 configs/CELL.md, in a temporary folder; takes more than ten minutes on two CPU cores.
 
     python -m tools.draw_pictures                     # into tools/pictures/
@@ -28,7 +28,7 @@ from tools.options import fail, make_parser
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
 PAGE = PICTURES.parents[1] / "configs" / "CELL.md"
-STRIP, PICK, TABLES, CELL = "strip.jpg", "pick.gif", "tables.jpg", "cell.jpg"
+STRIP, PICK, TABLES, USED, CELL = "strip.jpg", "pick.gif", "tables.jpg", "used.jpg", "cell.jpg"
 COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.color_format": "png", "bop.coco": False}
 STRIP_SETTINGS = COMMON | {
     "bake.mode": "move",
@@ -52,7 +52,14 @@ TABLE_COLUMNS = 4
 """Columns of the grid of training views."""
 TABLE_SETTINGS = {"bake.worlds": 8, "bake.episodes": 8, "bop.coco": False}
 """One episode for each of the eight cameras of `tabletop-train`."""
-BAKES = (("strip", "smoke", STRIP_SETTINGS), ("pick", "smoke", PICK_SETTINGS), ("tables", "tabletop-train", TABLE_SETTINGS))
+USED_SETTINGS = {"bake.mode": "still", "still.views": 0, "bake.worlds": 8, "bake.episodes": 8, "bop.coco": False, "render.coarse_paths": 8}
+USED_SETTINGS |= {"cameras.resolution": [480, 270], "cameras.positions": [[0.0, -0.8, 1.8]], "cameras.ups": [[0.0, 0.0, 1.0]]}
+BAKES = (
+    ("strip", "smoke", STRIP_SETTINGS),
+    ("pick", "smoke", PICK_SETTINGS),
+    ("tables", "tabletop-train", TABLE_SETTINGS),
+    ("used", "bracket-bin", USED_SETTINGS),
+)
 """Folder, preset and settings of each bake."""
 PANEL = (480, 270)
 """Width and height of an image in the strip [px]."""
@@ -82,6 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(write_picture(options.out / STRIP, draw_strip(*baked["strip"])))
             print(write_animation(options.out / PICK, draw_pick(*baked["pick"])))
             print(write_picture(options.out / TABLES, draw_training_views(baked["tables"])))
+            print(write_picture(options.out / USED, draw_training_views(baked["used"])))
             print(write_picture(options.out / CELL, draw_cell(Path(folder))))
     except SynpickError as error:
         return fail("draw_pictures", error)
@@ -128,8 +136,8 @@ def captioned(image: Image, text: str) -> Image:
 
 
 def draw_training_views(episodes: list[Episode]) -> Image:
-    """Grid of views: the first frame of each episode, seen by the camera with the episode's index."""
-    views = [episode.view(0, camera=camera).rgb[..., ::-1] for camera, episode in enumerate(episodes)]
+    """Grid of views: the first frame of each episode, seen by the camera with the episode's index, or the only one."""
+    views = [episode.view(0, camera=camera % len(episode.cameras)).rgb[..., ::-1] for camera, episode in enumerate(episodes)]
     rows = [np.concatenate(views[first : first + TABLE_COLUMNS], axis=1) for first in range(0, len(views), TABLE_COLUMNS)]
     return np.concatenate(rows)
 
