@@ -23,6 +23,7 @@ from synpick_warp.configs.schema import FORMATS
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
+from synpick_warp.kernels.render.lighting.materials import METALLIC_SHIFT, ROUGHNESS_MASK, ROUGHNESS_SHIFT
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE
@@ -189,7 +190,7 @@ def test_one_model_fills_the_tote_in_mode_pick(tmp_path):
 
 
 def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
-    """Factors times the mean of the picture that glTF keeps roughness (green) and metalness (blue) in."""
+    """Factors times the picture that glTF keeps roughness (green) and metalness (blue) in: texel by texel, and the mean."""
     rough = np.zeros((4, 6, 3), np.uint8)
     rough[:, :3], rough[:, 3:] = (9, 100, 200), (9, 200, 240)
     material = PBRMaterial(
@@ -210,8 +211,13 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
     assert surfaces.roughness.numpy()[0] == pytest.approx(0.8 * 150 / 255, abs=1e-3)
     # glTF's factor is linear, as are the renderer's colours.
     assert surfaces.color.numpy()[0] == pytest.approx((1.0, 128 / 255, 0.0), abs=2e-3)
-    assert surfaces.texture_size.numpy()[0].tolist() == [5, 3]
+    # The larger picture decides the size of both.
+    assert surfaces.texture_size.numpy()[0].tolist() == [6, 4]
     assert surfaces.texel.numpy()[0] == pack_texels(np.array([[[200, 100, 50]]], np.uint8))[0]
+    left, right = (surfaces.detail.numpy()[:6].astype(np.int64)[column] for column in (0, 5))
+    for texel, green, blue in ((left, 100, 200), (right, 200, 240)):
+        assert texel >> int(ROUGHNESS_SHIFT) & int(ROUGHNESS_MASK) == pytest.approx(0.8 * green / 255 * 127, abs=1)
+        assert texel >> int(METALLIC_SHIFT) == pytest.approx(0.5 * blue / 255 * 31, abs=1)
 
 
 def test_a_picture_does_not_depend_on_the_unit_of_its_light_map(device):

@@ -110,7 +110,10 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
         (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of PLY, OBJ, glTF"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
-        (["--config", "smook"], 'there is no preset "smook"; presets: full-bin, randomized, smoke, stills, synpick, synpick-hard, '),
+        (
+            ["--config", "smook"],
+            'there is no preset "smook"; presets: bracket-bin, full-bin, randomized, smoke, stills, ',
+        ),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
         (["extra"], '"extra" is neither an option nor the value of one; see synpick-warp bake --help'),
         (["--shard", "-1/4"], "--shard has no value; if -1/4 is one, write --shard=-1/4"),

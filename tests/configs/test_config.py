@@ -73,7 +73,7 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
 
 def test_other_presets_build_on_the_default_preset():
     synpick = ["synpick", "synpick-hard", "synpick-released", "synpick-test"]
-    assert preset_names() == ["full-bin", "randomized", "smoke", "stills", *synpick, "tabletop", "tabletop-train"]
+    assert preset_names() == ["bracket-bin", "full-bin", "randomized", "smoke", "stills", *synpick, "tabletop", "tabletop-train"]
     assert load_config("synpick-released", {}).object_rows == load_config(None, {}).object_rows
     smoke = load_config("smoke", {})
     assert (smoke.move.rounds, smoke.bop.color_format, len(smoke.object_rows)) == (1, "png", 21)
@@ -177,9 +177,9 @@ EVERY_ROW = "keys that may hold for every row: mass, concave, metallic, roughnes
         ("worlds = 3\n", "there is no section worlds, set in {path}; "),
         (
             'preset = "synpik"\n',
-            'there is no preset "synpik" in {path}; presets: full-bin, randomized, smoke, stills, synpick, synpick-hard, ',
+            'there is no preset "synpik" in {path}; presets: bracket-bin, full-bin, randomized, smoke, stills, synpick, synpick-hard, ',
         ),
-        ("preset = 3\n", "preset is 3 in {path}; allowed: full-bin, randomized, smoke, stills, synpick, synpick-hard, "),
+        ("preset = 3\n", "preset is 3 in {path}; allowed: bracket-bin, full-bin, randomized, smoke, stills, synpick, synpick-hard, "),
         ("object_rows = 3\n", "object_rows is 3 in {path}; allowed: [[object_rows]] tables"),
         ("[[object_rows]]\nid = 1\n", "object_rows[0] has no diameter in {path}; a row needs id and diameter"),
         ("[[object_rows]]\nid = 1\nweight = 2\n", "there is no key object_rows[0].weight, set in {path}; keys: id, "),

@@ -351,10 +351,38 @@ def test_normal_and_roughness_maps_are_read_beside_the_base_colour(tmp_path):
         normal[2] = max(normal[2], 1e-6)
         assert np.allclose(texel[3:5], MAP_CENTER + 127 * normal[:2] / np.linalg.norm(normal), atol=1.0)
         assert np.allclose(texel[5:], (color[1], color[2] / 2), atol=1.0)
+    # Equal by the standard: a transform that changes nothing.
+    same = {"index": 0, "extensions": {"KHR_texture_transform": {}}}
+    _, finish, said = Builder(**pbr(**TEXTURE), normalTexture=same).image().attribute("TEXCOORD_0", UV).read(tmp_path)
+    assert (said, finish.texture.shape) == ([], (4, 4, 7))
     moved = {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}
     _, finish, said = Builder(**pbr(**TEXTURE), normalTexture=moved).image().attribute("TEXCOORD_0", UV).read(tmp_path)
     assert said == ["ignored: normalTexture with other texture coordinates"]
     assert finish.texture.shape == (2, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("material", "named"),
+    [
+        ({"normalTexture": {"index": 5}}, "normalTexture, which cannot be read"),
+        ({"normalTexture": {"index": 0}}, "maps without texture coordinates"),
+    ],
+)
+def test_maps_that_cannot_be_used_are_left_out_with_a_line(tmp_path, material, named):
+    _, finish, said = Builder(**pbr(roughnessFactor=0.3), **material).image().read(tmp_path)
+    assert (said, finish.texture, finish.roughness) == ([f"ignored: {named}"], None, 0.3)
+
+
+def test_images_that_are_large_only_together_are_one_line(tmp_path):
+    builder = Builder(**pbr(baseColorTexture={"index": 0}), normalTexture={"index": 1}).attribute("TEXCOORD_0", UV)
+    images = []
+    for size in ((9000, 1), (1, 9000)):
+        file = io.BytesIO()
+        Image.new("RGB", size).save(file, "png")
+        images.append({"bufferView": builder.view(file.getvalue()), "mimeType": "image/png"})
+    builder.with_(images=images, textures=[{"source": 0}, {"source": 1}])
+    with pytest.raises(CatalogError, match=r"a texture with maps of 9000 x 9000 pixels"):
+        builder.read(tmp_path)
 
 
 SKINNED = {"nodes": [{"mesh": 0, "skin": 0}]}

@@ -252,6 +252,15 @@ def test_parts_of_a_glb_are_merged_with_their_transforms_and_materials(tmp_path)
     texel = texels(mesh, finish.texture)
     assert np.all(texel[mesh.vertices[:, 0] < 0.1] == (200, 10, 10, MAP_CENTER, MAP_CENTER, 51, 178))
     assert np.all(texel[mesh.vertices[:, 0] > 0.1] == (0, 255, 0, MAP_CENTER, MAP_CENTER, 255, 26))
+    bumpy = textured_box((200, 10, 10), normalTexture=Image.new("RGB", (8, 8), (200, 128, 220)))
+    _, finish, said = read_told(tmp_path / "a.glb", glb(bumpy, trimesh.creation.box((0.1, 0.1, 0.1))))
+    assert said == ["ignored: maps beside a part without metallic or roughness"]
+    assert finish.texture.shape[2] == 3
+    # Where it has a material, all have maps, which go on beside a narrow image.
+    plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.0, roughnessFactor=1.0))
+    _, finish = read(tmp_path / "a.glb", glb(bumpy, plain))
+    assert finish.texture.shape == (12, 8, 7)
+    assert np.all(finish.texture[8:, :, 3:] == (MAP_CENTER, MAP_CENTER, 255, 0))
     # Parts with one material share its texture.
     mesh, finish = read(tmp_path / "a.glb", glb(red, red.copy().apply_translation((0.3, 0, 0))))
     assert len(mesh.faces) == 24

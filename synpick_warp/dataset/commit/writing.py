@@ -359,15 +359,16 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors and textures, without the names of their files, and over each object: its mesh, material,
-    collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are
-    hashed, too: renaming a field of `Catalog` or `EnvironmentMap` changes every manifest.
+    SHA-256 over objects, lights, distractors, textures and maps, without the names of their files, and over each object: its mesh,
+    material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a field
+    of `Catalog` or `EnvironmentMap` changes every manifest.
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
-    maps = tuple((body.obj_id, body.material.maps) for body in catalog.bodies if body.material.maps is not None)
-    textures |= {"maps": _digest_data(maps)} if maps else {}
-    each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(body) for body in catalog.bodies}
+    maps = {body.obj_id: (body.material.maps,) for body in catalog.bodies if body.material.maps is not None}
+    textures |= {"maps": _digest_data(tuple(maps.values()))} if maps else {}
+    given = [(body, *maps[body.obj_id]) if body.obj_id in maps else body for body in catalog.bodies]
+    each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(data) for body, data in zip(catalog.bodies, given, strict=True)}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 
 

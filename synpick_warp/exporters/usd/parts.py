@@ -9,7 +9,7 @@ Stages are in metres, z up, as everywhere in this package. Imports pxr, so only 
 import errno
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,11 +99,17 @@ def add_faces(stage: Usd.Stage, path: str, vertices: np.ndarray, faces: np.ndarr
 
 
 def add_surface(
-    stage: Usd.Stage, path: str, material: Material, texture: str | None, gain: float = 1.0, repeats: float = 1.0, has_maps: bool = False
+    stage: Usd.Stage,
+    path: str,
+    material: Material,
+    texture: str | None,
+    gain: float = 1.0,
+    repeats: float = 1.0,
+    maps: Collection[str] = (),
 ) -> UsdShade.Material:
     """Add a metallic-roughness material (UsdPreviewSurface). The texture, a file relative to the layer or None, repeats, and is multiplied
-    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates; `has_maps`: the files of `MAPS` lie
-    beside the texture."""
+    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates; `maps`: which of `MAPS` hold, whose
+    files lie beside the texture."""
     surface = UsdShade.Material.Define(stage, path)
     shader = _add_shader(stage, f"{path}/Surface", "UsdPreviewSurface")
     surface.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
@@ -124,13 +130,16 @@ def add_surface(
     place = reader.CreateOutput("result", Sdf.ValueTypeNames.Float2)
     image = _add_image(stage, f"{path}/Texture", texture, "sRGB", place, (*linear, 1.0))
     color.ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
-    if has_maps:
-        normal, values = (texture.replace(".png", ending) for ending in MAPS)
+    normal, values = (texture.replace(".png", ending) for ending in (NORMALS, VALUES))
+    if "normal" in maps:
         image = _add_image(stage, f"{path}/Normals", normal, "raw", place, (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0))
         found = image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
         shader.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(found)
+    if {"roughness", "metallic"} & set(maps):
         image = _add_image(stage, f"{path}/Values", values, "raw", place, (1.0, 1.0, 1.0, 1.0))
         for channel, name in (("g", "roughness"), ("b", "metallic")):
+            if name not in maps:
+                continue
             shader.GetInput(name).ConnectToSource(image.CreateOutput(channel, Sdf.ValueTypeNames.Float))
     return surface
 
@@ -151,8 +160,10 @@ def _add_image(
     return image
 
 
-MAPS = ("_normal.png", "_values.png")
-"""Endings of the files of a material's maps: normals as in glTF, and roughness (green) with metallic (blue)."""
+MAPS = ("normal", "roughness", "metallic")
+"""Maps of a material ..."""
+NORMALS, VALUES = "_normal.png", "_values.png"
+"""... and endings of their files: normals as in glTF, and roughness (green) with metallic (blue)."""
 
 
 def write_texture(library: Path, name: str, material: Material) -> str | None:
@@ -166,7 +177,7 @@ def write_texture(library: Path, name: str, material: Material) -> str | None:
         x, y = (material.maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
         normal = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0))], axis=-1)
         images = np.rint(127.5 * normal + 127.5).astype(np.uint8), np.pad(material.maps[..., 2:], ((0, 0), (0, 0), (1, 0)))
-        for ending, image in zip(MAPS, images, strict=True):
+        for ending, image in zip((NORMALS, VALUES), images, strict=True):
             write_synced(library / file.replace(".png", ending), encode_png(np.ascontiguousarray(image)))
     return file
 

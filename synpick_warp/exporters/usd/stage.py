@@ -16,7 +16,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 from synpick_warp.codes import Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd import episode
-from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
+from synpick_warp.exporters.usd.parts import MAPS, add_label, add_property, add_surface, set_units
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera, Material
@@ -271,8 +271,8 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
     elif "hue" in look:
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
     material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness))
-    has_maps = surface.has_maps and not {"texture", "roughness", "metallic"} & look.keys()
-    add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, has_maps)
+    maps = set(MAPS) - look.keys() if surface.has_maps and "texture" not in look else ()
+    add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, maps)
 
 
 def hue_rotation(degrees: float) -> np.ndarray:

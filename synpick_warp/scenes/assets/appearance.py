@@ -22,6 +22,8 @@ MAX_TEXTURE_SIDE = 2**14
 """Largest side of a texture of tiles [px]."""
 UV_TOLERANCE = 1e-3
 """Texture coordinates may leave 0..1 by this, by rounding."""
+MIN_MAP_SIDE = 4
+"""Least width and height of a texture with maps [px], so that filtering does not bleed across an atlas."""
 TEXTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "JPEG2000", "DDS")
 """Formats that Pillow may decode: rasters only; for others, such as EPS, it starts other programs."""
 
@@ -49,6 +51,11 @@ class FileMaterial:
         """Whether the texture has more channels than colour."""
         return self.texture is not None and self.texture.shape[2] > 3
 
+    @property
+    def is_white_with_maps(self) -> bool:
+        """Whether the texture has maps, and its colours are white, as of files with maps alone."""
+        return self.texture is not None and self.has_maps and bool((self.texture[..., :3] == 255).all())
+
     def complete(self, metallic: float, roughness: float) -> Material:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
@@ -58,11 +65,13 @@ class FileMaterial:
 
     def add_maps(self, **maps: np.ndarray) -> "FileMaterial":
         """Material with normal (H, W, 2), roughness and metallic (H, W, 1) maps, uint8 as of `Material.maps`, of any sizes; those that are
-        not given are flat and constant. The material must state metallic and roughness."""
+        not given are flat and constant. The material must state metallic and roughness. Raises CatalogError: too large together."""
         flat = {"color": (255, 255, 255), "normal": (MAP_CENTER, MAP_CENTER)}
         flat |= {"roughness": (round(255 * (self.roughness or 0.0)),), "metallic": (round(255 * (self.metallic or 0.0)),)}
         planes = maps if self.texture is None else {"color": self.texture, **maps}
-        height, width = (max([4, *(image.shape[axis] for image in planes.values())]) for axis in (0, 1))
+        height, width = (max([MIN_MAP_SIDE, *(image.shape[axis] for image in planes.values())]) for axis in (0, 1))
+        if height * width > MAX_TEXTURE_PIXELS:
+            raise CatalogError(f"a texture with maps of {width} x {height} pixels; allowed: {MAX_TEXTURE_PIXELS} pixels; scale them alike")
         layers = [
             resize(planes[name], (width, height), Image.Resampling.BILINEAR)
             if name in planes
@@ -97,7 +106,7 @@ def plain_color(color: tuple[float, float, float] | None) -> tuple[float, float,
 
 def encode_normals(image: np.ndarray, scale: float = 1.0) -> np.ndarray:
     """Encode a normal map of glTF (H, W, 3) uint8 as x and y (H, W, 2) uint8 of `Material.maps`; `scale` is a factor on x and y."""
-    normals = (image / 127.5 - 1.0) * (scale, scale, 1.0)
+    normals = (image.astype(np.float32) / 127.5 - 1.0) * np.array((scale, scale, 1.0), np.float32)
     # Images from other programs have 127 or 128 where a surface is flat.
     normals[np.abs(image - 127.5) <= 0.5] = 0.0
     normals[..., 2] = np.maximum(normals[..., 2], _ROUNDING)
@@ -279,6 +288,8 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
     atlas, tops = np.zeros((height, width, blocks[0].shape[2]), np.uint8), np.cumsum([0, *(block.shape[0] for block in blocks)])
     for block, top in zip(blocks, tops, strict=False):
         atlas[top : top + block.shape[0], : block.shape[1]] = block
+        # Maps go on beside a narrow block, as mip levels blend across its border.
+        atlas[top : top + block.shape[0], block.shape[1] :, 3:] = block[:, -1:, 3:]
     uvs = []
     for (uv, material), place in zip(parts, index, strict=True):
         uv = np.full((1, 2), 0.5) if uv is None or material.texture is None else uv

@@ -325,7 +325,7 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
     all parts state both, they are averaged by area."""
     if len(parts) == 1:
         return parts[0]
-    parts = _share_maps(parts)
+    parts = _share_maps(parts, notes)
     first = parts[0].material
     if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
         parts = [_unroll(part, notes) for part in parts]
@@ -351,16 +351,32 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
     )
 
 
-def _share_maps(parts: list[MeshPart]) -> list[MeshPart]:
-    """Give all parts maps if one has them, or metallic or roughness differ; parts of one texture still share it."""
+def _share_maps(parts: list[MeshPart], notes: Notes) -> list[MeshPart]:
+    """Give all parts maps if one has them, or metallic or roughness differ; parts of one texture and equal values still share it. Where a
+    part does not state them, the settings do, and maps are dropped with a note."""
     values = {(part.material.metallic, part.material.roughness) for part in parts}
-    if not any(part.material.has_maps for part in parts) and (len(values) == 1 or any(None in each for each in values)):
+    has_maps, complete = any(part.material.has_maps for part in parts), not any(None in each for each in values)
+    if not complete and has_maps:
+        notes.ignored.append("maps beside a part without metallic or roughness")
+        return [
+            replace(part, material=replace(part.material, texture=part.material.texture[..., :3]))
+            if part.material.has_maps and part.material.texture is not None
+            else part
+            for part in parts
+        ]
+    if not complete or (len(values) == 1 and not has_maps):
         return parts
-    made: dict[Any, appearance.FileMaterial] = {}
+    made: dict[Any, np.ndarray | None] = {}
+    shared = []
     for part in parts:
-        key = id(part.material)
-        made[key] = made.get(key) or (part.material if part.material.has_maps else part.material.add_maps())
-    return [replace(part, material=made[id(part.material)]) for part in parts]
+        given = part.material
+        if not given.has_maps:
+            key = id(given.texture), given.metallic, given.roughness
+            if key not in made:
+                made[key] = given.add_maps().texture
+            given = replace(given, texture=made[key])
+        shared.append(replace(part, material=given))
+    return shared
 
 
 def _unroll(part: MeshPart, notes: Notes) -> MeshPart:

@@ -163,7 +163,11 @@ def _read_rows(element: _Element, kinds: dict[str, tuple[str, ...]], body: bytes
     else:
         end = _read_ragged(element, kinds, body, start)
     # Numbers of text have the precision and the range of their types.
-    element.values = {name: (flat.astype(element.kinds[name][-1]), count) for name, (flat, count) in element.values.items()}
+    for name, (flat, count) in element.values.items():
+        values = flat.astype(element.kinds[name][-1])
+        if values.dtype.kind in "iu" and not np.array_equal(values, flat):
+            raise ValueError(f"{name} has a value that is no {values.dtype}")
+        element.values[name] = values, count
     return end
 
 

@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.materials import (
     METALLIC_MAP,
+    METALLIC_MASK,
     METALLIC_SHIFT,
     NORMAL_MAP,
     NORMAL_STEPS,
@@ -130,27 +131,33 @@ def pack_texels(image: np.ndarray) -> np.ndarray:
 def detail_levels(maps: np.ndarray) -> list[np.ndarray]:
     """Mip pyramid of maps (H, W, 4) uint8 as of `Material.maps`, packed (H W) uint32. The variance of the normals below a texel widens
     its roughness (Toksvig, 2005), as the squared GGX width, which is averaged."""
-    x, y = (maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
-    alpha2 = (maps[..., 2] / 255.0) ** 4
-    planes = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0)), alpha2, maps[..., 3] / 255.0], axis=-1).astype(np.float32)
-    levels = [pack_details(planes)]
-    while max(planes.shape[:2]) > 1:
-        height, width = planes.shape[:2]
-        planes = cv2.resize(planes, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
-        levels.append(pack_details(planes))
+    scaled = maps.astype(np.float32)
+    x, y = (scaled[..., :2].transpose(2, 0, 1) - MAP_CENTER) / (MAP_CENTER - 1)
+    # In two images, as OpenCV averages at most four channels where a side is odd.
+    planes = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0))], axis=-1), scaled[..., 2:] / 255.0
+    planes[1][..., 0] **= 4
+    levels = [pack_details(*planes)]
+    while max(planes[0].shape[:2]) > 1:
+        height, width = planes[0].shape[:2]
+        size = max(width // 2, 1), max(height // 2, 1)
+        normals, values = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in planes)
+        planes = normals, values
+        levels.append(pack_details(*planes))
     return levels
 
 
-def pack_details(planes: np.ndarray) -> np.ndarray:
-    """Pack filtered maps (H, W, 5) into texels (H W) uint32, the layout of `Surfaces.detail`: mean normal, squared GGX width, metallic."""
-    planes = planes.reshape(-1, 5).astype(np.float64)
-    length = np.clip(np.linalg.norm(planes[:, :3], axis=1), 1e-3, 1.0)
+def pack_details(normals: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Pack filtered maps into texels (H W) uint32, the layout of `Surfaces.detail`: mean normals (H, W, 3), squared GGX width and metallic
+    (H, W, 2)."""
+    normals, (alpha2, metallic) = normals.reshape(-1, 3), values.reshape(-1, 2).T
+    length = np.clip(np.linalg.norm(normals, axis=1), 1e-3, 1.0)
     # Variance of a von Mises-Fisher distribution of normals along one axis, by the length of their mean (Banerjee et al., 2005).
     variance = (1.0 - length**2) / (length * (3.0 - length**2))
-    roughness = np.clip(planes[:, 3] + 2.0 * variance, 0.0, 1.0) ** 0.25
-    x, y = np.rint(planes[:, :2].T / length * float(NORMAL_STEPS)).astype(np.int64) + int(NORMAL_ZERO)
-    packed = x | y << int(TEXEL_BITS) | np.rint(roughness * int(ROUGHNESS_MASK)).astype(np.int64) << int(ROUGHNESS_SHIFT)
-    return (packed | np.rint(31.0 * planes[:, 4]).astype(np.int64) << int(METALLIC_SHIFT)).astype(np.uint32)
+    roughness = np.clip(alpha2 + 2.0 * variance, 0.0, 1.0) ** 0.25
+    x, y = np.rint(np.clip(normals[:, :2].T / length, -1.0, 1.0) * float(NORMAL_STEPS)).astype(np.int32) + int(NORMAL_ZERO)
+    packed = (x | y << int(TEXEL_BITS)).astype(np.uint32)
+    packed |= np.rint(roughness * int(ROUGHNESS_MASK)).astype(np.uint32) << int(ROUGHNESS_SHIFT)
+    return packed | np.rint(metallic * int(METALLIC_MASK)).astype(np.uint32) << int(METALLIC_SHIFT)
 
 
 def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
@@ -221,14 +228,15 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     texels: list[np.ndarray] = []
     details: list[np.ndarray] = []
     total = 0
-    for row, (material, chain) in enumerate(zip(materials, chains, strict=True)):
+    mapped = map_in_threads(lambda material: None if material.maps is None else detail_levels(material.maps), materials)
+    for row, (chain, levels) in enumerate(zip(chains, mapped, strict=True)):
         packed = [pack_texels(image) for image in chain]
         texels += packed
-        details += packed if material.maps is None else detail_levels(material.maps)
+        details += packed if levels is None else levels
         for level, image in enumerate(packed):
             first_texel[row, level] = total
             total += len(image)
-    if all(material.maps is None for material in materials) or not texels:
+    if all(levels is None for levels in mapped):
         details = [np.zeros(1, np.uint32)]
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()

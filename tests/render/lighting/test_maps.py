@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.lighting import wear
 from synpick_warp.kernels.render.lighting.materials import ROUGHNESS_MASK, ROUGHNESS_SHIFT
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import MAP_CENTER, Material
-from synpick_warp.stages.render.scene import detail_levels
+from synpick_warp.stages.render.scene import detail_levels, mip_levels
 from tests.worlds.shapes import FLAT, camera, sheet, sun, surface
 from tests.worlds.toy_scene import render_objects
 
@@ -80,6 +80,13 @@ def test_normals_below_a_texel_widen_its_roughness():
     length = np.cos(np.arcsin(x / 127))
     widened = (0.2**4 + 2.0 * (1.0 - length**2) / (length * (3.0 - length**2))) ** 0.25
     assert all(np.all(np.abs(level - widened * 127) <= 1) for level in levels[1:])
+
+
+@pytest.mark.parametrize("size", [(5, 7), (20, 4), (1, 9), (6, 1)])
+def test_maps_of_any_size_have_the_mip_levels_of_their_texture(device, size):
+    material = mapped(64 / 127, 0.0, size=size)
+    assert [level.size for level in detail_levels(material.maps)] == [level.size // 3 for level in mip_levels(material.texture)]
+    np.testing.assert_allclose(radiance(device, SQUARE, material), radiance(device, SQUARE, mapped(64 / 127, 0.0)), rtol=1e-3)
 
 
 # ---- wear ----

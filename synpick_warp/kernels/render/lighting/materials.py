@@ -35,8 +35,8 @@ NORMAL_STEPS = wp.constant(511.0)
 """Steps of a map's normal from 0 to 1."""
 ROUGHNESS_SHIFT, ROUGHNESS_MASK = wp.constant(20), wp.constant(127)
 """Place of a map's roughness among the bits of a texel, and its largest packed value."""
-METALLIC_SHIFT = wp.constant(27)
-"""Place of a map's metallic, whose largest packed value is 31."""
+METALLIC_SHIFT, METALLIC_MASK = wp.constant(27), wp.constant(31)
+"""The same of a map's metallic."""
 MIN_TILT = wp.constant(0.1)
 """Lower bound of the cosine between surface normal and view direction, which limits a pixel's footprint at grazing angles."""
 TRIANGLE_RECORDS = wp.constant(5)
@@ -224,18 +224,23 @@ def place_details(  # noqa: F811
     footprint: float,
     to_world: wp.mat33,
 ) -> Surface:
-    """Shading data with tangent and place. The tangent is that of the triangle: the gradient of its texture coordinate u."""
+    """Shading data with tangent and place. The tangent is that of the triangle: the edge along which only u grows."""
     result = surface
+    wear = surfaces.wear[surface.row]
+    is_worn = wear[0] + wear[1] + wear[2] + wear[3] > 0.0
+    is_bumpy = (surfaces.maps[surface.row] & NORMAL_MAP) != 0
+    if not is_worn and not is_bumpy:
+        return result
     first = meshes.first_triangle[mesh] + triangle
     a = meshes.corner[3 * first]
     edge = meshes.corner[3 * first + 1] - a
     other = meshes.corner[3 * first + 2] - a
-    if wp.length_sq(surfaces.wear[surface.row]) > 0.0:
+    if is_worn:
         point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
         unit = wp.min(meshes.radius[mesh], WEAR_LENGTH)
         result.place = (point - meshes.center[mesh]) / unit
         result.place_footprint = footprint / unit
-    if (surfaces.maps[surface.row] & NORMAL_MAP) != 0:
+    if is_bumpy:
         u = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first)[3]
         v = read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 3)
         toward_b = wp.vec2(read_flat_record(surfaces.triangle, TRIANGLE_RECORDS * first + 1)[3] - u, v[1] - v[0])
@@ -389,7 +394,12 @@ def decode_detail(surfaces: RandomizedSurfaces, index: int) -> wp.vec4:
     x = float((texel & TEXEL_MASK) - NORMAL_ZERO)
     y = float(((texel >> TEXEL_BITS) & TEXEL_MASK) - NORMAL_ZERO)
     roughness = float((texel >> ROUGHNESS_SHIFT) & ROUGHNESS_MASK)
-    return wp.vec4(x / NORMAL_STEPS, y / NORMAL_STEPS, roughness / float(ROUGHNESS_MASK), float((texel >> METALLIC_SHIFT) & 31) / 31.0)
+    return wp.vec4(
+        x / NORMAL_STEPS,
+        y / NORMAL_STEPS,
+        roughness / float(ROUGHNESS_MASK),
+        float((texel >> METALLIC_SHIFT) & METALLIC_MASK) / float(METALLIC_MASK),
+    )
 
 
 @wp.func
@@ -409,7 +419,7 @@ def sample_details(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec4:
 
 @wp.func
 def bump_normal(surface: Surface, x: float, y: float) -> wp.vec3:
-    """Normal mapping (Blinn, 1978; tangent frames as in glTF 2.0): the interpolated normal, tilted by x along u and y along v."""
+    """Normal mapping in a tangent frame, as in glTF 2.0: the interpolated normal, tilted by x along u and y along v."""
     along = wp.vec3(surface.tangent[0], surface.tangent[1], surface.tangent[2])
     along -= wp.dot(along, surface.normal) * surface.normal
     if wp.length_sq(along) == 0.0:

@@ -12,7 +12,8 @@ OCTAVES, STAIN_OCTAVES = wp.constant(4), wp.constant(2)
 NOISE_SPREAD, STAIN_SPREAD = wp.constant(0.22), wp.constant(0.21)
 """Standard deviations of their sums, measured at 400,000 places."""
 LOGISTIC = wp.constant(0.5513)
-"""Quantile of the normal distribution by that of the logistic one, √3 / π."""
+"""Ratio of standard deviations, √3 / π: times it, the quantile of the logistic distribution, log(p / (1 - p)), approximates the normal
+one's."""
 EDGE = wp.constant(0.1)
 """Half width of the border of a patch, in units of the noise."""
 RUST_SCALE, STAIN_SCALE, SCRATCH_SCALE = wp.constant(2.5), wp.constant(1.2), wp.constant(2.5)
@@ -89,11 +90,12 @@ def scratches(state: wp.uint32, place: wp.vec3, footprint: float, amount: float,
     for family in range(SCRATCH_FAMILIES):
         own = state + wp.uint32(8 + family)
         turn = 2.4 * float(family) + 0.7
-        normal = wp.vec3(wp.cos(turn), wp.sin(turn), 0.4 * float(family) - 0.4)
-        distance = wp.abs(wp.noise(own, SCRATCH_DENSITY * (wp.dot(place, normal) + bend)))
-        if distance < width + blur:
+        normal = wp.normalize(wp.vec3(wp.cos(turn), wp.sin(turn), 0.4 * float(family) - 0.4))
+        level = wp.abs(wp.noise(own, SCRATCH_DENSITY * (wp.dot(place, normal) + bend)))
+        if level < width + blur:
+            # Blurred, a scratch is fainter by about as much as it is wider.
             present = wp.smoothstep(0.0, 0.25, wp.noise(own, SCRATCH_SCALE * place))
-            total += present * width / (width + 0.5 * blur) * (1.0 - wp.smoothstep(0.5 * width, width + blur, distance))
+            total += present * width / (width + 0.5 * blur) * (1.0 - wp.smoothstep(0.5 * width, width + blur, level))
     return wp.min(total, 1.0)
 
 

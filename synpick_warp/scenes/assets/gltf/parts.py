@@ -41,6 +41,7 @@ class _Reader:
         self.images = appearance.ImageCache(self.path)
         self.files: dict[int, bytes] = {}
         self.tiles: dict[tuple[int, bool, bool], np.ndarray] = {}
+        self.mapped_textures: dict[tuple[Any, ...], np.ndarray | None] = {}
         self.materials: dict[int, tuple[appearance.FileMaterial, schema.TextureInfo | None]] = {}
 
     def parts(self) -> list[MeshPart]:
@@ -135,9 +136,13 @@ class _Reader:
             )
             name = f"TEXCOORD_{info.texCoord if coordinates is None else coordinates}"
             uv = self.attribute(attributes.get(name), name, (2,), count)
-            if uv is None:
+            if uv is None and material.is_white_with_maps:
+                self.notes.ignored.append("maps without texture coordinates")
+                material = replace(material, texture=None)
+            elif uv is None:
                 raise CatalogError(f"{self.path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
-            material, uv = self.wrapped(material, _transform_uv(uv, info), info)
+            else:
+                material, uv = self.wrapped(material, _transform_uv(uv, info), info)
         if primitive.targets:
             self.notes.ignored.append("morph targets")
         if colors is not None:
@@ -219,16 +224,22 @@ class _Reader:
         """Add the maps of normals, and of roughness and metallic, that have the texture coordinates of the base colour `info`; without one
         those of the normals. Returns the reference to the texture whose coordinates hold."""
         maps: dict[str, np.ndarray] = {}
+        key: list[Any] = [id(material.texture), material.metallic, material.roughness]
         for name, each in (("normalTexture", normal), ("metallicRoughnessTexture", pbr.metallicRoughnessTexture)):
             if each is None or material.metallic is None or material.roughness is None:
                 continue
             if info is not None and self.coordinates(info) != self.coordinates(each):
                 self.notes.ignored.append(f"{name} with other texture coordinates")
                 continue
-            image = self.texture(each)
+            try:
+                image = self.texture(each)
+            except CatalogError:
+                self.notes.ignored.append(f"{name}, which cannot be read")
+                continue
             if image is None:
                 continue
             info = info or each
+            key += [name, id(image), each.scale, pbr.roughnessFactor, pbr.metallicFactor]
             if each is normal:
                 maps["normal"] = appearance.encode_normals(image, each.scale)
             else:
@@ -237,13 +248,23 @@ class _Reader:
                     np.rint(image[..., channel : channel + 1] * min(max(factor, 0.0), 1.0)).astype(np.uint8)
                     for channel, factor in ((1, pbr.roughnessFactor), (2, pbr.metallicFactor))
                 )
-        return (material.add_maps(**maps), info) if maps else (material, info)
+        if not maps:
+            return material, info
+        if tuple(key) not in self.mapped_textures:
+            try:
+                self.mapped_textures[tuple(key)] = material.add_maps(**maps).texture
+            except CatalogError as error:
+                raise CatalogError(f"{self.path}: {error}") from None
+        return replace(material, texture=self.mapped_textures[tuple(key)]), info
 
     def coordinates(self, info: schema.TextureInfo) -> tuple[Any, ...]:
         """By what a texture's coordinates follow from a vertex: their set, transform and wrap modes."""
-        texture = schema.item_at(self.gltf.textures, info.index, "texture", self.path)
-        sampler = None if texture.sampler is None else schema.item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
-        return info.texCoord, info.extensions, sampler and (sampler.wrapS, sampler.wrapT)
+        texture = self.gltf.textures[info.index] if info.index < len(self.gltf.textures) else schema.Texture()
+        default = texture.sampler is None or texture.sampler >= len(self.gltf.samplers)
+        sampler = schema.Sampler() if default else self.gltf.samplers[texture.sampler or 0]
+        transform = (info.extensions and info.extensions.transform) or schema.Transform()
+        coordinates = info.texCoord if transform.texCoord is None else transform.texCoord
+        return coordinates, transform.offset, transform.rotation, transform.scale, sampler.wrapS, sampler.wrapT
 
     def note_ignored(self, material: schema.GltfMaterial) -> None:
         """Note the features of a material that are not used. Occlusion is none: it is that of the geometry."""
