@@ -163,7 +163,7 @@ FRAMES = [{"fl_x": focal, "cx": 1, "cy": 1} for focal in (1.0, 2.0)]
 ONES = '"fx": 1, "fy": 1, "cx": 1, "cy": 1'
 SHAPES = b"(3, 3), }" + 12 * b" ", b"(9999999999999, 3), }"
 LAUGHS = "a0: &a0 [1, 2]\n" + "".join(f"a{n + 1}: &a{n + 1} [*a{n}, *a{n}]\n" for n in range(40)) + "intrinsics: *a40\ncamera_model: *a40\n"
-DAMAGED = "is no calibration file: its reader "
+DAMAGED = "(is no calibration file|cannot be read on this machine): its reader "
 REFUSED = {
     "nothing": ("", "no calibration file"),
     "a list": ("- 1\n- 2\n", "no calibration file"),

@@ -83,7 +83,8 @@ def read_calibration(path: Path, model: str = "", pixel_center: float | None = N
 
     (found,) = run_isolated(_read, [(path, model, pixel_center)], Limits(_SECONDS, _MEMORY))
     if isinstance(found, Failure):
-        raise ConfigError(f"{path} is no calibration file: its reader {found.reason}")
+        verdict = "cannot be read on this machine" if found.by_machine else "is no calibration file"
+        raise ConfigError(f"{path} {verdict}: its reader {found.reason}")
     if isinstance(found, SynpickError):
         raise found
     return found
