@@ -20,12 +20,18 @@ RUST_SCALE, STAIN_SCALE, SCRATCH_SCALE = wp.constant(2.5), wp.constant(1.2), wp.
 """Lowest frequencies of the noise: cells per unit; of scratches, along them."""
 SCRATCH_FAMILIES = wp.constant(3)
 """Directions of scratches."""
+SCRATCH_TURN, SCRATCH_RISE = wp.constant(2.4), wp.constant(0.4)
+"""Step of azimuth [rad], the golden angle, and of height between the normals of their families, which begins at -SCRATCH_RISE."""
 SCRATCH_DENSITY = wp.constant(22.0)
 """Frequency of their noise across them, per unit."""
 SCRATCH_WIDTH, SCRATCH_BEND = wp.constant(0.06), wp.constant(0.06)
 """Half width of a scratch where there are most, in units of the noise; and by how much scratches are bent, in units of length."""
+SCRATCH_END = wp.constant(0.25)
+"""Noise along a scratch from which it has its full strength; below 0 there is none."""
 SCRATCH_BLUR = wp.constant(0.4)
 """Largest blur of a scratch by a pixel's width, in units of the noise: about its range, at which scratches are an even haze."""
+DUST_CONTRAST, TONE_CONTRAST = wp.constant(0.7), wp.constant(2.0)
+"""Change of dust and of the tone of rust about 0.5 by the noise."""
 RUST_DARK, RUST_BRIGHT = wp.constant(wp.vec3(0.06, 0.016, 0.006)), wp.constant(wp.vec3(0.29, 0.085, 0.022))
 """Linear base colour of iron oxides, thick and thin."""
 DUST_COLOR = wp.constant(wp.vec3(0.42, 0.37, 0.30))
@@ -89,12 +95,12 @@ def scratches(state: wp.uint32, place: wp.vec3, footprint: float, amount: float,
     blur = wp.min(SCRATCH_DENSITY * footprint, SCRATCH_BLUR)
     for family in range(SCRATCH_FAMILIES):
         own = state + wp.uint32(8 + family)
-        turn = 2.4 * float(family) + 0.7
-        normal = wp.normalize(wp.vec3(wp.cos(turn), wp.sin(turn), 0.4 * float(family) - 0.4))
+        turn = SCRATCH_TURN * float(family)
+        normal = wp.normalize(wp.vec3(wp.cos(turn), wp.sin(turn), SCRATCH_RISE * float(family - 1)))
         level = wp.abs(wp.noise(own, SCRATCH_DENSITY * (wp.dot(place, normal) + bend)))
         if level < width + blur:
             # Blurred, a scratch is fainter by about as much as it is wider.
-            present = wp.smoothstep(0.0, 0.25, wp.noise(own, SCRATCH_SCALE * place))
+            present = wp.smoothstep(0.0, SCRATCH_END, wp.noise(own, SCRATCH_SCALE * place))
             total += present * width / (width + 0.5 * blur) * (1.0 - wp.smoothstep(0.5 * width, width + blur, level))
     return wp.min(total, 1.0)
 
@@ -114,9 +120,10 @@ def find_wear(amount: wp.vec4, pattern: int, place: wp.vec3, footprint: float) -
     if amount[2] > 0.0:
         stain = fractal_noise(state + wp.uint32(1), STAIN_SCALE * place, STAIN_SCALE * footprint, STAIN_OCTAVES)
         share[2] = patches(stain[0], STAIN_SPREAD, STAIN_SCALE * footprint, amount[2])
-    share[3] = amount[3] * wp.clamp(0.5 - 0.7 * noise[0], 0.1, 1.0)
+    # Dust lies where rust does not.
+    share[3] = amount[3] * wp.clamp(0.5 - DUST_CONTRAST * noise[0], 0.0, 1.0)
     result.share = share
-    result.tone = wp.clamp(0.5 + 2.0 * noise[1], 0.0, 1.0)
+    result.tone = wp.clamp(0.5 + TONE_CONTRAST * noise[1], 0.0, 1.0)
     return result
 
 
