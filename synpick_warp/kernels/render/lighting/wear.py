@@ -24,13 +24,13 @@ SCRATCH_TURN, SCRATCH_RISE = wp.constant(2.4), wp.constant(0.4)
 """Step of azimuth [rad], the golden angle, and of height between the normals of their families, which begins at -SCRATCH_RISE."""
 SCRATCH_DENSITY = wp.constant(22.0)
 """Frequency of their noise across them, per unit."""
-SCRATCH_WIDTH, SCRATCH_BEND = wp.constant(0.06), wp.constant(0.06)
+SCRATCH_WIDTH, SCRATCH_BEND = wp.constant(0.06), wp.constant(0.03)
 """Half width of a scratch where there are most, in units of the noise; and by how much scratches are bent, in units of length."""
 SCRATCH_END = wp.constant(0.25)
 """Noise along a scratch from which it has its full strength; below 0 there is none."""
 SCRATCH_BLUR = wp.constant(0.4)
 """Largest blur of a scratch by a pixel's width, in units of the noise: about its range, at which scratches are an even haze."""
-DUST_CONTRAST, TONE_CONTRAST = wp.constant(0.7), wp.constant(2.0)
+DUST_CONTRAST, TONE_CONTRAST = wp.constant(0.7), wp.constant(4.0)
 """Change of dust and of the tone of rust about 0.5 by the noise."""
 RUST_DARK, RUST_BRIGHT = wp.constant(wp.vec3(0.06, 0.016, 0.006)), wp.constant(wp.vec3(0.29, 0.085, 0.022))
 """Linear base colour of iron oxides, thick and thin."""
@@ -114,7 +114,7 @@ def find_wear(amount: wp.vec4, pattern: int, place: wp.vec3, footprint: float) -
     noise = fractal_noise(state, RUST_SCALE * place, RUST_SCALE * footprint, OCTAVES)
     share = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if amount[0] > 0.0:
-        share[0] = scratches(state, place, footprint, amount[0], SCRATCH_BEND * noise[0])
+        share[0] = scratches(state, place, footprint, amount[0], SCRATCH_BEND * (noise[0] - noise[1]))
     if amount[1] > 0.0:
         share[1] = patches(noise[0], NOISE_SPREAD, RUST_SCALE * footprint, amount[1])
     if amount[2] > 0.0:
