@@ -50,7 +50,7 @@ class AssetSurface:
     texture: str | None
     """File of its texture, relative to the asset library; None: it has none."""
     has_maps: bool = False
-    """Whether the files of its maps lie beside it."""
+    """Whether normal and roughness-metallic maps are stored next to the texture."""
 
     @staticmethod
     def of(name: str, material: Material) -> "AssetSurface":

@@ -147,7 +147,7 @@ def add_surface(
 def _add_image(
     stage: Usd.Stage, path: str, file: str, space: str, place: UsdShade.Output, scale: Sequence[float], bias: Sequence[float] = ()
 ) -> UsdShade.Shader:
-    """Add a texture node (UsdUVTexture) of a file relative to the layer, which repeats: its values times `scale` plus `bias`."""
+    """Add a texture node (UsdUVTexture) with repeat wrapping; its output is texel * `scale` + `bias`. `file`: relative to the layer."""
     image = _add_shader(stage, path, "UsdUVTexture")
     image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(f"./{file}"))
     image.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set(space)

@@ -1,4 +1,4 @@
-"""Material maps and wear: a normal map shades like tilted normals, maps like plain materials, and wear covers what it is told."""
+"""Material maps and wear: normal maps shade like tilted vertex normals, constant maps like plain materials; wear covers its fraction."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_roughness_and_metallic_maps_shade_like_plain_materials(device, roughnes
 
 
 def test_normals_below_a_texel_widen_its_roughness():
-    """Normals of ±20° along x: their mean is flat, and its length cos 20° says their variance."""
+    """Normals tilted by ±20° average to the surface normal; the length of the mean, cos 20°, determines the variance."""
     x = round(np.sin(np.radians(20.0)) * 127)
     maps = np.zeros((8, 8, 4), np.uint8)
     maps[..., 0], maps[..., 1], maps[..., 2] = MAP_CENTER + x * np.where(np.arange(8) % 2, 1, -1), MAP_CENTER, 51

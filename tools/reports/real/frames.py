@@ -15,7 +15,7 @@ from synpick_warp.system.inputs.files import decode_json
 from synpick_warp.system.inputs.image_files import decode_image
 
 CENTER = 0.5
-"""Centre of the first pixel in our coordinates, where the frames have 0 [px]."""
+"""Pixel-centre offset [px]: the frames place the centre of the first pixel at 0, this package at half a pixel."""
 _MILLIMETRES = 1e3
 """In a metre."""
 

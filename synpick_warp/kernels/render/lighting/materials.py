@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
-from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear
+from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear, has_wear
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
@@ -226,8 +226,7 @@ def place_details(  # noqa: F811
 ) -> Surface:
     """Shading data with tangent and place. The tangent is that of the triangle: the edge along which only u grows."""
     result = surface
-    wear = surfaces.wear[surface.row]
-    is_worn = wear[0] + wear[1] + wear[2] + wear[3] > 0.0
+    is_worn = has_wear(surfaces.wear[surface.row])
     is_bumpy = (surfaces.maps[surface.row] & NORMAL_MAP) != 0
     if not is_worn and not is_bumpy:
         return result
@@ -440,7 +439,7 @@ def wear_at(surfaces: Surfaces, surface: Surface) -> Wear:
 def wear_at(surfaces: RandomizedSurfaces, surface: Surface) -> Wear:  # noqa: F811
     """Wear of a surface in a pixel, by the amounts of its row."""
     amount = surfaces.wear[surface.row]
-    if amount[0] + amount[1] + amount[2] + amount[3] > 0.0:
+    if has_wear(amount):
         return find_wear(amount, surfaces.pattern[surface.row], surface.place, surface.place_footprint)
     return Wear()
 
@@ -473,7 +472,7 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> S
             result.roughness = details[2]
         if (maps & METALLIC_MAP) != 0:
             result.metallic = details[3]
-    if wear.share[0] + wear.share[1] + wear.share[2] + wear.share[3] > 0.0:
+    if has_wear(wear.share):
         worn = apply_wear(wear, result.color, result.metallic, result.roughness)
         result.color = worn.color
         result.metallic = worn.metallic

@@ -15,29 +15,31 @@ LOGISTIC = wp.constant(0.5513)
 """Ratio of standard deviations, √3 / π: times it, the quantile of the logistic distribution, log(p / (1 - p)), approximates the normal
 one's."""
 EDGE = wp.constant(0.1)
-"""Half width of the border of a patch, in units of the noise."""
+"""Half width of a patch's soft edge, in noise values."""
 RUST_SCALE, STAIN_SCALE, SCRATCH_SCALE = wp.constant(2.5), wp.constant(1.2), wp.constant(2.5)
 """Lowest frequencies of the noise: cells per unit; of scratches, along them."""
 SCRATCH_FAMILIES = wp.constant(3)
-"""Directions of scratches."""
+"""Number of scratch directions."""
 SCRATCH_TURN, SCRATCH_RISE = wp.constant(2.4), wp.constant(0.4)
-"""Step of azimuth [rad], the golden angle, and of height between the normals of their families, which begins at -SCRATCH_RISE."""
+"""The normal of scratch family k has azimuth k SCRATCH_TURN [rad], a multiple of the golden angle, and height (k - 1) SCRATCH_RISE."""
 SCRATCH_DENSITY = wp.constant(22.0)
-"""Frequency of their noise across them, per unit."""
+"""Noise frequency across scratches [1/unit]."""
 SCRATCH_WIDTH, SCRATCH_BEND = wp.constant(0.06), wp.constant(0.03)
-"""Half width of a scratch where there are most, in units of the noise; and by how much scratches are bent, in units of length."""
+"""Half width of a scratch at amount 1, in noise values, and amplitude of its bending, in units of length."""
 SCRATCH_END = wp.constant(0.25)
-"""Noise along a scratch from which it has its full strength; below 0 there is none."""
+"""Noise value along a scratch at which it reaches full strength; it ends at 0."""
 SCRATCH_BLUR = wp.constant(0.4)
-"""Largest blur of a scratch by a pixel's width, in units of the noise: about its range, at which scratches are an even haze."""
+"""Maximum blur of a scratch by the pixel footprint, in noise values: about the range of the noise, where scratches become uniform haze."""
 DUST_CONTRAST, TONE_CONTRAST = wp.constant(0.7), wp.constant(4.0)
-"""Change of dust and of the tone of rust about 0.5 by the noise."""
+"""Gain of the noise in dust density and rust tone, about a mean of 0.5. These and the values below are chosen by eye."""
 RUST_DARK, RUST_BRIGHT = wp.constant(wp.vec3(0.06, 0.016, 0.006)), wp.constant(wp.vec3(0.29, 0.085, 0.022))
 """Linear base colour of iron oxides, thick and thin."""
 DUST_COLOR = wp.constant(wp.vec3(0.42, 0.37, 0.30))
 """Linear base colour of dust of packing and concrete."""
 OIL_COLOR = wp.constant(wp.vec3(0.35, 0.27, 0.17))
-"""Transmission of a film of used oil."""
+"""Transmittance of a film of used oil."""
+SCRATCH_WHITE, OIL_METALLIC = wp.constant(0.25), wp.constant(0.5)
+"""Blend of a scratched base colour towards white, and factor of oil on metallic."""
 RUST_ROUGHNESS, OIL_ROUGHNESS, DUST_ROUGHNESS, SCRATCH_ROUGHNESS = wp.constant(0.9), wp.constant(0.12), wp.constant(0.95), wp.constant(0.6)
 
 
@@ -56,6 +58,12 @@ class Worn:
     color: wp.vec3
     metallic: float
     roughness: float
+
+
+@wp.func
+def has_wear(amount: wp.vec4) -> bool:
+    """Whether a surface has wear of any kind."""
+    return amount[0] + amount[1] + amount[2] + amount[3] > 0.0
 
 
 @wp.func
@@ -132,7 +140,7 @@ def apply_wear(wear: Wear, color: wp.vec3, metallic: float, roughness: float) ->
     """Change a material by its wear: scratches, rust, stains and dust, one over the other."""
     result = Worn()
     # Below a scratch lies bright metal, or paler plastic.
-    result.color = wp.lerp(color, 0.75 * color + wp.vec3(0.25, 0.25, 0.25), wear.share[0])
+    result.color = wp.lerp(color, wp.vec3(1.0, 1.0, 1.0), SCRATCH_WHITE * wear.share[0])
     result.roughness = wp.lerp(roughness, wp.max(roughness, SCRATCH_ROUGHNESS), wear.share[0])
     # Plastic does not rust.
     rust = metallic * wear.share[1]
@@ -142,5 +150,5 @@ def apply_wear(wear: Wear, color: wp.vec3, metallic: float, roughness: float) ->
     result.roughness = wp.lerp(result.roughness, OIL_ROUGHNESS, wear.share[2])
     result.color = wp.lerp(result.color, DUST_COLOR, wear.share[3])
     result.roughness = wp.lerp(result.roughness, DUST_ROUGHNESS, wear.share[3])
-    result.metallic = metallic * (1.0 - rust) * (1.0 - 0.5 * wear.share[2]) * (1.0 - wear.share[3])
+    result.metallic = metallic * (1.0 - rust) * (1.0 - (1.0 - OIL_METALLIC) * wear.share[2]) * (1.0 - wear.share[3])
     return result
