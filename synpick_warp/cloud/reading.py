@@ -68,9 +68,9 @@ class Copier:
         self.folder = folder
 
     def fetch(self, name: str, digest: str | None = None, limit: int = MAX_JSON) -> bool:
-        """Download an object atomically unless it is cached in the folder; returns whether the file exists afterwards.
-        `digest`: expected SHA-256; None: unchecked. `limit`: maximum size [bytes]. Raises DatasetError: its checksum differs, or its name leads out of the folder; OutputError:
-        the folder cannot be written; SizeError: it is larger."""
+        """Download an object atomically unless it is cached in the folder; returns whether the file exists afterwards. `digest`: expected
+        SHA-256; None: unchecked. `limit`: maximum size [bytes]. Raises DatasetError: its checksum differs, or its name leads out of the
+        folder; OutputError: the folder cannot be written; SizeError: it is larger."""
         path, state = path_inside(self.folder, name, self.store.url, DatasetError), hashlib.sha256()
         if path.exists():
             return True
