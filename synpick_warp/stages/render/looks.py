@@ -9,13 +9,14 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
-from synpick_warp.configs.episodes.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, UNIFORM, Distribution, Randomize
+from synpick_warp.configs.episodes.randomize import CHOICE, FIXED, LOG_UNIFORM, NORMAL, OFF, UNIFORM, Distribution, Randomize
 from synpick_warp.configs.fields import settings_of
 from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
 from synpick_warp.kernels.render.lighting.materials import RandomizedSurfaces, Surfaces
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, RandomizedScene
+from synpick_warp.kernels.render.lighting.wear import NOISE_SIZE, make_noise_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES
 from synpick_warp.kernels.render.visibility.variants import kernel_for
@@ -60,6 +61,10 @@ _MATERIALS = StructArrays(
 )
 """... and all that the materials of views have."""
 
+WEAR = [name for (_, look), name in SETTINGS.items() if Look.SCRATCHES <= look <= Look.DUST]
+"""Settings of wear."""
+NOISE_SEED = 0x77656172
+"""Seed of the noise of wear, "wear" in ASCII: each body shows another part of it."""
 _ROW: Any = LookDistribution.numpy_dtype()
 
 
@@ -123,6 +128,13 @@ def allocate_materials(rows: int, levels: int, device: wp.Device) -> Any:
     return allocate_struct(_MATERIALS, {"material": rows, "level": levels}, device)
 
 
+def make_noise(device: wp.Device) -> wp.array:
+    """Noise table of `kernels.render.lighting.wear`."""
+    noise = wp.empty((int(NOISE_SIZE),) * 3, dtype=wp.uint32, device=device)
+    wp.launch(make_noise_kernel, dim=noise.shape, inputs=[wp.uint32(NOISE_SEED)], outputs=[noise], device=device)
+    return noise
+
+
 class Dresser:
     """Sampler of the materials of each batch of views. Owns a scene with space for them.
 
@@ -146,6 +158,8 @@ class Dresser:
             else:
                 setattr(surfaces, name, values)
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
+        is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
+        surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)
         paths = RandomizedScene()
         for name in PathScene.vars:
             setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))

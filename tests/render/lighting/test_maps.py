@@ -13,6 +13,7 @@ from synpick_warp.kernels.render.lighting import wear
 from synpick_warp.kernels.render.lighting.materials import ROUGHNESS_MASK, ROUGHNESS_SHIFT
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import MAP_CENTER, Material
+from synpick_warp.stages.render.looks import make_noise
 from synpick_warp.stages.render.scene import detail_levels, mip_levels
 from tests.worlds.shapes import FLAT, camera, sheet, sun, surface
 from tests.worlds.toy_scene import render_objects
@@ -93,11 +94,13 @@ def test_maps_of_any_size_have_the_mip_levels_of_their_texture(device, size):
 
 
 @wp.kernel
-def measure_wear_kernel(place: wp.array[wp.vec3], kind: int, amount: float, footprint: float, out: wp.array[wp.vec3]):
+def measure_wear_kernel(
+    noise: wp.array3d[wp.uint32], place: wp.array[wp.vec3], kind: int, amount: float, footprint: float, out: wp.array[wp.vec3]
+):
     index = wp.tid()
     amounts = wp.vec4(0.0, 0.0, 0.0, 0.0)
     amounts[kind] = amount
-    found = wear.find_wear(amounts, 7 * (index % 64), place[index], footprint)
+    found = wear.find_wear(noise, amounts, 7 * (index % 64), place[index], footprint)
     worn = wear.apply_wear(found, wp.vec3(0.5, 0.5, 0.5), 1.0, 0.3)
     out[index] = wp.vec3(worn.color[0], worn.metallic, worn.roughness)
 
@@ -106,7 +109,9 @@ def measure_wear(device, kind: int, amount: float, footprint: float = 0.0) -> np
     """Red, metallic and roughness (N, 3) of a grey metal at places that are drawn uniformly, in 64 patterns."""
     places = wp.array(np.random.default_rng(0).uniform(-1.0, 1.0, (50_000, 3)), dtype=wp.vec3, device=device)
     out = wp.zeros(len(places), dtype=wp.vec3, device=device)
-    wp.launch(measure_wear_kernel, dim=len(places), inputs=[places, kind, amount, footprint], outputs=[out], device=device)
+    wp.launch(
+        measure_wear_kernel, dim=len(places), inputs=[make_noise(device), places, kind, amount, footprint], outputs=[out], device=device
+    )
     return out.numpy()
 
 

@@ -146,7 +146,7 @@ def render_infrared_kernel(
     else:
         point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
         surface = seen_surface(scene, shot.bodies, cameras, view, hit, point, outgoing, shot.views.instances)
-        material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface))
+        material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, False))
         roughness = widen_roughness(material.roughness, surface.normal_spread)
         brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
         ambient = unoccluded_light(scene.lights, which, yaw, brdf)

@@ -190,7 +190,7 @@ def albedo_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row:
     color = wp.vec3(0.0, 0.0, 0.0)
     if int(shot.gbuffer.segment[view, row, column]) != Segment.NOTHING:
         surface = hit_surface(scene, shot, view, row, column)
-        color = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface)).color
+        color = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, False)).color
     return wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
 

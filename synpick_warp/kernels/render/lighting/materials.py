@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
-from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear, has_wear
+from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear, has_wear, mean_wear
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
 from synpick_warp.kernels.render.visibility.variants import VARIANTS, variant_of
@@ -85,13 +85,14 @@ RandomizedSurfaces = variant_of(
     repeats=wp.array[float],
     wear=wp.array[wp.vec4],
     pattern=wp.array[int],
+    noise=wp.array3d[wp.uint32],
 )
 """Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
 More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
-clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise has the seed
-`pattern`."""
+clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
+table `noise`, in a part that the seed `pattern` draws."""
 AnySurfaces = Any
 """`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
@@ -430,17 +431,19 @@ def bump_normal(surface: Surface, x: float, y: float) -> wp.vec3:
 
 
 @wp.func
-def wear_at(surfaces: Surfaces, surface: Surface) -> Wear:
+def wear_at(surfaces: Surfaces, surface: Surface, is_mean: bool) -> Wear:
     """Wear of a surface in a pixel: none."""
     return Wear()
 
 
 @wp.func
-def wear_at(surfaces: RandomizedSurfaces, surface: Surface) -> Wear:  # noqa: F811
-    """Wear of a surface in a pixel, by the amounts of its row."""
+def wear_at(surfaces: RandomizedSurfaces, surface: Surface, is_mean: bool) -> Wear:  # noqa: F811
+    """Wear of a surface in a pixel, by the amounts of its row, or its mean over the whole surface."""
     amount = surfaces.wear[surface.row]
+    if is_mean:
+        return mean_wear(amount)
     if has_wear(amount):
-        return find_wear(amount, surfaces.pattern[surface.row], surface.place, surface.place_footprint)
+        return find_wear(surfaces.noise, amount, surfaces.pattern[surface.row], surface.place, surface.place_footprint)
     return Wear()
 
 

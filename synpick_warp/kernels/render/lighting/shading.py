@@ -211,7 +211,7 @@ def shade_pixel(
         surface = map_table(scene.surfaces, surface, position, outgoing, width)
     normal = wp.transpose(to_world) * surface.face_normal
     light = gather_light(scene, shot, denoised, sky, image, view, row, column, normal)
-    wear = wear_at(scene.surfaces, surface)
+    wear = wear_at(scene.surfaces, surface, False)
     if segment == Segment.TABLE or samples_per_axis == 1:
         return shade_point(scene, sky, surface, wear, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)

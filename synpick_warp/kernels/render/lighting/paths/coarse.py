@@ -241,7 +241,7 @@ def trace_pixel(
     if surface.hit.segment == Segment.NOTHING:
         write_record(guide_out.surface, cell, wp.vec4())
         return
-    vertex = make_vertex(scene, shot, view, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    vertex = make_vertex(scene, shot, view, surface.hit, surface.position, surface.outgoing, surface.width, 0.0, True)
     write_guide(guide_out, shot.views.cameras.to_world[view], cell, surface.hit, vertex.brdf.normal)
     context = make_context(scene, coarse, rules, shot, view, row, column)
     beginning = wp.where(known > 0, rules.first_samples, samples)

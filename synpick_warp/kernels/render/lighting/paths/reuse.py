@@ -94,7 +94,7 @@ def reuse_histories_kernel(
         write_record(guide_out.surface, cell, wp.vec4())
         return
     slot = world * history.cameras + shot.views.slot[view]
-    vertex = make_vertex(scene, shot, view, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    vertex = make_vertex(scene, shot, view, surface.hit, surface.position, surface.outgoing, surface.width, 0.0, True)
     unoccluded = unoccluded_light(scene.lights, snapshot.light[world], snapshot.light_yaw[world], vertex.brdf)
     exposure = scene.lights.exposure[snapshot.light[world]]
     store_light(coarse_light_out, cell, read_history(history, slot, row, column), scale_light(unoccluded, exposure))

@@ -156,9 +156,19 @@ class Path:
 
 @wp.func
 def make_vertex(
-    scene: AnyScene, shot: AnyShot, view: int, hit: Hit, position: wp.vec3, outgoing: wp.vec3, width: float, min_roughness: float
+    scene: AnyScene,
+    shot: AnyShot,
+    view: int,
+    hit: Hit,
+    position: wp.vec3,
+    outgoing: wp.vec3,
+    width: float,
+    min_roughness: float,
+    is_mean: bool,
 ) -> Vertex:
-    """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
+    """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray; `is_mean`: with
+    the mean wear of the surface, whose noise no one can tell from a ratio or a reflection, and which costs more than the ray.
+    """
     bodies = shot.bodies
     surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
     at = position
@@ -172,7 +182,7 @@ def make_vertex(
     vertex = Vertex()
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
-    material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface))
+    material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, is_mean))
     roughness = wp.max(material.roughness, min_roughness)
     vertex.brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return vertex
@@ -266,7 +276,7 @@ def init_path(width: float) -> Path:
 @wp.func
 def next_vertex(scene: AnyScene, shot: AnyShot, rules: PathRules, context: PathContext, path: Path) -> Vertex:
     """Build the vertex at the last hit of a path that goes on."""
-    return make_vertex(scene, shot, context.view, path.hit, path.position, -path.direction, path.width, rules.min_roughness)
+    return make_vertex(scene, shot, context.view, path.hit, path.position, -path.direction, path.width, rules.min_roughness, True)
 
 
 @wp.func
@@ -354,7 +364,7 @@ def trace_paths_kernel(scene: AnyScene, shot: AnyShot, rules: PathRules, first: 
         else:
             start = hit_position(views.cameras, view, ray, hit.depth)
             width = footprint * hit.depth
-            vertex = make_vertex(scene, shot, view, hit, start, -direction, width, 0.0)
+            vertex = make_vertex(scene, shot, view, hit, start, -direction, width, 0.0, False)
             diffuse = vertex.brdf.diffuse
             path = init_path(width)
             while path.bounce != TERMINATED:
