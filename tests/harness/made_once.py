@@ -15,7 +15,7 @@ from synpick_warp.apps.conversion import foreign, run
 from synpick_warp.apps.evaluation import figures
 from synpick_warp.apps.viz import explain
 from synpick_warp.cloud import run as cloud_run
-from synpick_warp.dataset.commit import merge
+from synpick_warp.dataset.commit import merge, writing
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory import pipeline
 from synpick_warp.stages.render import light_tables, scene
@@ -57,6 +57,7 @@ def made_once() -> Iterator[None]:
         read = functools.lru_cache(maxsize=MOST_MAPS)(lambda text, loads=tomllib.loads: pickle.dumps(loads(text)))
         patch.setattr(tomllib, "loads", lambda text: pickle.loads(read(text)))
         patch.setattr(os, "fsync", lambda handle: None)
+        patch.setattr(writing, "sync_file_system", lambda folder: None)
         patch.setattr(isolation, "IDLE_TIME", 600.0)  # Between two tests that read files half a minute may pass.
         yield
 

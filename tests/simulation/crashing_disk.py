@@ -12,6 +12,7 @@ from typing import Any, Self
 
 import pytest
 
+from synpick_warp.dataset.commit import writing
 from tests.simulation.scheduler import Dead
 
 _CHANGES = ("os.rename", "os.link", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "shutil.rmtree")
@@ -42,6 +43,7 @@ class CrashingDisk:
 
     def __enter__(self) -> Self:
         self._patch.setattr(os, "fsync", self._sync)
+        self._patch.setattr(writing, "sync_file_system", self._sync_all)
         _disks.append(self)
         return self
 
@@ -65,6 +67,10 @@ class CrashingDisk:
     def _sync(self, handle: int) -> None:
         """Replacement of `os.fsync`: records the file, and does not flush it."""
         self._synced.add(os.fstat(handle).st_ino)
+
+    def _sync_all(self, folder: Path) -> None:
+        """Replacement of `sync_file_system`: records all files."""
+        self._synced |= {path.stat().st_ino for path in folder.rglob("*") if path.is_file()}
 
     def cut_power(self) -> None:
         """Truncate all files that were not flushed to half of their size."""

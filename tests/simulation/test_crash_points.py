@@ -89,6 +89,14 @@ def test_a_bake_may_end_at_any_change_to_its_folder(tmp_path, case, turn):
         shutil.rmtree(out)
 
 
+def test_a_finished_data_set_outlives_a_power_cut(tmp_path):
+    with CrashingDisk(tmp_path) as disk:
+        scripted_bake.bake(tmp_path / "out", CONFIG)
+    disk.cut_power()
+    verdict = verify(tmp_path / "out")
+    assert (verdict.problem, verdict.finished) == ("", True)
+
+
 @pytest.mark.parametrize(("case", "turn"), turns("merge", all_of="merge"))
 def test_a_merge_may_end_at_any_change_to_its_folder(tmp_path, expected, case, turn):
     """Its parts stay as they are, and nothing that it leaves is taken for a data set."""

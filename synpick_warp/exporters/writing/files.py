@@ -2,6 +2,7 @@
 SHA-256 lists in the format of `sha256sum`."""
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
@@ -166,6 +167,21 @@ def sync_folder(folder: Path) -> None:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def sync_file_system(folder: Path) -> None:
+    """Flush all that was written to a folder's file system (syncfs of Linux, else sync), once for many thousand files. Raises OSError if
+    the system could not write some of it."""
+    syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
+    if syncfs is None:
+        os.sync()
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        if syncfs(handle):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(folder))
     finally:
         os.close(handle)
 
