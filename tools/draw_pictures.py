@@ -29,10 +29,10 @@ from tools.options import fail, make_parser
 PICTURES = Path(__file__).resolve().parent / "pictures"
 PAGE = PICTURES.parents[1] / "configs" / "CELL.md"
 STRIP, PICK, TABLES, USED, CELL = "strip.jpg", "pick.gif", "tables.jpg", "used.jpg", "cell.jpg"
-COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.color_format": "png", "bop.coco": False}
+COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.split": "train", "bop.color_format": "png", "bop.coco": False}
 STRIP_SETTINGS = COMMON | {
     "bake.mode": "move",
-    "arrangement.volume": 7e-3,
+    "arrangement.counts": {"bracket": 40},
     "move.speed": 0.8,
     "cameras.resolution": [960, 540],
     "cameras.positions": [[0.0, 0.0, 2.0]],
@@ -41,8 +41,8 @@ STRIP_SETTINGS = COMMON | {
 }
 PICK_SETTINGS = COMMON | {
     "bake.mode": "pick",
-    "arrangement.volume": 3e-3,
-    "pick.failures": 1,
+    "gripper.kind": "suction_array",
+    "gripper.cups": [[-0.011, 0.0], [0.011, 0.0]],
     # The first camera is the one that perception uses; the second is drawn.
     "cameras.resolution": [480, 270],
     "cameras.positions": [[0.0, 0.0, 2.0], [0.9, -1.1, 1.3]],
@@ -55,8 +55,8 @@ TABLE_SETTINGS = {"bake.worlds": 8, "bake.episodes": 8, "bop.coco": False}
 USED_SETTINGS = {"bake.mode": "still", "still.views": 0, "bake.worlds": 8, "bake.episodes": 8, "bop.coco": False, "render.coarse_paths": 8}
 USED_SETTINGS |= {"cameras.resolution": [480, 270], "cameras.positions": [[0.0, -0.8, 1.8]], "cameras.ups": [[0.0, 0.0, 1.0]]}
 BAKES = (
-    ("strip", "smoke", STRIP_SETTINGS),
-    ("pick", "smoke", PICK_SETTINGS),
+    ("strip", "bracket-bin", STRIP_SETTINGS),
+    ("pick", "bracket-bin", PICK_SETTINGS),
     ("tables", "tabletop-train", TABLE_SETTINGS),
     ("used", "bracket-bin", USED_SETTINGS),
 )
