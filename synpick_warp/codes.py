@@ -237,6 +237,8 @@ class Look(enum.IntEnum):
     """Fraction of the surface that is oily."""
     DUST = 17
     """Density of dust, 0 to 1."""
+    TRANSMISSION = 18
+    """Fraction of the light that passes through."""
 
 
 class LookPart(enum.IntEnum):

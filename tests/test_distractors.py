@@ -286,6 +286,7 @@ DRAWN: dict[str, Any] = {
     "object_brightness": {"log_uniform": [0.5, 2]},
     "object_roughness": {"normal": [0.5, 0.2]},
     "object_metallic": {"choice": [0, 0.9], "weights": [2, 1]},
+    "object_transmission": {"choice": [0, 0.4, 0.9]},
     **{f"object_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "rust", "stains", "dust")},
     **{f"bin_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "stains", "dust")},
     "bin_color": ANY_COLOR,

@@ -121,6 +121,9 @@ INFRARED = {"render__layers": ["depth_sensor", "ir_left"]}
         ((), {}, "RandomizedSurfaces.recolor", []),
         # Of 20 objects, 3 fixtures, table and background.
         ((), {"randomize__lamps": 1}, "RandomizedSurfaces.recolor", [(5 * 25,)]),
+        # Once more without transparent objects.
+        ((), {}, "ShadedImage.radiance", [(5, 180, 320)]),
+        ((), {"randomize__object_transmission": 0.5}, "ShadedImage.radiance", [(5, 180, 320)] * 2),
         # One cost volume for all views.
         ((), STEREO, "MatchingScratch.cost", [(1, 180, 320, 256)]),
         ((), STEREO | {"depth_sensor__max_disparity": 100.0}, "MatchingScratch.cost", [(1, 180, 320, 102)]),

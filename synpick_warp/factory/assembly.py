@@ -348,14 +348,16 @@ def fit_to_catalog(config: Config, catalog: Catalog, bins: Sequence[Bin], device
         progress.note(f"{len(catalog)} objects take {total:.3g} of {budget:g} m³ together, so that they repeat in an episode")
     arrangement = filled.arrangement
     physics = with_capacities(filled.physics, arrangement.max_objects, catalog, bins, arrangement.counts)
-    if physics is filled.physics:
+    transparent = any(body.material.glass.transmission > 0.0 for body in catalog.bodies)
+    if physics is filled.physics and not transparent:
         return filled
     cause = "thin objects" if arrangement.max_objects <= FEW else "many objects"
     cause = "bins of many shapes" if any(one.is_detailed for one in bins) else cause
-    progress.note(f"{cause}: capacity for {physics.contacts_per_world:,} contacts a world")
+    if physics is not filled.physics:
+        progress.note(f"{cause}: capacity for {physics.contacts_per_world:,} contacts a world")
     fitted = replace(filled, physics=physics)
     pieces = max(len(catalog.bodies[index].pieces) for index in find_drawn(arrangement, catalog))
-    check_memory(plan_memory(fitted, device, 0, pieces), device)
+    check_memory(plan_memory(fitted, device, 0, pieces, transparent), device)
     return fitted
 
 

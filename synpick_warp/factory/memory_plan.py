@@ -21,7 +21,7 @@ from synpick_warp.configs.cell.cameras import COLOR
 from synpick_warp.configs.dataset import DataLayout, may_pick
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import most_objects
-from synpick_warp.configs.episodes.randomize import Randomize
+from synpick_warp.configs.episodes.randomize import OFF, Randomize
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Arrangement, Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
@@ -96,12 +96,12 @@ class Term:
         return sum(row[3] for row in self.rows)
 
 
-def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int = 1) -> list[Term]:
+def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int = 1, transparent: bool = False) -> list[Term]:
     """Work out what a bake takes on a device by a dry run of its stages: nothing is allocated. On a GPU the plan is for
     `with_enough_worlds`.
 
     Body slots are counted at their maximum: the object capacity for each slot type. Without `writers` (0) views stay on the device;
-    `pieces` are the convex pieces of each object, as far as they are known."""
+    `pieces` are the convex pieces of each object, as far as they are known, and `transparent` says whether some are."""
     config, needs = with_enough_worlds(config, device), Needs.of(config)
     worlds, objects, rig = config.bake.worlds, config.arrangement.max_objects, config.rig
     bodies = build.GRIPPER_BODIES + 2 * objects
@@ -114,10 +114,10 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
         size, layers = rig.sizes[group[0]], rig.chosen(group[0], config.render.layers)
         sections = replace(config.render, layers=layers), config.effects, config.depth_sensor
         with dry_run() as arrays:
-            scene = blank_scene(count, *size, device)
+            scene = blank_scene(count, *size, device, transparent or config.randomize.object_transmission.kind != OFF or None)
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
             Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
-            if config.randomize != Randomize():
+            if config.randomize != Randomize() or transparent:
                 allocate_materials(views["view"] * materials_of_view(objects), 1, device)
             if rig.draws_lens(group[0]):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]

@@ -26,6 +26,20 @@ class TriangleMesh:
     """Texture coordinates (V, 2) float32; v points up (the image's top edge is v = 1); zeros without a texture."""
 
 
+@dataclass(frozen=True)
+class Glass:
+    """Transmission of a material, as in KHR_materials_transmission, KHR_materials_ior and KHR_materials_volume of glTF."""
+
+    transmission: float = 0.0
+    """Fraction of the light that enters which passes through; 0: opaque."""
+    ior: float = 1.5
+    """Index of refraction, by which the light that passes is bent."""
+    thickness: float = 0.0
+    """Way of the light inside [m]; 0: thin-walled, light is not bent."""
+
+
+OPAQUE = Glass()
+
 MAP_CENTER = 128
 """Value of a map that is 0 of a normal's x or y."""
 
@@ -45,6 +59,13 @@ class Material:
     maps: np.ndarray | None = field(default=None, hash=False)
     """Maps of the texture's size (H, W, 4) uint8, in place of metallic and roughness: x and y of the normal along growing u and v, where
     MAP_CENTER is 0 and 1 and 255 are -1 and 1; roughness and metallic, 0 to 255. None: no maps."""
+    glass: Glass = field(default=OPAQUE, hash=False)
+    """Transmission."""
+
+    @property
+    def transmission(self) -> float:
+        """Fraction of the light that passes through; metals are opaque."""
+        return self.glass.transmission * (1.0 - self.metallic)
 
 
 class HullSize(NamedTuple):

@@ -15,7 +15,7 @@ from PIL import Image
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.meshes import MeshOptions
-from synpick_warp.scenes.types import MAP_CENTER
+from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, Glass
 from tests.worlds.model_files import pack_glb, read_told, texels
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -335,6 +335,53 @@ def test_what_is_ignored_is_one_line(tmp_path):
     _, finish, said = builder.with_(animations=[{}]).read(tmp_path)
     assert said == ["ignored: KHR_materials_clearcoat, animations, emission, transparency"]
     assert (finish.metallic, finish.roughness) == (1.0, 1.0)
+
+
+def glass(alpha: float = 1.0, mode: str = "OPAQUE", **extensions: Any) -> Builder:
+    named = {f"KHR_materials_{name}": value for name, value in extensions.items()}
+    return Builder(**pbr(baseColorFactor=[1, 1, 1, alpha]), alphaMode=mode, extensions=named)
+
+
+def test_transmission_is_that_of_extensions_and_of_blending(tmp_path):
+    """A thickness is a length of the mesh: it is scaled with its node."""
+    builder = glass(transmission={"transmissionFactor": 0.75}, ior={"ior": 1.4}, volume={"thicknessFactor": 0.01})
+    builder.with_(nodes=[{"mesh": 0, "scale": [2, 2, 2]}], extensionsUsed=["KHR_materials_transmission", "KHR_materials_ior"])
+    _, finish, said = builder.read(tmp_path)
+    assert (finish.glass.transmission, finish.glass.ior, finish.glass.thickness) == pytest.approx((0.75, 1.4, 0.02))
+    assert not said
+    assert glass(0.25, "BLEND").read(tmp_path)[1].glass == Glass(0.75)
+    assert glass(0.25).read(tmp_path)[1].glass == OPAQUE
+    assert glass(0.5, "BLEND", transmission={"transmissionFactor": 0.5}).read(tmp_path)[1].glass == Glass(0.75)
+
+
+def test_what_transmission_leaves_out_is_said(tmp_path):
+    textured = {"transmissionFactor": 1.0, "transmissionTexture": {"index": 0}}
+    _, finish, said = glass(transmission=textured, volume={"thicknessTexture": {"index": 0}}).image().read(tmp_path)
+    assert finish.glass.transmission == pytest.approx(COLORS[..., 0].mean() / 255)
+    assert said == ["ignored: the texture of transmission but for its mean, absorption, or the texture of thickness"]
+    assert glass(ior={"ior": 1.3}).read(tmp_path)[2] == ["ignored: KHR_materials_ior"]
+    assert glass(0.5, "MASK").read(tmp_path)[2] == ["ignored: transparency"]
+    mixed = glass(transmission={"transmissionFactor": 1.0}).with_(nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
+    mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
+    mixed.content["materials"].append({})
+    _, finish, said = mixed.read(tmp_path)
+    assert finish.glass == OPAQUE
+    assert said == ["ignored: transparency of some of its parts: an object has one for all"]
+
+
+@pytest.mark.parametrize(
+    ("builder", "said"),
+    [
+        (glass(transmission={"transmissionFactor": 1.5}), "transmissionFactor is 1.5; allowed: 0 to 1; correct the material"),
+        (glass(-0.5, "BLEND"), "baseColorFactor's alpha is -0.5; allowed: 0 to 1; correct"),
+        (glass(ior={"ior": 0.5}), "ior is 0.5; allowed: 1 to 3; correct"),
+        (glass(volume={"thicknessFactor": -1}), "thicknessFactor is -1; allowed: 0 to 10000; correct"),
+        (glass(ior={"ior": float("nan")}), "JSON is malformed"),
+    ],
+)
+def test_transmission_that_cannot_be_is_refused(tmp_path, builder, said):
+    with pytest.raises(CatalogError, match=said):
+        builder.read(tmp_path)
 
 
 def test_normal_and_roughness_maps_are_read_beside_the_base_colour(tmp_path):

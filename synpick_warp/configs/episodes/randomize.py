@@ -158,6 +158,9 @@ class Randomize:
     object_brightness: Annotated[Distribution, "[0.05, 20]"] = setting(_NONE, "Factor on the base colour of each object, in linear light.")
     object_roughness: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Roughness of each object.")
     object_metallic: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Metallic factor of each object.")
+    object_transmission: Annotated[Distribution, "[0, 1]"] = setting(
+        _NONE, "Fraction of the light that passes through each object, in place of its file's; from 0.5 on it casts no shadow."
+    )
     object_scratches: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Scratches of each object, by solid noise over its mesh: 1 many.")
     object_rust: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Fraction of each object's surface that is rusty.")
     object_stains: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Fraction of each object's surface that is oily: dark and glossy.")

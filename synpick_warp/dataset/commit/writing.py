@@ -47,7 +47,7 @@ from synpick_warp.exporters.writing.files import (
 )
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.types import Catalog, EnvironmentMap
+from synpick_warp.scenes.types import OPAQUE, Catalog, EnvironmentMap
 from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import MAX_TOML, check_regular_file, make_folder
 from synpick_warp.views.frames import EpisodeEnd
@@ -361,7 +361,7 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors, textures and maps, without the names of their files, and over each object: its mesh,
+    SHA-256 over objects, lights, distractors, textures, maps and glass, without the names of their files, and over each object: its mesh,
     material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a field
     of `Catalog` or `EnvironmentMap` changes every manifest.
     """
@@ -369,7 +369,10 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: L
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
     maps = {body.obj_id: (body.material.maps,) for body in catalog.bodies if body.material.maps is not None}
     textures |= {"maps": _digest_data(tuple(maps.values()))} if maps else {}
-    given = [(body, *maps[body.obj_id]) if body.obj_id in maps else body for body in catalog.bodies]
+    glass = {body.obj_id: (body.material.glass,) for body in catalog.bodies if body.material.glass != OPAQUE}
+    textures |= {"glass": _digest_data(tuple(glass.values()))} if glass else {}
+    added = {body.obj_id: maps.get(body.obj_id, ()) + glass.get(body.obj_id, ()) for body in catalog.bodies}
+    given = [(body, *more) if (more := added[body.obj_id]) else body for body in catalog.bodies]
     each = {f"{manifest.OBJECT}{body.obj_id}: {body.name}": _digest_data(data) for body, data in zip(catalog.bodies, given, strict=True)}
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)} | distractors | textures | each
 

@@ -115,6 +115,9 @@ def add_surface(
     surface.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     shader.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(material.metallic)
     shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(material.roughness)
+    if material.transmission > 0.0:
+        shader.CreateInput("opacity", Sdf.ValueTypeNames.Float).Set(1.0 - material.transmission)
+        shader.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(material.glass.ior)
     color: UsdShade.Input = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     linear = (gain * srgb_to_linear(material.color)).tolist()
     if texture is None:

@@ -248,7 +248,7 @@ def _add_light(stage: Usd.Stage, light: episode.StageLight, yaw: float, exposure
 def _drawn(assets: Mapping[str, str], looks: Mapping[str, Any]) -> Iterator[tuple[str, LookPart, Mapping[str, Any]]]:
     """Path, part and drawn look of the prims, by the asset that each references and the episode's record; a look may be empty."""
     rows = dict(enumerate(looks.get("objects", ()))) | {row["instance"]: row for row in looks.get("distractors", ())}
-    names = ("color", "metallic", "roughness", "hue", "brightness")
+    names = ("color", "metallic", "roughness", "transmission", "hue", "brightness")
     for path in assets if looks else ():
         name = path.rpartition("/")[2]
         if name in _PARTS:
@@ -270,7 +270,8 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
         gain = 1.0
     elif "hue" in look:
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
-    material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness))
+    glass = replace(given.glass, transmission=look.get("transmission", given.glass.transmission))
+    material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness), glass=glass)
     maps = set(MAPS) - look.keys() if surface.has_maps and "texture" not in look else ()
     add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, maps)
 

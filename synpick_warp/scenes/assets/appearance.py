@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
-from synpick_warp.scenes.types import MAP_CENTER, Material
+from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, Glass, Material
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -45,6 +45,7 @@ class FileMaterial:
     """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`."""
     metallic: float | None
     roughness: float | None
+    glass: Glass = OPAQUE
 
     @property
     def has_maps(self) -> bool:
@@ -60,8 +61,8 @@ class FileMaterial:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
         if self.texture is None or not self.has_maps:
-            return Material(self.color, self.texture, *given)
-        return Material(self.color, self.texture[..., :3].copy(), *given, self.texture[..., 3:].copy())
+            return Material(self.color, self.texture, *given, glass=self.glass)
+        return Material(self.color, self.texture[..., :3].copy(), *given, self.texture[..., 3:].copy(), self.glass)
 
     def add_maps(self, **maps: np.ndarray) -> "FileMaterial":
         """Material with normal (H, W, 2), roughness and metallic (H, W, 1) maps, uint8 as of `Material.maps`, of any sizes; those that are

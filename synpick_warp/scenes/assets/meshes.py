@@ -35,7 +35,7 @@ from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.wavefront import read_obj
-from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.scenes.types import OPAQUE, TriangleMesh
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -189,6 +189,8 @@ def read_cell_mesh(
     if path.suffix.lower() not in SUFFIXES:
         raise CatalogError(f"{path} is no mesh; allowed: {', '.join(SUFFIXES)}")
     found = read_mesh(path, UNITS[unit], MeshOptions(substitute=True), report)
+    if found.material.glass.transmission > 0.0:
+        report(f"{path}: ignored: transparency, which objects alone have")
     if len(found.mesh.faces) > MAX_CELL_FACES:
         raise CatalogError(f"{path} has {len(found.mesh.faces):,} triangles; allowed: {MAX_CELL_FACES:,}; decimate the mesh")
     lengths = np.ptp(found.mesh.vertices.astype(np.float64), axis=0)
@@ -217,7 +219,8 @@ def _finish(part: MeshPart, unit: float, options: MeshOptions, notes: Notes) -> 
     part = complete_normals(replace(part, vertices=vertices, faces=faces, normals=given), options.crease_angle)
     vertices, normals = part.vertices.astype(np.float32), np.asarray(part.normals, np.float32)
     uv = np.zeros((len(vertices), 2), np.float32) if part.uv is None else part.uv.astype(np.float32)
-    return MeshFile(TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), part.material, moved)
+    material = replace(part.material, glass=replace(part.material.glass, thickness=part.material.glass.thickness * unit))
+    return MeshFile(TriangleMesh(vertices, part.faces.astype(np.int32), normals, uv), material, moved)
 
 
 def complete_normals(part: MeshPart, crease_angle: float) -> MeshPart:
@@ -332,6 +335,9 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
         moved, texture = appearance.join_textures([(part.uv, part.material) for part in parts], str(path), notes.said)
         parts = [replace(part, uv=np.broadcast_to(uv, (len(part.vertices), 2))) for uv, part in zip(moved, parts, strict=True)]
         first = replace(first, color=appearance.WHITE, texture=texture)
+    if len({part.material.glass.transmission for part in parts}) > 1:
+        notes.ignored.append("transparency of some of its parts: an object has one for all")
+        first = replace(first, glass=OPAQUE)
     mean = {}
     for name in ("metallic", "roughness"):
         known = [(value, _area(part)) for part in parts if (value := getattr(part.material, name)) is not None]

@@ -3,6 +3,7 @@
 Mode unoccluded leaves out the first two: no ambient occlusion, no indirect light.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -275,9 +276,9 @@ class DenoisedRenderer:
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
         self.kept_sources = allocate_struct(KEPT_SOURCES, kept, scene.device)
 
-    def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
+    def shade(self, snapshot: Snapshot, shot: Any, image: Any, add: Callable[[Any, Any], None] | None = None) -> None:
         """Render the radiance of a batch of views, for which `find_damage` was called. `snapshot`: the worlds. `shot`: the struct
-        `ShotData`. `image`: the struct `ShadedImage`; written."""
+        `ShotData`. `image`: the struct `ShadedImage`; written. `add`: adds what is behind transparent surfaces to it."""
         device = self.scene.device
         if self.traces_paths:
             with scope("trace coarse paths", device):
@@ -288,6 +289,8 @@ class DenoisedRenderer:
             self.trace_shadows(shot, image)
         with scope("shade pixels", device):
             self.shade_pixels(shot, image)
+            if add is not None:
+                add(shot, image)
         if self.antialias:
             with scope("anti-alias", device):
                 self.resolve_footprints(shot, image)

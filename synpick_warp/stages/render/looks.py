@@ -32,6 +32,7 @@ SETTINGS = {
     (LookPart.OBJECT, Look.BRIGHTNESS): "object_brightness",
     (LookPart.OBJECT, Look.ROUGHNESS): "object_roughness",
     (LookPart.OBJECT, Look.METALLIC): "object_metallic",
+    (LookPart.OBJECT, Look.TRANSMISSION): "object_transmission",
     (LookPart.OBJECT, Look.SCRATCHES): "object_scratches",
     (LookPart.OBJECT, Look.RUST): "object_rust",
     (LookPart.OBJECT, Look.STAINS): "object_stains",
@@ -55,7 +56,7 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels", "maps")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern")}
+_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern", "glass")}
 _MATERIALS = StructArrays(
     RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )
@@ -157,6 +158,8 @@ class Dresser:
                 wp.copy(getattr(surfaces, name), values, count=values.size)
             else:
                 setattr(surfaces, name, values)
+        if scene.glass is not None:
+            wp.copy(surfaces.glass, scene.glass, count=scene.glass.size)
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
         surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)

@@ -1,5 +1,6 @@
 """Path-traced reference renderer."""
 
+from collections.abc import Callable
 from typing import Any
 
 from synpick_warp.configs.schema import Render
@@ -33,7 +34,7 @@ class ReferenceRenderer:
         self.scene = scene
         self.rules = make_path_rules(render, seed, render.samples, ROULETTE)
 
-    def shade(self, snapshot: Snapshot, shot: Any, image: Any) -> None:
+    def shade(self, snapshot: Snapshot, shot: Any, image: Any, add: Callable[[Any, Any], None] | None = None) -> None:
         """Render the radiance of a batch of views; arguments as of `DenoisedRenderer.shade`.
 
         It is anti-aliased. Each path traces its own camera ray: the G-buffer is read for the floor alone.
@@ -41,3 +42,5 @@ class ReferenceRenderer:
         scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
         launch_pixels(trace_paths_kernel, pixels, [scene.paths, shot, self.rules], [image], scene.device)
         shade_floor(scene, shot, image)
+        if add is not None:
+            add(shot, image)

@@ -5,8 +5,7 @@ from typing import Any
 
 from synpick_warp.configs import schema
 from synpick_warp.configs.cell.cameras import DepthSensor, Effects
-from synpick_warp.kernels.render.visibility.gbuffer import ALL_PASSES, ShadedImage
-from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import Annotator
 from synpick_warp.stages.render.cameras import allocate_view_cameras
@@ -17,10 +16,9 @@ from synpick_warp.stages.render.postprocess import PostProcessor, has_effects
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.render.transparency import SceneBehind, allocate_image
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_shot, set_up_views, with_cameras
 from synpick_warp.stages.timing import scope
-
-SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column", passes=("view", "tile"))
 
 
 class Renderer:
@@ -68,7 +66,7 @@ class Renderer:
             colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
-        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None or scene.has_maps else None
+        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None or scene.has_details else None
         self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
@@ -78,9 +76,8 @@ class Renderer:
         self.shading: DenoisedRenderer | ReferenceRenderer | None = None
         kept = 0
         if colors:
-            self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
-            self.image.passes.fill_(ALL_PASSES)
-            if has_effects(effects):
+            self.image = allocate_image(sizes, scene.device)
+            if has_effects(effects) or scene.is_transparent:
                 settings = replace(settings, reuse=False)
             history_row = None
             if settings.mode == schema.REFERENCE:
@@ -90,6 +87,9 @@ class Renderer:
                 kept, history_row = histories if self.shading.reuses else 0, self.shading.flags.history_row
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
+        self.behind: SceneBehind | None = None
+        if scene.is_transparent and self.shading is not None:
+            self.behind = SceneBehind(scene, self.shading, self.rasterizer, (settings, seed), instances, views, histories)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
         self.annotator = Annotator(scene, instances, views, kept)
@@ -114,7 +114,10 @@ class Renderer:
                 self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1])
         if self.shading is not None:
             with scope("shade", device):
-                self.shading.shade(snapshot, shot, self.image)
+                if self.behind is None:
+                    self.shading.shade(snapshot, shot, self.image)
+                else:
+                    self.shading.shade(snapshot, self.behind.render(snapshot, shot), self.image, self.behind.add)
             with scope("post-process", device):
                 self.postprocessor.process(shot, self.image, out)
         with scope("annotate", device):
@@ -127,6 +130,8 @@ class Renderer:
             set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
             if self.dresser:
                 self.dresser.dress(snapshot, views, self.bodies)
+            if self.behind:
+                self.behind.group(views, self.bodies)
         self.damage = self.rasterizer.whole
         if isinstance(self.shading, DenoisedRenderer):
             self.damage = self.shading.find_damage(snapshot, self.bodies, views) or self.damage

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.configs.episodes.randomize import OFF
 from synpick_warp.kernels.render.images.layers import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
@@ -35,7 +36,7 @@ from synpick_warp.scenes.bins import TABLE_ROUGHNESS
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.modelling import project_from_box
-from synpick_warp.scenes.types import MAP_CENTER, Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
+from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.cameras import build_cameras
 from synpick_warp.stages.render.light_tables import (
     EnvironmentTables,
@@ -82,10 +83,18 @@ class RenderScene:
     suction_maps: Any = None
     """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
 
+    glass: Any = None
+    """(material): transmission, index of refraction, thickness [m]; None: all of them are opaque, and no episode draws another."""
+
     @property
-    def has_maps(self) -> bool:
-        """Whether a material has normal, roughness or metallic maps."""
-        return self.surfaces is not None and self.surfaces.detail.size > 1
+    def has_details(self) -> bool:
+        """Whether a material has normal, roughness or metallic maps, or some are transparent."""
+        return self.surfaces is not None and (self.surfaces.detail.size > 1 or self.is_transparent)
+
+    @property
+    def is_transparent(self) -> bool:
+        """Whether some objects are or may be transparent."""
+        return self.glass is not None
 
     @property
     def width(self) -> int:
@@ -102,11 +111,11 @@ ALL_MAPS = int(NORMAL_MAP) | int(ROUGHNESS_MAP) | int(METALLIC_MAP)
 """Bits of `Surfaces.maps` of a material with maps: a file that states only some has its constants in the others."""
 
 
-def blank_scene(cameras: int, width: int, height: int, device: wp.Device) -> RenderScene:
-    """Scene of cameras without content: in a dry run, constructors ask it for sizes alone."""
+def blank_scene(cameras: int, width: int, height: int, device: wp.Device, glass: Any = None) -> RenderScene:
+    """Scene of cameras without content: in a dry run, constructors ask it for sizes alone. `glass`: True if objects are transparent."""
     content = dict.fromkeys(("meshes", "surfaces", "cameras", "lights", "table", "paths", "plain"))
     ids = wp.empty(0, dtype=wp.int32, device="cpu")
-    return RenderScene(**content, grid=build_grid(width, height), obj_id=ids, camera_count=cameras, device=device, keep=())
+    return RenderScene(**content, grid=build_grid(width, height), obj_id=ids, camera_count=cameras, device=device, keep=(), glass=glass)
 
 
 def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
@@ -274,6 +283,15 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
     return (np.sqrt(np.maximum(squared, 0.0)) / np.where(area > 0.0, area, np.inf)).astype(np.float32)
 
 
+def build_glass(materials: list[Material], objects: int, looks: Looks | None, device: wp.Device) -> wp.array | None:
+    """Transmission of the materials (material) as of `RenderScene.glass`, of which the first `objects` are those of objects; others are
+    opaque."""
+    glass = [(each.glass.transmission, each.glass.ior, each.glass.thickness) for each in materials[:objects]]
+    if not any(row[0] for row in glass) and (looks is None or looks.randomize.object_transmission.kind == OFF):
+        return None
+    return wp.array(glass + [(0.0, OPAQUE.ior, 0.0)] * (len(materials) - objects), dtype=wp.vec3, device=device)
+
+
 def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
     """The same scene with other cameras, of one image size."""
     grid = build_grid(*cameras[0].resolution)
@@ -392,8 +410,7 @@ def build_render_scene(
     if looks and looks.bin_textures:
         first = len(catalog.bodies)
         shapes[first : first + len(bins)] = map(project_from_box, shapes[first : first + len(bins)])
-    table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
-    materials = [entry.material for entry in catalog.bodies] + [fixture.material for fixture in fixtures] + [table_material]
+    materials = [each.material for each in (*catalog.bodies, *fixtures)] + [Material(settings.table_color, None, 0.0, TABLE_ROUGHNESS)]
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
     meshes, keep = build_meshes(shapes, len(catalog.bodies) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
     table = Table()
@@ -420,4 +437,5 @@ def build_render_scene(
         keep=keep,
         looks=looks,
         suction_maps=build_suction_scene(catalog, cup_radius, device),
+        glass=build_glass(materials, len(catalog.bodies), looks, device),
     )

@@ -121,6 +121,11 @@ def set_up_views(
     if placed:
         bodies.uses_background.zero_()
     wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
+    bin_bodies(scene, views, bodies)
+
+
+def bin_bodies(scene: RenderScene, views: Any, bodies: Any) -> None:
+    """Bin the bodies of the struct `ViewBodies` into tiles, in their order."""
     inputs = [scene.meshes, scene.grid, views]
     wp.launch(
         kernel_for(bin_bodies_kernel, views), dim=(views.count, scene.grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device

@@ -325,6 +325,7 @@ GIVEN = STIRRING | {
     "randomize.object_brightness": {"uniform": [0.5, 1.0]},
     "randomize.object_roughness": {"uniform": [0.0, 1.0]},
     "randomize.object_metallic": 0.25,
+    "randomize.object_transmission": 0.8,
     "randomize.bin_color": {"uniform": [[0, 0, 0], [1, 1, 1]]},
     "randomize.texture_width": 0.25,
     "randomize.table_roughness": {"uniform": [0.5, 1.0]},
@@ -378,6 +379,7 @@ def test_objects_have_the_drawn_material(stage, record):
         color = np.array(shader.GetInput("diffuseColor").Get())
         assert color.sum() == pytest.approx(row["brightness"] * srgb_to_linear(base).sum(), abs=1e-5)
         assert shader.GetInput("roughness").Get() == pytest.approx(row["roughness"], abs=1e-6)
+        assert shader.GetInput("opacity").Get() == pytest.approx(1.0 - 0.75 * row["transmission"], abs=1e-6)
         assert shader.GetInput("metallic").Get() == pytest.approx(0.25)
 
 

@@ -93,6 +93,8 @@ def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
     info: dict[str, Any] = {"diameter": MILLIMETERS * entry.diameter}
     info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
     info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
+    if entry.material.transmission > 0.0:
+        info["transmission"] = entry.material.transmission
     if entry.symmetries_discrete:
         info["symmetries_discrete"] = [
             # Row-major 4 x 4 matrices, of which the translation is a length.

@@ -73,6 +73,8 @@ class DrawnMaterial:
     """As in `Surfaces`: values that are drawn replace maps."""
     wear: wp.vec4
     """As in `RandomizedSurfaces`."""
+    glass: wp.vec3
+    """As in `RandomizedSurfaces`; metals are opaque."""
 
 
 @wp.func
@@ -111,6 +113,11 @@ def draw_material(table: LookTable, surfaces: RandomizedSurfaces, base: int, key
         if table.distribution[part, Look.SCRATCHES + kind].kind != LookKind.OFF:
             wear[kind] = draw_look(table, key, part, Look.SCRATCHES + kind)[0]
     result.wear = wear
+    glass = surfaces.glass[base]
+    if table.distribution[part, Look.TRANSMISSION].kind != LookKind.OFF:
+        glass[0] = draw_look(table, key, part, Look.TRANSMISSION)[0]
+    glass[0] = glass[0] * (1.0 - result.metallic)
+    result.glass = glass
     return result
 
 
@@ -162,6 +169,7 @@ def dress_bodies_kernel(
     surfaces_inout.recolor[row] = material.recolor
     surfaces_inout.repeats[row] = material.repeats
     surfaces_inout.wear[row] = material.wear
+    surfaces_inout.glass[row] = material.glass
     surfaces_inout.pattern[row] = int(key >> wp.uint64(40))
     surfaces_inout.maps[row] = material.maps
     surfaces_inout.texture_size[row] = surfaces_inout.texture_size[material.texture]

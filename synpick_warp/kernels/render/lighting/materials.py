@@ -86,13 +86,14 @@ RandomizedSurfaces = variant_of(
     wear=wp.array[wp.vec4],
     pattern=wp.array[int],
     noise=wp.array3d[wp.uint32],
+    glass=wp.array[wp.vec3],
 )
 """Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
 More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
 clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
-table `noise`, in a part that the seed `pattern` draws."""
+table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]."""
 AnySurfaces = Any
 """`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
@@ -460,9 +461,10 @@ def material_at(surfaces: Surfaces, surface: Surface, wear: Wear) -> SurfaceMate
 
 @wp.func
 def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
-    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share."""
+    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share. Its colour is that of what
+    it does not transmit."""
     result = SurfaceMaterial()
-    result.color = sample_base_color(surfaces, surface)
+    result.color = (1.0 - surfaces.glass[surface.row][0]) * sample_base_color(surfaces, surface)
     result.metallic = surfaces.metallic[surface.row]
     result.roughness = surfaces.roughness[surface.row]
     result.normal = surface.normal

@@ -25,7 +25,8 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 TRIANGLES, STRIP, FAN = 4, 5, 6
 QUANTIZATION, TRANSFORM, WEBP = "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
-_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS}
+TRANSMISSION, IOR, VOLUME = "KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_volume"
+_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS, TRANSMISSION, IOR, VOLUME}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -189,10 +190,35 @@ class Glossiness(msgspec.Struct):
     specularGlossinessTexture: TextureInfo | None = None  # noqa: N815
 
 
+class Transmission(msgspec.Struct):
+    """Fraction of the light that passes a surface, and its texture (KHR_materials_transmission)."""
+
+    transmissionFactor: float = 0.0  # noqa: N815
+    transmissionTexture: TextureInfo | None = None  # noqa: N815
+
+
+class Ior(msgspec.Struct):
+    """Index of refraction (KHR_materials_ior)."""
+
+    ior: float = 1.5
+
+
+class Volume(msgspec.Struct):
+    """Thickness of a transparent body, in the units of its mesh, and what is not used: its texture and the colour that it absorbs
+    (KHR_materials_volume)."""
+
+    thicknessFactor: float = 0.0  # noqa: N815
+    thicknessTexture: Any = None  # noqa: N815
+    attenuationDistance: Any = None  # noqa: N815
+
+
 class MaterialExtensions(msgspec.Struct):
     """Extensions of a material that are read."""
 
     glossiness: Glossiness | None = msgspec.field(name=GLOSSINESS, default=None)
+    transmission: Transmission | None = msgspec.field(name=TRANSMISSION, default=None)
+    ior: Ior | None = msgspec.field(name=IOR, default=None)
+    volume: Volume | None = msgspec.field(name=VOLUME, default=None)
 
 
 class GltfMaterial(msgspec.Struct):

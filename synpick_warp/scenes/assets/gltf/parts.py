@@ -14,12 +14,17 @@ from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf import document as schema
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
+from synpick_warp.scenes.types import OPAQUE, Glass
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
 # Factors may exceed 0..1 by rounding.
 _FACTOR_TOLERANCE = 1e-3
 _DIELECTRIC = 0.04
 """Reflectance of a dielectric at normal incidence (glTF 2.0, appendix B)."""
+_MAX_IOR = 3.0
+"""Largest index of refraction; diamond has 2.4."""
+_MAX_THICKNESS = 1e4
+"""Largest thickness, as that of coordinates."""
 _CLAMP, _MIRROR = 33071, 33648
 _RIGID = 1e-6
 """Relative difference up to which the joints of a skin move alike, as they do in the pose of binding."""
@@ -215,6 +220,7 @@ class _Reader:
             gloss = material.extensions.glossiness if material.extensions else None
             pbr = material.pbrMetallicRoughness or schema.Pbr()
             found, info = self.gloss(gloss) if gloss else self.pbr(pbr)
+            found = replace(found, glass=self.glass(material))
             self.materials[index] = self.mapped(found, info, material.normalTexture, schema.Pbr() if gloss else pbr)
         return self.materials[index]
 
@@ -270,8 +276,36 @@ class _Reader:
         """Note the features of a material that are not used. Occlusion is none: it is that of the geometry."""
         if material.emissiveTexture is not None or any(material.emissiveFactor):
             self.notes.ignored.append("emission")
-        if material.alphaMode != "OPAQUE":
+
+    def glass(self, material: schema.GltfMaterial) -> Glass:
+        """Transmission of a material by its extensions or, where it blends, by its alpha; of a texture of either, the mean or nothing."""
+        extensions, alpha = material.extensions or schema.MaterialExtensions(), 1.0
+        given, volume = extensions.transmission or schema.Transmission(), extensions.volume or schema.Volume()
+        if material.alphaMode == "BLEND" and material.pbrMetallicRoughness:
+            alpha = material.pbrMetallicRoughness.baseColorFactor[3]
+        ior = (extensions.ior or schema.Ior()).ior
+        for name, value, low, high in (
+            ("transmissionFactor", given.transmissionFactor, -_FACTOR_TOLERANCE, 1.0 + _FACTOR_TOLERANCE),
+            ("baseColorFactor's alpha", alpha, -_FACTOR_TOLERANCE, 1.0 + _FACTOR_TOLERANCE),
+            ("ior", ior, 1.0, _MAX_IOR),
+            ("thicknessFactor", volume.thicknessFactor, 0.0, _MAX_THICKNESS),
+        ):
+            if not low <= value <= high:
+                raise CatalogError(f"{self.path}: {name} is {value:g}; allowed: {max(low, 0.0):g} to {high:.0f}; correct the material")
+        factor = given.transmissionFactor
+        if given.transmissionTexture is not None:
+            self.notes.ignored.append("the texture of transmission but for its mean")
+            image = self.texture(given.transmissionTexture)
+            factor *= 1.0 if image is None else float(image[..., 0].mean() / 255.0)
+        transmission = float(np.clip(1.0 - (1.0 - factor) * alpha, 0.0, 1.0))
+        if transmission == 0.0:
+            unused = (schema.IOR, extensions.ior), (schema.VOLUME, extensions.volume)
+            self.notes.ignored += [name for name, extension in unused if extension is not None]
+        elif volume.thicknessTexture is not None or volume.attenuationDistance is not None:
+            self.notes.ignored.append("absorption, or the texture of thickness")
+        if material.alphaMode != "OPAQUE" and alpha == 1.0:
             self.notes.ignored.append("transparency")
+        return Glass(transmission, ior, volume.thicknessFactor) if transmission > 0.0 else OPAQUE
 
     def pbr(self, pbr: schema.Pbr) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
         """Convert a metallic-roughness material: (material, base colour texture); of the metallic-roughness texture, the mean."""
@@ -426,4 +460,5 @@ def _transform(part: MeshPart, transform: np.ndarray) -> MeshPart:
     determinant = det(transform[:3, :3])
     normals = None if part.normals is None or determinant == 0.0 else matmul(part.normals, cofactors(transform[:3, :3]).T / determinant)
     faces = part.faces if determinant > 0.0 else part.faces[:, ::-1]
-    return replace(part, vertices=vertices, faces=faces, normals=normals)
+    glass = replace(part.material.glass, thickness=part.material.glass.thickness * float(np.cbrt(abs(determinant))))
+    return replace(part, vertices=vertices, faces=faces, normals=normals, material=replace(part.material, glass=glass))

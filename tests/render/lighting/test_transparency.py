@@ -1,0 +1,113 @@
+"""Transparent bodies: what is seen through them, their coats, shadows and truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.episodes.randomize import Distribution, Randomize
+from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
+from synpick_warp.factory.assembly import make_renderer
+from synpick_warp.scenes.looks import Looks
+from synpick_warp.scenes.types import Glass
+from tests.render.lighting.test_dirty_tiles import CAMERAS, ENTRIES, ROOM, play, scripts
+from tests.render.lighting.test_shadows import LAMPS
+from tests.worlds.shapes import UPRIGHT, camera, even_light, sheet, sun, surface
+from tests.worlds.toy_scene import ToyScene, assert_same, build_scene, render_objects, with_render
+
+VIEW = camera(48, 32, 150.0, (0.0, 0.0, 1.0))
+PANE = sheet(0.2, 0.12)
+RAISED = (0.0, 0.0, 0.1, *UPRIGHT)
+INSIDE = (0, slice(12, 20), slice(16, 32))
+CHECKS = np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.ones((4, 4)))[..., None].astype(np.uint8) * np.array([255, 255, 255], np.uint8)
+EVEN = (even_light(),)
+COAT = 0.04
+"""Reflectance of the coat at normal incidence."""
+
+
+def pane(transmission, color=(1.0, 1.0, 1.0), ior=1.5, thickness=0.0):
+    return replace(surface(color, roughness=0.3), glass=Glass(transmission, ior, thickness))
+
+
+def picture(device, material, mode=UNOCCLUDED, mesh=PANE, floor=None, lights=EVEN, **more):
+    below = (sheet(0.6, 0.5), floor or surface(texture=CHECKS))
+    placed = [below] if material is None else [below, (mesh, material, RAISED)]
+    return render_objects(device, *placed, view=VIEW, config=with_render(mode, samples=64), lights=lights, **more)
+
+
+@pytest.mark.parametrize("mode", [UNOCCLUDED, FAST, REFERENCE])
+def test_clear_glass_vanishes_in_even_light_over_a_white_floor(device, mode):
+    """What the coat reflects and what passes are all light."""
+    with_pane, without = (picture(device, material, mode, floor=surface()) for material in (pane(1.0), None))
+    np.testing.assert_allclose(with_pane.radiance[INSIDE], without.radiance[INSIDE], rtol=0.03)
+
+
+@pytest.mark.parametrize("mode", [UNOCCLUDED, REFERENCE])
+def test_a_pane_reflects_and_shows_what_is_behind(device, mode):
+    behind = picture(device, None, mode).radiance[INSIDE]
+    seen = picture(device, pane(1.0), mode).radiance[INSIDE]
+    assert np.ptp(behind) > 0.8
+    slope, reflected = np.polyfit(behind.reshape(-1), seen.reshape(-1), 1)
+    assert (slope, reflected) == pytest.approx((1.0 - COAT, COAT), abs=0.02)
+
+
+def test_light_is_linear_in_the_transmission(device):
+    half, most, whole = (picture(device, pane(share, (0.2, 0.5, 0.9))).radiance for share in (0.5, 0.75, 1.0))
+    np.testing.assert_allclose(most, (half + whole) / 2.0, atol=1e-5)
+    assert np.abs(half - whole).max() > 0.1
+
+
+def test_an_opaque_pane_among_transparent_ones_has_the_bits_of_one_without(device):
+    """Also with a drawn transmission of 0, and truth is that of opaque bodies."""
+    plain = picture(device, surface(roughness=0.3), FAST)
+    drawn = Looks(Randomize(object_transmission=Distribution("fixed", ((0.0,),))), (), ())
+    assert_same(picture(device, pane(0.8), FAST, looks=drawn), plain, "color", "radiance", "depth", "instance", "masks", "boxes", "pixels")
+    assert_same(picture(device, pane(0.8), FAST), plain, "depth", "exact_depth", "instance", "masks", "boxes", "pixels")
+
+
+@pytest.mark.parametrize(("transmission", "shadow"), [(0.45, True), (0.55, False)])
+def test_bodies_cast_a_shadow_below_half(device, transmission, shadow):
+    light = (sun((0.6, 0.0, 0.8)),)
+    lit, shaded = (picture(device, material, floor=surface(), lights=light).radiance[0, 14:18] for material in (None, pane(transmission)))
+    outside = picture(device, None, floor=surface(), lights=light).instance[0, 14:18] == 1
+    outside &= picture(device, pane(transmission), floor=surface(), lights=light).instance[0, 14:18] == 1
+    assert (shaded[outside].min() < 0.7 * lit.max()) == shadow
+    if not shadow:
+        np.testing.assert_array_equal(shaded[outside], lit[outside])
+
+
+def test_thick_glass_bends_light_as_a_tilted_slab(device):
+    """A slab shifts what is behind it by t sin(i) (1 - cos(i) / sqrt(n² - sin²(i))), here along the image."""
+    line = surface(texture=np.repeat(np.eye(1, 64, 32, dtype=np.uint8)[..., None] * 255, 3, axis=-1).repeat(4, axis=0))
+    tilt, thick = np.radians(40.0), 0.03
+    pose = (0.0, 0.0, 0.1, 0.0, np.sin(tilt / 2), 0.0, np.cos(tilt / 2))
+
+    def place(thickness):
+        toy = [(sheet(0.6, 0.5), line), (sheet(0.3, 0.2), pane(1.0, thickness=thickness), pose)]
+        row = render_objects(device, *toy, view=VIEW, config=with_render(UNOCCLUDED), lights=(even_light(),)).radiance[0, 16, :, 0]
+        row = row - np.median(row)
+        return (row.clip(0) * np.arange(48)).sum() / row.clip(0).sum()
+
+    shift = thick * np.sin(tilt) * (1.0 - np.cos(tilt) / np.sqrt(1.5**2 - np.sin(tilt) ** 2))
+    assert abs(abs(place(thick) - place(0.0)) - 150.0 * shift / 0.95) < 1.0
+
+
+def test_pictures_depend_on_neither_batches_nor_reuse(device):
+    """Of bodies that move, appear and disappear, over frames."""
+    glass = [
+        replace(each, material=replace(each.material, glass=Glass(share))) for each, share in zip(ENTRIES, (0, 0.4, 0.9, 1), strict=True)
+    ]
+    frames, pictures = scripts(7)[:10], []
+    for reuse in (True, False):
+        config = with_render(coarse_pixel=2, coarse_paths=1, reuse=reuse)
+        toy = ToyScene(glass, frames[0], CAMERAS, lights=(LAMPS,), instances=ROOM, config=config)
+        renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
+        pictures.append(play(renderer, frames, toy, seed=int(reuse))[0])
+    for one, other in zip(*pictures, strict=True):
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_metals_are_opaque(device):
+    metal = replace(pane(1.0), metallic=1.0)
+    assert_same(picture(device, metal), picture(device, replace(surface(roughness=0.3), metallic=1.0)), "color")
