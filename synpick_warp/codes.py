@@ -239,6 +239,8 @@ class Look(enum.IntEnum):
     """Density of dust, 0 to 1."""
     TRANSMISSION = 18
     """Fraction of the light that passes through."""
+    LABEL = 19
+    """Width of a label [m]."""
 
 
 class LookPart(enum.IntEnum):

@@ -289,6 +289,8 @@ DRAWN: dict[str, Any] = {
     "object_transmission": {"choice": [0, 0.4, 0.9]},
     **{f"object_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "rust", "stains", "dust")},
     **{f"bin_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "stains", "dust")},
+    "object_label": {"choice": [0, 0.03]},
+    "bin_label": 0.05,
     "bin_color": ANY_COLOR,
     "bin_roughness": {"uniform": [0.2, 0.9]},
     "bin_metallic": {"choice": [0, 1]},

@@ -165,9 +165,13 @@ class Randomize:
     object_rust: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Fraction of each object's surface that is rusty.")
     object_stains: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Fraction of each object's surface that is oily: dark and glossy.")
     object_dust: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Density of dust on each object.")
+    object_label: Annotated[Distribution, "[0, 1] m"] = setting(
+        _NONE, "Width of a printed label with codes, stuck on each object; 0: none."
+    )
     bin_scratches: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Scratches of the bin.")
     bin_stains: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Fraction of the bin that is oily.")
     bin_dust: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Density of dust on the bin.")
+    bin_label: Annotated[Distribution, "[0, 1] m"] = setting(_NONE, "Width of a label on the bin; 0: none.")
     bin_color: Annotated[ColorDistribution, "[0, 1] sRGB"] = setting(_NO_COLOR, "Base colour of the bin; with a texture, its factor.")
     bin_roughness: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Roughness of the bin.")
     bin_metallic: Annotated[Distribution, "[0, 1]"] = setting(_NONE, "Metallic factor of the bin.")

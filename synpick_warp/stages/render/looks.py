@@ -37,10 +37,12 @@ SETTINGS = {
     (LookPart.OBJECT, Look.RUST): "object_rust",
     (LookPart.OBJECT, Look.STAINS): "object_stains",
     (LookPart.OBJECT, Look.DUST): "object_dust",
+    (LookPart.OBJECT, Look.LABEL): "object_label",
     (LookPart.BIN, Look.COLOR): "bin_color",
     (LookPart.BIN, Look.SCRATCHES): "bin_scratches",
     (LookPart.BIN, Look.STAINS): "bin_stains",
     (LookPart.BIN, Look.DUST): "bin_dust",
+    (LookPart.BIN, Look.LABEL): "bin_label",
     (LookPart.BIN, Look.ROUGHNESS): "bin_roughness",
     (LookPart.BIN, Look.METALLIC): "bin_metallic",
     (LookPart.TABLE, Look.COLOR): "table_color",
@@ -56,7 +58,7 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels", "maps")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern", "glass")}
+_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern", "glass", "label")}
 _MATERIALS = StructArrays(
     RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )

@@ -129,6 +129,21 @@ def test_scratches_are_few_and_fade_into_a_wide_pixel(device):
     assert wide.mean() - 0.3 == pytest.approx(sharp.mean() - 0.3, rel=0.5)
 
 
+def test_a_label_covers_its_rectangle_of_one_side_and_has_codes(device):
+    metal = surface(color=(0.5, 0.5, 0.5), metallic=1.0, roughness=0.3)
+    looks = Looks(Randomize(object_label=Distribution.parse(0.2)), (), ())
+
+    def drawn(mesh, **options):
+        return render_objects(device, (mesh, metal, FLAT), view=VIEW, config=PLAIN, lights=(sun((0.7, 0.5, 0.5)),), **options).radiance[0]
+
+    label = np.abs(drawn(SQUARE, looks=looks) - drawn(SQUARE)).max(axis=2) > 0.0
+    # 100 px/m; it is turned a little.
+    assert label.sum() == pytest.approx(20 * 12, abs=25)
+    assert drawn(SQUARE, looks=looks)[label].std() > 0.1 * drawn(SQUARE, looks=looks)[label].mean()
+    behind = replace(SQUARE, faces=SQUARE.faces[:, ::-1])
+    assert np.array_equal(drawn(behind, looks=looks), drawn(behind))
+
+
 def test_each_object_wears_its_own_way_and_plastic_does_not_rust(device):
     def worn(material, **amounts):
         given = {name: Distribution.parse(amount) for name, amount in amounts.items()}

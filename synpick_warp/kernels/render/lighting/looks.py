@@ -8,6 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
+from synpick_warp.kernels.render.lighting.labels import Label, place_label
 from synpick_warp.kernels.render.lighting.materials import METALLIC_MAP, ROUGHNESS_MAP, RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
@@ -75,6 +76,8 @@ class DrawnMaterial:
     """As in `RandomizedSurfaces`."""
     glass: wp.vec3
     """As in `RandomizedSurfaces`; metals are opaque."""
+    label: float
+    """Width of the label [m]; 0: none."""
 
 
 @wp.func
@@ -118,6 +121,8 @@ def draw_material(table: LookTable, surfaces: RandomizedSurfaces, base: int, key
         glass[0] = draw_look(table, key, part, Look.TRANSMISSION)[0]
     glass[0] = glass[0] * (1.0 - result.metallic)
     result.glass = glass
+    if table.distribution[part, Look.LABEL].kind != LookKind.OFF:
+        result.label = draw_look(table, key, part, Look.LABEL)[0]
     return result
 
 
@@ -171,6 +176,9 @@ def dress_bodies_kernel(
     surfaces_inout.wear[row] = material.wear
     surfaces_inout.glass[row] = material.glass
     surfaces_inout.pattern[row] = int(key >> wp.uint64(40))
+    surfaces_inout.label[row] = Label()
+    if material.label > 0.0:
+        surfaces_inout.label[row] = place_label(meshes, base, surfaces_inout.pattern[row], material.label, part == LookPart.BIN)
     surfaces_inout.maps[row] = material.maps
     surfaces_inout.texture_size[row] = surfaces_inout.texture_size[material.texture]
     surfaces_inout.texture_levels[row] = surfaces_inout.texture_levels[material.texture]

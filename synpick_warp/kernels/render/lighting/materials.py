@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
+from synpick_warp.kernels.render.lighting.labels import LABEL_ROUGHNESS, Label, find_place, label_reflectance
 from synpick_warp.kernels.render.lighting.wear import WEAR_LENGTH, Wear, apply_wear, find_wear, has_wear, mean_wear
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.records import read_flat_record
@@ -87,13 +88,15 @@ RandomizedSurfaces = variant_of(
     pattern=wp.array[int],
     noise=wp.array3d[wp.uint32],
     glass=wp.array[wp.vec3],
+    label=wp.array[Label],
 )
 """Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
 More rows called material follow: one for each texture that episodes draw from, and one for each body of each view. `row` is that of a
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
 clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
-table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]."""
+table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]; `label` the place
+of the body's label, whose print has the same seed."""
 AnySurfaces = Any
 """`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
@@ -121,6 +124,8 @@ class Surface:
     """Position in the body's frame, in the unit of `lighting.wear`; zero without wear."""
     place_footprint: float
     """Width of the pixel's footprint on the surface, in the same unit."""
+    label: wp.vec3
+    """Coordinates on the body's label, and the pixel's footprint in them; 0: it shows none."""
 
 
 @wp.struct
@@ -230,14 +235,20 @@ def place_details(  # noqa: F811
     result = surface
     is_worn = has_wear(surfaces.wear[surface.row])
     is_bumpy = (surfaces.maps[surface.row] & NORMAL_MAP) != 0
-    if not is_worn and not is_bumpy:
+    label = surfaces.label[surface.row]
+    is_labelled = wp.length_sq(label.normal) > 0.0
+    if not is_worn and not is_bumpy and not is_labelled:
         return result
     first = meshes.first_triangle[mesh] + triangle
     a = meshes.corner[3 * first]
     edge = meshes.corner[3 * first + 1] - a
     other = meshes.corner[3 * first + 2] - a
+    point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
+    if is_labelled:
+        at = find_place(label, point, wp.transpose(to_world) * surface.face_normal)
+        if wp.max(wp.abs(at[0]), wp.abs(at[1])) < 1.0:
+            result.label = wp.vec3(at[0], at[1], footprint * wp.length(label.along))
     if is_worn:
-        point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
         unit = wp.min(meshes.radius[mesh], WEAR_LENGTH)
         result.place = (point - meshes.center[mesh]) / unit
         result.place_footprint = footprint / unit
@@ -477,6 +488,11 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> S
             result.roughness = details[2]
         if (maps & METALLIC_MAP) != 0:
             result.metallic = details[3]
+    if surface.label[2] > 0.0:
+        shade = label_reflectance(surfaces.pattern[surface.row], wp.vec2(surface.label[0], surface.label[1]), surface.label[2])
+        result.color = wp.vec3(shade, shade, shade)
+        result.metallic = 0.0
+        result.roughness = LABEL_ROUGHNESS
     if has_wear(wear.share):
         worn = apply_wear(wear, result.color, result.metallic, result.roughness)
         result.color = worn.color
