@@ -149,7 +149,9 @@ def build_factory(
     planned = DataLayout.of(config).planned if episodes is None else max(expected, len(episodes))
     needs = Needs.of(config)
     writers = count_writers(config.bake.writers, needs.slot_bytes)
-    config = fit_to_device(without_pictures(config), device, planned, writers, processes)
+    keeps, config = config.render.reuse, fit_to_device(without_pictures(config), device, planned, writers, processes)
+    if keeps and not config.render.reuse:
+        progress.note("memory is too short to keep resting parts of pictures from frame to frame (render.reuse): same files, but slower")
     check_memory(plan_memory(config, device, writers), device, processes)
     with compiling_if_cold(config, device, progress):
         stages = build_stages(config, device, progress, episodes, needs.physics, longest_first)

@@ -4,6 +4,7 @@
 import math
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from synpick_warp.configs.files.load import config_to_toml, load_config, parse_a
 from synpick_warp.configs.schema import Arrangement, Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.factory import forecast, memory_plan
+from synpick_warp.factory import assembly, forecast, memory_plan
 from synpick_warp.factory.forecast import (
     DEVIATIONS,
     FRAMES_OF_MODE,
@@ -129,6 +130,17 @@ def test_settings_that_are_named_stay(give):
     named = {"bake.worlds": 512, "render.views_per_batch": 25, "perception.views": 23, "bake.mode": "mixed"}
     config = load_config("synpick", named)
     assert fit_to_device(config, GPU, 512) == config.with_values({"render.reuse": False})
+
+
+def test_a_bake_says_that_it_does_not_keep_pictures(monkeypatch):
+    notes: list[str] = []
+    progress = SilentProgress()
+    monkeypatch.setattr(progress, "note", notes.append)
+    monkeypatch.setattr(assembly, "fit_to_device", lambda config, *_: config.with_values({"render.reuse": False}))
+    monkeypatch.setattr(assembly, "compiling_if_cold", Mock(side_effect=InterruptedError))
+    with pytest.raises(InterruptedError):
+        assembly.build_factory(Config(), progress)
+    assert ["render.reuse" in note for note in notes] == [True]
 
 
 def test_processes_share_the_hosts_memory(give):
