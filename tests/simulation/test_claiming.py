@@ -10,7 +10,7 @@ from synpick_warp.cloud.ledger import Ledger
 from synpick_warp.system.stores import store
 from synpick_warp.system.stores.store import Store
 from tests.simulation.claiming import Schedule, without_formats
-from tests.simulation.scheduler import HungError, Process, Simulation
+from tests.simulation.scheduler import HungError
 
 SCHEDULES, MOST_SCHEDULES = 200, 2000
 """Schedules of a test, and those in which a planted bug must show; the rarest does in one of 250."""
@@ -105,24 +105,3 @@ def test_a_planted_bug_is_found(bug, monkeypatch):
     BUGS[bug](monkeypatch)
     with pytest.raises((AssertionError, HungError)):
         _run_all(range(MOST_SCHEDULES))
-
-
-def test_threads_of_a_simulation_take_turns_and_die():
-    """Sleeps end in order; what waits for ever is reported; a process that was killed does nothing more."""
-    order, doomed = [], Process("doomed")
-    with Simulation(0) as simulation:
-
-        def note(name, seconds):
-            simulation.sleep(seconds)
-            order.append((name, simulation.now))
-
-        def kill():
-            simulation.sleep(2.0)
-            doomed.dead = True
-
-        simulation.run(*((Process(name), lambda name=name, at=at: note(name, at)) for name, at in (("b", 2.0), ("a", 1.0), ("c", 3.0))))
-        simulation.run((doomed, lambda: note("never", 5.0)), (Process("killer"), kill))
-        with pytest.raises(HungError):
-            simulation.run((Process("stuck"), lambda: simulation.wait(lambda: False)))
-    assert [name for name, _ in order] == ["a", "b", "c"]
-    assert simulation.errors == []

@@ -226,37 +226,6 @@ def test_the_next_frame_displaces_objects_and_keeps_the_rest(device):
 # ---- the guard of two checkouts ----
 
 
-SOURCE = """
-// scale: a comment
-#define float(x) cast_float(x)
-static CUDA_CALLABLE wp::float32 {scale}_0(
-    wp::float32 var_{factor})
-{{
-    if (true) {{ var_1 = wp::mul(var_{factor}, {two}); }}
-    return var_1;
-}}
-extern "C" __global__ void WP_MAXNREG(64) {kernel}_0123abcd_cuda_kernel_forward(
-    wp::launch_bounds_t<1> dim)
-{{
-    var_2 = {scale}_0(var_0);  // x = scale(y)  <L 7>
-}}
-"""
-NAMES = {"scale": "scale", "factor": "factor", "two": "2.0", "kernel": "scale_kernel"}
-
-
-def canonical(**changes: str) -> str:
-    definitions = kernel_sources.split_definitions(SOURCE.format_map(NAMES | changes))
-    (kernel,) = (name for name in definitions if name.endswith("_forward"))
-    return kernel_sources.canonical(kernel, definitions)
-
-
-def test_values_matter_to_a_kernels_source_also_in_functions_that_it_calls_and_names_do_not():
-    assert canonical() == canonical(scale="enlarge", factor="gain", kernel="enlarge_kernel")
-    assert "// " not in canonical()
-    difference = kernel_sources.first_difference([canonical()], [canonical(two="3.0")])
-    assert difference.endswith("wp::mul(p0, 2.0); } | if (true) { var_1 = wp::mul(p0, 3.0); }")
-
-
 def test_the_order_of_overloads_does_not_matter_and_all_of_them_count():
     kinds = ("Sum_0123abcd", "Mean_4567ef01", "Peak_89abcdef")
     first, second, third = (f"CUDA_CALLABLE {kind} add(const {kind}& a) {{ return a; }}\n" for kind in kinds)
