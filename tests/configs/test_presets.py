@@ -130,7 +130,7 @@ def test_every_setting_is_in_the_reference_and_every_preset_in_the_guide():
 # ---- splits: tables, defaults, ranges of episodes, random streams ----
 
 
-GAMMA_INVERSE = pow(int(rng.GAMMA), -1, 2**64)
+GAMMA_INVERSE = np.uint64(pow(int(rng.GAMMA), -1, 2**64))
 """Sample i of a stream with key k is mix(k + (i + 1)·γ): k/γ is its place on the one orbit that all streams follow."""
 LONGEST_STREAM = 2**24
 """More samples than any stream has."""
@@ -176,11 +176,8 @@ def test_no_stream_of_test_meets_one_of_train():
     config = load_config("synpick", splits=True)
     episodes = [index for split in config.splits for index in episode_range(split)]
     assert len(set(episodes)) == 300
-    keys = [
-        int(rng.stream_key(config.bake.seed, episode, arrangement, stream))
-        for episode, arrangement, stream in itertools.product(episodes, range(config.settle.tries), Stream)
-    ]
-    places = np.sort(np.array([key * GAMMA_INVERSE % 2**64 for key in keys], np.uint64))
+    addresses = np.array(list(itertools.product(episodes, range(config.settle.tries), Stream)))
+    places = np.sort(rng.stream_key(config.bake.seed, *addresses.T) * GAMMA_INVERSE)
     gaps = np.diff(np.append(places, places[0]))  # The last one goes around.
     assert gaps.min() > LONGEST_STREAM
 
