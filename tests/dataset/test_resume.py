@@ -18,6 +18,7 @@ import pytest
 import synpick_warp
 from synpick_warp.cli.main import EXIT_MISTAKE
 from synpick_warp.configs.files.load import config_to_toml
+from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import writing
 from synpick_warp.dataset.commit.manifest import committed_episodes
 from synpick_warp.dataset.commit.merge import merge
@@ -77,16 +78,21 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
     assert digests(out) == expected
 
 
+SMALL = {"bake.formats": ["bop"], "bop.split": "test"}
+
+
+def scripted_config(**given: Any) -> Config:
+    values = {"bake.mode": "move", "bop.split": "train", "bop.color_format": "png"} | given
+    return scripted_bake.settings(EPISODES, tuple(TINY["bake.formats"])).with_values(values)
+
+
 @pytest.fixture
 def scripted(tmp_path, monkeypatch) -> Callable[..., str]:
     """Function that runs the command `bake` without simulation, for seconds less, and returns what it reports as an error."""
     monkeypatch.setattr(pipeline, "_fill", scripted_bake.fill)
 
     def bake(out: Path, *arguments: str, splits: str = "", **given: Any) -> str:
-        config = scripted_bake.settings(EPISODES, tuple(TINY["bake.formats"])).with_values(
-            {"bake.mode": "move", "bop.split": "train", "bop.color_format": "png"} | given
-        )
-        (tmp_path / "scripted.toml").write_text(config_to_toml(config) + splits)
+        (tmp_path / "scripted.toml").write_text(config_to_toml(scripted_config(**given)) + splits)
         ran = run("bake", "--config", tmp_path / "scripted.toml", "--out", out, *arguments)
         assert (ran.code == 0) == ("error: " not in ran.err), ran.err
         return ran.err.partition("error: ")[2]
@@ -140,18 +146,14 @@ def test_a_data_set_of_splits_grows_at_its_end_only(scripted, tmp_path):
     assert scripted(out, splits=few, **given).startswith("splits.train.episodes is 2, but")
 
 
-def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):
-    log = tmp_path / "log"
-    changed = {"physics.friction": 0.4, "bake.seed": 3, "bake.worlds": 1}
-    assert server.bake(whole, settings=changed, log=str(log)) == 2
-    (line,) = log.read_text().splitlines()
-    assert line.startswith(f"synpick-warp: error: {whole} was started with other settings: ")
+def test_a_bake_of_other_settings_is_refused_and_says_which(scripted, copied):
+    before = digests(copied)
+    line = scripted(copied, **SMALL | {"physics.friction": 0.4, "bake.seed": 3, "bake.worlds": 1})
+    assert line.startswith(f"{copied} was started with other settings: ")
     assert "bake.seed is 3, there 0; physics.friction is 0.4, there 0.5; " in line
     assert "worlds" not in line
-    log.unlink()
-    assert server.bake(whole, settings={"bake.episodes": 2}, log=str(log)) == 2
-    assert "bake.episodes is 2, but" in log.read_text()
-    assert digests(whole) == expected
+    assert "bake.episodes is 2, but" in scripted(copied, **SMALL | {"bake.episodes": 2})
+    assert digests(copied) == before
 
 
 SENSORS = {
@@ -181,6 +183,7 @@ def test_parts_of_splits_and_of_several_sensors_are_merged(scripted, tmp_path, s
     assert digests(tmp_path / "merged") == digests(tmp_path / "once")
 
 
+@pytest.mark.slow
 def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log), settings={"bake.worlds": 1})
@@ -233,18 +236,20 @@ def test_the_folder_is_removed(scripted, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def copied(whole, tmp_path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "set"))
+def copied(tmp_path) -> Path:
+    """A finished bake without simulation."""
+    scripted_bake.bake(tmp_path / "set", scripted_config(**SMALL))
+    return tmp_path / "set"
 
 
-def test_an_undisturbed_data_set_is_as_it_was_written(whole, expected):
-    assert verify(whole) == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
-    listed = subprocess.run(["sha256sum", "--check", "--quiet", *whole.glob("manifest/*.sha256")], cwd=whole, capture_output=True)
+def test_an_undisturbed_data_set_is_as_it_was_written(copied):
+    assert verify(copied) == ("", EPISODES, len(digests(copied)) - FILES_OF_THE_MANIFEST, True)
+    listed = subprocess.run(["sha256sum", "--check", "--quiet", *copied.glob("manifest/*.sha256")], cwd=copied, capture_output=True)
     assert listed.returncode == 0
 
 
 def test_what_is_wrong_or_missing_is_named(copied):
-    targets, picture = copied / "test_targets_bop19.json", copied / "train/000004/depth/000002.png"
+    targets, picture = copied / "test_targets_bop19.json", copied / "test/000003/depth/000001.png"
     model, settings, manifest = copied / "models/models_info.json", copied / "config.toml", copied / "manifest.json"
     for change, said in (
         (lambda: targets.write_bytes(targets.read_bytes()[:-1]), f"{targets} has changed since it was written: its checksum differs"),

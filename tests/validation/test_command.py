@@ -146,15 +146,22 @@ def test_whatever_a_file_says_is_reported_in_lines(copy, check, name):
     other = [("text", b"[bake]\nmode = 3"), ("binary", b"\xff\0")]
     contents = list(hostile_contents(path.read_bytes())) if path.suffix == ".json" else other
     offset = FILES.index(name)
-    whole = contents[:16]
+    whole = contents[offset % 4 : 16 : 4]
     for description, content in [*whole, *islice(contents, 16 + offset, None, max(EVERY, len(contents) // 5))]:
         path.write_bytes(content)
-        found = check(copy, sample=6 if name.startswith(SCENE) else 0, images=name.startswith(SCENE))
+        found = check(copy, sample=3 if name.startswith(SCENE) else 0, images=name.startswith(SCENE))
         assert all(violation.text and "Traceback" not in violation.text for violation in found), description
 
 
-@pytest.mark.parametrize("part", ["rgb/000001.png", "depth/000001.png", "mask/000001_000000.png", "mask_visib/000001_000001.png"])
-@pytest.mark.parametrize("content", ["empty", "text", "bomb", "truncated", "tiff"])
+@pytest.mark.parametrize(
+    ("part", "content"),
+    [
+        *(("depth/000001.png", content) for content in ("empty", "text", "bomb", "truncated", "tiff")),
+        ("rgb/000001.png", "text"),
+        ("mask/000001_000000.png", "truncated"),
+        ("mask_visib/000001_000001.png", "bomb"),
+    ],
+)
 def test_images_that_do_not_decode_are_named(copy, check, part, content):
     path = copy / SCENE / part
     whole = path.read_bytes()
