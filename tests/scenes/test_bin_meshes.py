@@ -255,8 +255,14 @@ def test_a_tool_that_does_not_come_down_between_leaning_walls_is_refused(tmp_pat
 # ---- floors and openings of bins whose walls lean, that are turned in their files, or have holes ----
 
 
-@pytest.mark.parametrize("more", [{}, {"radius": 0.03}, {"wall": 0.0}, {"wall": 0.03}], ids=["sharp", "rounded", "sheet", "thick"])
-@pytest.mark.parametrize("drafts", [(1,) * 4, UNEQUAL, (15, 15, 0, 0), (30,) * 4, (45,) * 4], ids=str)
+@pytest.mark.parametrize(
+    ("drafts", "more"),
+    [
+        *((drafts, {}) for drafts in ((1,) * 4, UNEQUAL, (15, 15, 0, 0), (30,) * 4, (45,) * 4)),
+        *((UNEQUAL, more) for more in ({"radius": 0.03}, {"wall": 0.0}, {"wall": 0.03})),
+        ((45,) * 4, {"wall": 0.03}),
+    ],
+)
 def test_floor_and_opening_are_those_of_a_frustum(tmp_path, drafts, more):
     found, sizes = read_sizes(tmp_path, frustum(drafts=drafts, **more))
     np.testing.assert_allclose(sizes.floor, FLOOR, atol=5e-4)
@@ -279,8 +285,9 @@ def test_upright_walls_need_no_other_keys(tmp_path):
     assert (measured.yaw, measured.floor, measured.openings) == (None, None, None)
 
 
-@pytest.mark.parametrize("flip", [False, True])
-@pytest.mark.parametrize(("angle", "yaw"), [(3, 3), (30, 30), (60, 60), (90, None), (100, -80), (200, 20)])
+@pytest.mark.parametrize(
+    ("angle", "yaw", "flip"), [(3, 3, False), (30, 30, True), (60, 60, False), (90, None, False), (100, -80, True), (200, 20, False)]
+)
 def test_a_turned_bin_has_its_own_sides(tmp_path, angle, yaw, flip):
     """Its frame lies along them; in the world it is where the mesh is."""
     mesh = frustum(drafts=UNEQUAL).apply_transform(TURN(np.radians(angle), AROUND_Z)).apply_translation((0.3, -0.2, 0.5))
@@ -296,8 +303,14 @@ def test_a_turned_bin_has_its_own_sides(tmp_path, angle, yaw, flip):
     assert np.ptp(sizes.corners, axis=0)[2] == pytest.approx(0.18)
 
 
-@pytest.mark.parametrize("wall", [0.0, 0.004, 0.03])
-@pytest.mark.parametrize(("hole", "said"), [(0.005, None), (0.01, None), (0.03, 30), (0.1, 100), (0.2, 200)])
+HOLES = {0.005: None, 0.01: None, 0.03: 30, 0.1: 100, 0.2: 200}
+"""Sides of holes [m], and what is said of each [mm]."""
+
+
+@pytest.mark.parametrize(
+    ("wall", "hole", "said"),
+    [*((0.004, *row) for row in HOLES.items()), *((wall, hole, HOLES[hole]) for wall in (0.0, 0.03) for hole in (0.01, 0.03))],
+)
 def test_a_hole_is_named_and_the_floor_stays_where_it_is(tmp_path, hole, wall, said):
     found, sizes = read_sizes(tmp_path, frustum(hole=hole, wall=wall))
     np.testing.assert_allclose((*sizes.floor, sizes.base, sizes.height), (*FLOOR, -wall, HEIGHT), atol=5e-4)
@@ -363,7 +376,7 @@ def test_what_is_longer_than_the_floor_lies_between_the_walls(tmp_path):
     assert np.abs(points[:, :2]).max() == pytest.approx(room - 0.01, abs=1e-3)
 
 
-@pytest.mark.parametrize(("draft", "angle"), [(0, 0), (15, 0), (30, 25)])
+@pytest.mark.parametrize(("draft", "angle"), [(0, 0), (30, 25)])
 def test_a_basket_collides_as_a_closed_box_on_request(tmp_path, draft, angle):
     mesh = meshes.basket(draft, sections=6).apply_transform(TURN(np.radians(angle), AROUND_Z))
     found, sizes = read_sizes(tmp_path, mesh, collision="box")

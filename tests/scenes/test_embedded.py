@@ -141,7 +141,7 @@ def test_labels_are_upright_and_not_mirrored(obj_id):
     assert (slope[:, 2] > 0.1).any()
 
 
-@pytest.mark.parametrize(("name", "row"), PARTS.items())
+@pytest.mark.parametrize(("name", "row"), [pytest.param(*row, marks=[pytest.mark.slow] * (row[0] == "gear")) for row in PARTS.items()])
 def test_parts_have_the_sizes_masses_and_symmetries_of_their_drawings(name, row):
     """Their rotations are all that the detection of symmetries finds by shape alone, which knows nothing of how they are made."""
     sides, density, order = row
@@ -256,7 +256,7 @@ def piece_corners(shape):
     return [set(map(tuple, np.rint(1e9 * piece.vertices).astype(int).tolist())) for piece in shape]
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (index % 3 > 0)) for index, name in enumerate(NAMED)])
 def test_each_object_has_its_shape(name):
     """`python -m tools.embedded_shapes` computes it again where an object has changed. Releases of NumPy differ by 5e-14 m at zero."""
     raw, recipe = NAMED[name], shape_recipe(NAMED[name], SETTINGS)

@@ -80,7 +80,7 @@ def stepped_bin() -> Mesh:
 
 def bowl() -> Mesh:
     """Lower half of the surface of a sphere with a radius of 0.2 m."""
-    mesh = trimesh.creation.icosphere(4, 0.2)
+    mesh = trimesh.creation.icosphere(3, 0.2)
     return Mesh(mesh.vertices, mesh.faces[mesh.triangles_center[:, 2] < 0.0])
 
 
