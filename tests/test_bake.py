@@ -264,9 +264,9 @@ def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
 # ---- when something fails ----
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("share", [0.5, 1.0])
 def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
-    """The first batch cannot be written, one in the middle, or the last."""
+    """A batch in the middle cannot be written, or the last."""
     left = [int(share * (baked.summary.views // CAMERAS - 1))]
     write = BopExporter.write_views
 

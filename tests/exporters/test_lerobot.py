@@ -37,7 +37,7 @@ from synpick_warp.exporters.trajectory.arrays import CONSTANT_GROUPS, EPISODE_GR
 from synpick_warp.factory.episodes import EpisodeOutcome
 from synpick_warp.testing import box_views
 from synpick_warp.testing.box_views import config
-from synpick_warp.testing.exporters import ExporterContract, digests, export, exporting, feed, finish
+from synpick_warp.testing.exporters import ExporterContract, export, exporting, feed, finish
 from synpick_warp.testing.picks import EACH, REPEATS, pick_batch
 from synpick_warp.views.frames import EpisodeEnd
 from synpick_warp.views.layers import LAYER_TABLE
@@ -197,9 +197,9 @@ class TestLerobotContract(ExporterContract):
     exporter_class, row = LerobotExporter, FORMAT_TABLE["lerobot"]
 
 
-def write(out: Path, settings: Config, episodes: tuple[int, ...] = EPISODES, processes: int = 0) -> Path:
+def write(out: Path, settings: Config, episodes: tuple[int, ...] = EPISODES) -> Path:
     """Write a data set with physics, views and attempts."""
-    with exporting(LerobotExporter, out, settings, processes) as exporter:
+    with exporting(LerobotExporter, out, settings) as exporter:
         exporter.write_constants()
         for tick in trajectories.ticks(episodes, FRAMES):
             exporter.write_ticks(tick)
@@ -368,10 +368,6 @@ def test_statistics_are_those_of_all_frames(dataset, data, episodes):
     np.testing.assert_allclose(np.ravel(seen["q50"]), median / 255)
     assert np.shape(seen["q50"]) == (3, 1, 1)
     assert episodes[1]["stats/index/min"] == [FRAMES]
-
-
-def test_bytes_do_not_depend_on_processes(dataset, tmp_path):
-    assert digests(write(tmp_path / "set", trajectories.config(), processes=2) / "lerobot") == digests(dataset)
 
 
 def with_rows(content: dict, state: float | None) -> bytes:

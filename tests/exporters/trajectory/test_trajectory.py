@@ -201,10 +201,6 @@ def test_equally_named_dimensions_have_equal_sizes(store):
         assert {name: len(sizes) for name, sizes in extents.items()} == dict.fromkeys(extents, 1)
 
 
-def test_bytes_do_not_depend_on_processes_or_order(tmp_path, folder):
-    assert digests(write_set(tmp_path, config(), EPISODES[::-1], FRAMES, processes=2)) == digests(folder)
-
-
 def test_without_recorded_steps_there_is_no_group_of_steps(tmp_path):
     write_set(tmp_path, config(steps=False), (0,), 3, steps=False)
     episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
