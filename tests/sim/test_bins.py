@@ -221,9 +221,7 @@ HALVES = BinRow(name="halves", compartments=(2, 1), divider_height=0.15)
 FLAT = BinRow(name="flat", outer_size=(0.615, 0.373, 0.1), wall=0.01, rim_size=(0.53, 0.34))
 
 
-@pytest.mark.parametrize(
-    ("kind", "rows"), [("own", ["sloped", "round", "moulded", HALVES]), ("own", [HALVES, FLAT]), ("none", []), ("pallet", [])]
-)
+@pytest.mark.parametrize(("kind", "rows"), [("own", ["sloped", "round", "moulded", HALVES, FLAT]), ("none", []), ("pallet", [])])
 def test_piles_rest_in_or_on_the_bin_that_is_drawn_in_any_number_of_worlds(kind, rows, tmp_path):
     """Bins of meshes and of sizes, shifted and turned: no corner of an object is in a wall, a floor or beside the inside."""
     files = {name: str(tmp_path / f"{name}.stl") for name in rows if isinstance(name, str)}

@@ -115,7 +115,7 @@ def test_what_hangs_by_its_edge_swings_little_more_than_the_limit(device):
 THREE = {"gripper__kind": "suction_array", "gripper__cups": [[-0.05, 0.0], [0.0, 0.04], [0.05, 0.0]]}
 
 
-@pytest.fixture(scope="module", params=[{}, THREE], ids=["one", "three"])
+@pytest.fixture(scope="module")
 def floating(device, request) -> Hanging:
     """The lightest and the heaviest object, without weight, on grippers that nothing holds; on one cup, or on three."""
     hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0, **request.param)
@@ -123,7 +123,13 @@ def floating(device, request) -> Hanging:
     return hanging
 
 
-@pytest.mark.parametrize(("stiffness", "damping", "twist"), [(2e4, 100.0, 50.0), (1e6, 0.0, 500.0), (2e3, 100.0, 5.0)])
+SEALS = ((2e4, 100.0, 50.0), (1e6, 0.0, 500.0), (2e3, 100.0, 5.0))
+"""Stiffness, damping and stiffness of twist."""
+
+
+@pytest.mark.parametrize(
+    ("floating", "stiffness", "damping", "twist"), [*(({}, *seal) for seal in SEALS), (THREE, *SEALS[0])], indirect=["floating"]
+)
 def test_wrenches_are_opposite_and_give_no_energy(floating, stiffness, damping, twist):
     """A pushed and spinning object takes its gripper along: the momentum stays, energy goes, at last both move as one."""
     filled(floating.scene.suction, {"stiffness": stiffness, "damping": damping, "twist_stiffness": twist})
@@ -245,7 +251,7 @@ def loads(cups, offset, held) -> np.ndarray:
     return result
 
 
-@pytest.mark.parametrize("cups", [[[0.0, 0.0]], SQUARE[::2], TRIANGLE, SQUARE, [*SQUARE, [0.0, 0.0]]])
+@pytest.mark.parametrize("cups", [TRIANGLE, [*SQUARE, [0.0, 0.0]]])
 def test_cups_about_the_middle_of_a_box_bear_equal_shares(device, cups):
     world = hanging(device, cups)
     largest = world.run(STEPS)[-1, 0, 0]
@@ -279,13 +285,12 @@ def test_loads_balance_the_moments_where_cups_miss_or_have_broken_off(device, br
     np.testing.assert_allclose(world.seals.cup_force.numpy(), expected, atol=0.01 * BOX_MASS * GRAVITY)
 
 
-@pytest.mark.parametrize(("valve", "held"), [("each", 0b0111), ("common", 0)])
-def test_where_one_seal_of_a_common_valve_breaks_the_others_are_poor(device, valve, held):
-    world = hanging(device, SQUARE, gripper__valve=valve)
+def test_where_one_seal_of_a_common_valve_breaks_the_others_are_poor(device):
+    world = hanging(device, SQUARE, gripper__valve="common")
     world.seals.break_force.assign(np.array([[40.0, 40.0, 40.0, 1.0]]))
     world.run(STEPS)
-    assert world.seals.attached.numpy().tolist() == [[held]]
-    assert (world.bodies()[0][0, 2, 2] < 0.5) == (held == 0)
+    assert world.seals.attached.numpy().tolist() == [[0]]
+    assert world.bodies()[0][0, 2, 2] < 0.5
 
 
 # ---- the law ----
