@@ -81,8 +81,11 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
     return pictures, shares
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
-@pytest.mark.parametrize(("lights", "mode"), [(LAMPS, FAST), (LIGHT, FAST), (LAMPS, UNOCCLUDED)], ids=["lamps", "gradient", "unoccluded"])
+@pytest.mark.parametrize(
+    ("size", "lights", "mode"),
+    [(1, LAMPS, FAST), (2, LAMPS, FAST), (3, LAMPS, FAST), (2, LIGHT, FAST), (2, LAMPS, UNOCCLUDED)],
+    ids=["1", "2", "3", "gradient", "unoccluded"],
+)
 def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode):
     frames, pictures, shares = scripts(size), {}, {}
     for reuse in (True, False):
@@ -99,7 +102,7 @@ def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode)
 def test_a_still_scene_is_shaded_when_its_light_is_due(device):
     toy = ToyScene(ENTRIES, scripts(0)[0], CAMERAS, lights=(LAMPS,), instances=ROOM, config=with_render(coarse_pixel=2, coarse_paths=1))
     renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
-    _, shares = play(renderer, [toy.placed] * 200, toy, seed=0)
-    due = np.array(shares)[-80:]
+    _, shares = play(renderer, [toy.placed] * 120, toy, seed=0)
+    due = np.array(shares)[-60:]
     assert set(np.unique(due.round(6)).tolist()) <= {0.0, 0.25, 0.333333, 0.5, 0.666667, 0.75, 1.0}
     assert due.mean() < 0.2 < shares[0] == 1.0

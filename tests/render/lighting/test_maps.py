@@ -38,8 +38,13 @@ def radiance(device, mesh, material, pose=FLAT, looks=None):
     ]
 
 
-@pytest.mark.parametrize("tilt", [(64 / 127, 0.0), (0.0, -64 / 127), (-38 / 127, 51 / 127)])
-@pytest.mark.parametrize("frame", ["plain", "mirrored", "quarter turn", "turned body", "from behind"])
+@pytest.mark.parametrize(
+    ("frame", "tilt"),
+    [
+        *(("plain", tilt) for tilt in ((64 / 127, 0.0), (0.0, -64 / 127))),
+        *((frame, (-38 / 127, 51 / 127)) for frame in ("plain", "mirrored", "quarter turn", "turned body", "from behind")),
+    ],
+)
 def test_a_normal_map_shades_like_normals_of_the_mesh(device, tilt, frame):
     """The map's x is the direction in which u grows, and y that of v, also where the texture is mirrored, turned or seen from behind."""
     uv, along, across = SQUARE.uv, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])

@@ -266,6 +266,11 @@ VIEWS = {
 }
 
 
+def on_views(*values: tuple) -> list[tuple]:
+    """The first values on each of VIEWS, the others on the strong one."""
+    return [*((name, *values[0]) for name in VIEWS), *(("strong", *other) for other in values[1:])]
+
+
 TURN = Rotation.from_euler("xyz", [172, 9, 40], degrees=True).as_matrix()
 OFF_CENTRE = Camera(96, 64, np.array([[75.0, 0.0, 51.3], [0.0, 69.4, 30.2], [0.0, 0.0, 1.0]]), TURN, -TURN @ (0.02, -0.03, 1.0))
 """A real camera matrix without a lens: fx ≠ fy and cx ≠ W/2."""
@@ -297,8 +302,7 @@ def test_depth_and_masks_are_those_of_float64(device, name, size):
     assert check_triangles(random_triangles(5, 40, size, 0.4), device, VIEWS[name]) > 20
 
 
-@pytest.mark.parametrize("name", VIEWS)
-@pytest.mark.parametrize(("zoom", "shift"), [(0.0, (3.0, -2.0)), (0.05, (-4.5, 0.25)), (-0.02, (0.5, 1.5))])
+@pytest.mark.parametrize(("name", "zoom", "shift"), on_views((0.0, (3.0, -2.0)), (0.05, (-4.5, 0.25)), (-0.02, (0.5, 1.5))))
 def test_rays_of_a_drawn_camera_matrix_are_those_of_float64(device, name, zoom, shift):
     """Beside a pinhole, in a batch of three views with a lens of their own."""
     view = VIEWS[name]
@@ -334,8 +338,7 @@ def test_edges_lie_where_opencv_projects_them(device, view):
     np.testing.assert_array_equal((found["segment"].ravel() == 1)[sure], (off > 0)[sure])
 
 
-@pytest.mark.parametrize("name", VIEWS)
-@pytest.mark.parametrize("place", [(0.68, 0.0), (-0.75, 0.45), (0.0, -0.62)])
+@pytest.mark.parametrize(("name", "place"), on_views(((0.68, 0.0),), ((-0.75, 0.45),), ((0.0, -0.62),)))
 def test_masks_beyond_the_border_are_those_of_the_continued_lens(device, name, place):
     view = VIEWS[name]
     toy = ToyScene([entry(ball(0.15, 3))], [[(0, (*place, 0.1, *UPRIGHT)), (0, (*place, -0.3, *UPRIGHT))]], (view,))
@@ -346,8 +349,7 @@ def test_masks_beyond_the_border_are_those_of_the_continued_lens(device, name, p
     assert np.abs(picture.boxes[0] - boxes).max() <= 1
 
 
-@pytest.mark.parametrize("name", VIEWS)
-@pytest.mark.parametrize("shift", [0.0, 1e-5, 0.03])
+@pytest.mark.parametrize(("name", "shift"), on_views((0.03,), (0.0,), (1e-5,)))
 def test_flow_is_the_difference_of_opencvs_projections(device, name, shift):
     """Of a sheet that moves across and towards the camera, by nothing, by less than float32 resolves in pixels, and by pixels."""
     view, moved = VIEWS[name], np.array((shift, -shift / 2, shift))
