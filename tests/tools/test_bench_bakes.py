@@ -71,28 +71,21 @@ def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
     assert table.exists()
 
 
-@pytest.mark.parametrize(
-    ("processes", "end", "said"),
-    [
-        (1, lambda out, _: (out / "manifest/000009.json").write_text("{"), "000009.json"),
-        (2, lambda _, pids: os.kill(pids[-1], signal.SIGKILL), "a process that verifies episodes was ended by SIGKILL; "),
-    ],
-    ids=["damage", "death"],
-)
-def test_the_processes_follow_a_growing_data_set_until_one_finds_damage_or_dies(tmp_path, processes, end, said):
+@pytest.mark.slow
+def test_the_processes_follow_a_growing_data_set_until_one_dies(tmp_path):
     files = [file for episode in range(5) for file in write_episode(tmp_path, episode)]
     size = sum(file.stat().st_blocks * 512 for file in files)
-    with Cleaner(CleanedSet(tmp_path, SHARED), processes) as cleaner:
-        assert len(set(cleaner.pids)) == processes
+    with Cleaner(CleanedSet(tmp_path, SHARED), 2) as cleaner:
+        assert len(set(cleaner.pids)) == 2
         wait_for(lambda: cleaner.poll().episodes == 5)
         assert cleaner.poll() == Tally(5, 10, size)
         assert not any(file.exists() for file in files)
         write_episode(tmp_path, 7)
         wait_for(lambda: cleaner.poll().episodes == 6)
         assert not cleaner.poll().problem
-        end(tmp_path, cleaner.pids)
+        os.kill(cleaner.pids[-1], signal.SIGKILL)
         wait_for(lambda: cleaner.poll().problem)
-        assert said in cleaner.poll().problem
+        assert "a process that verifies episodes was ended by SIGKILL; " in cleaner.poll().problem
         assert cleaner.poll().episodes == 6
 
 
@@ -155,18 +148,21 @@ def test_what_would_be_lost_or_ignored_is_refused_at_once(capsys, arguments, sai
     assert said in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_devices_that_do_not_exist_damage_and_ctrl_c_end_the_benchmark_with_one_line(monkeypatch, capsys):
-    def steady(*arguments: str) -> tuple[int, str]:
-        code = bench.main([*arguments, "--parts", "steady", "--seconds", "60"])
-        return code, capsys.readouterr().err.splitlines()[-1]
+def steady(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    """Exit code and last line of a measurement."""
+    code = bench.main([*arguments, "--parts", "steady", "--seconds", "60"])
+    return code, capsys.readouterr().err.splitlines()[-1]
 
-    code, line = steady(*ANY_DEVICE, "--devices", "cuda:98,cuda:99")
+
+def test_devices_that_do_not_exist_end_the_benchmark_with_one_line(capsys):
+    code, line = steady(capsys, *ANY_DEVICE, "--devices", "cuda:98,cuda:99")
     assert (code, "cuda:98" in line) == (2, True)
-    with monkeypatch.context() as patch:
-        patch.setattr(bakes.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
-        assert steady(*TINY) == (2, "bench: a file is missing")
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_benchmark_with_one_line(monkeypatch, capsys):
     monkeypatch.setattr(bakes.SteadyMeter, "update", lambda *_, **counts: os.kill(os.getpid(), signal.SIGINT))
-    assert steady(*TINY) == (130, "bench: interrupted")
+    assert steady(capsys, *TINY) == (130, "bench: interrupted")
 
 
 def bench_rows(folder: Path, *arguments: str) -> dict[str, float]:
