@@ -17,7 +17,7 @@ from synpick_warp.apps.validation.run import Summary, ValidationOptions, validat
 from synpick_warp.cli import main as commands
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.files.load import load_config
-from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.scene_exporter import BopExporter
 from synpick_warp.factory import picks, pipeline
 from synpick_warp.factory.episodes import BakeSummary
@@ -410,8 +410,3 @@ def test_the_ordinary_data_set_is_the_same_without_trials(tried, tmp_path):
     ordinary = {name: digest for name, digest in files(tried).items() if not name.startswith("picks")}
     assert len(ordinary) > 50
     assert files(tmp_path / "set") == ordinary
-
-
-def test_episodes_must_pick():
-    with pytest.raises(ConfigError, match=r"bake.formats is .*; allowed: without picks where no episode picks"):
-        load_config("smoke", QUICK | {"bake.mode": "move", "bake.formats": ["picks"]})

@@ -35,7 +35,7 @@ from tests.builders import PICKING, mistake, once
 from tests.harness.bake_server import TINY, TINY_PICKS
 from tests.harness.pieces import depth_within
 from tests.worlds.bin_meshes import bracket, sloped_bin
-from tests.worlds.model_files import OBJ, box, exported, glb, put
+from tests.worlds.model_files import box, exported, glb, put
 from tests.worlds.shapes import UPRIGHT, camera, entry, even_light, sheet, sun
 from tests.worlds.small_worlds import QUICK
 from tests.worlds.toy_scene import ToyScene, render
@@ -258,12 +258,10 @@ CASES = {
         CAMERA + BIN + 'file = "bin.stl"\nplace = "file"\n',
         "in cell.toml; allowed: positions above the bin's floor, z > 1.5",
     ),
-    "parts in millimetres": (PARTS, 'did you mean objects.unit = "'),
     "part larger than a compartment": (IN_MM + BIN + "compartments = [6, 6]\n", "long: too large for the bin"),
     "part larger than the budget": (IN_MM + "[arrangement]\nvolume = 1e-5\n", "arrangement.volume is 1e-05 m³, but the smallest object, "),
     "part without mass": (IN_MM + ROW, "object_rows[0].mass is 0 in cell.toml; "),
     "no parts": ('[bake]\nmodels = "empty"\n', "empty: it contains no models; "),
-    "texture of a part that is cut": ('[bake]\nmodels = "skin"\n', "skin/t.png: not readable as an image ("),
     "light that is not finite": (LIGHTS, "lights/a.hdr has radiance that is infinite or not a number"),
     "no textures": (looks('bin_textures = "missing"'), "missing cannot be read"),
     "empty textures": (looks('table_textures = "empty"'), "empty has 0 images"),
@@ -294,9 +292,6 @@ def test_what_cannot_be_baked_is_one_line(tmp_path, monkeypatch, case):
         "transposed.yaml": TRANSPOSED,
         "bin.stl": exported(sloped_bin().apply_translation((0.0, 0.0, 1.5)), "stl"),
         "parts/long.stl": exported(trimesh.creation.box((90.0, 80.0, 70.0)), "stl"),
-        "skin/a.obj": OBJ,
-        "skin/a.mtl": "newmtl skin\nmap_Kd t.png\n",
-        "skin/t.png": picture[:3000],
         "cut/a.png": picture[:3000],
         "cut/b.webp": b"",
         "half/a.png": picture,

@@ -242,7 +242,6 @@ def test_shards_divide_the_episodes_of_all_splits(lengths, gaps, count):
         (["--split", "train", "--mode", "pick"], 'bake.mode is "pick" on the command line; allowed: none'),
         (["--split", "test", "--shard", "61/1000"], "--shard 61/1000 has none of 60 episodes; use fewer shards"),
         (["--set", "splits.train.episodes=4"], "there is no split train, set on the command line; the settings have none"),
-        (["--split", "train", "--set", "splits.train.episode=4"], "there is no key splits.train.episode, set on the command line"),
         (["--split", "train", "--set", "splits.train=4"], "there is no key splits.train., set on the command line"),
         (["--split", "train", "--set", "splits.test.first=4"], "splits.test.first is 4 on the command line; allowed: at least 240"),
     ],

@@ -219,7 +219,7 @@ def test_the_symmetries_of_a_folder_of_parts(tmp_path):
 def test_parts_are_compared_with_the_bins_mesh(tmp_path):
     """A part that does not fit into a bin of the default size."""
     put(tmp_path / "parts" / "plate.stl", exported(trimesh.creation.box((0.6, 0.5, 0.1)), "stl"))
-    sloped_bin().apply_scale(3.0).export(tmp_path / "bin.stl")
+    sloped_bin().apply_scale(2.2).export(tmp_path / "bin.stl")
     put(tmp_path / "cell.toml", "preset = 'smoke'\n[bins]\nkind = 'own'\n[[bin]]\nname = 'large'\nfile = 'bin.stl'\n")
     assert "plate.stl: symmetries detected" in run("preview", tmp_path / "parts", "--symmetries", "--config", tmp_path / "cell.toml").out
 

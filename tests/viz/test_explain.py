@@ -296,7 +296,6 @@ def observed(*seen: dict) -> dict[str, object]:
     return {"resolution": [96, 72], "instances": list(seen), "votes": []}
 
 
-NO_POLE = observed(seen_object(2, 7, (5, 5), pole=None))
 CIRCLE = observed(seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9), above=[2]))
 
 
@@ -304,15 +303,8 @@ CIRCLE = observed(seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9)
     ("harm", "said"),
     [
         (second("{"), r"attempts\.jsonl, line 2, is damaged: input data was truncated; restore the file, "),
-        (second(""), r"attempts\.jsonl, line 2, is damaged: input data was truncated"),
-        (second("[1]"), r"line 2, is damaged: expected object, got array"),
         (second('{"episode": 1, "attempt": "0"}'), r"line 2, is damaged: expected int, got str - at \$\.attempt"),
-        (second('{"episode": 1, "attempt": 0}'), r"line 2, is damaged: object missing required field mode"),
-        (second(frame="first"), r"line 2, is damaged: expected int, got str - at \$\.frame"),
-        (second(mode="move"), r"line 2, is damaged: invalid enum value 'move' - at \$\.mode"),
         (second(target=9), r"line 2, is damaged: target is 9, which was not visible"),
-        (second(peak_force=[float("inf")]), r"line 2, is damaged: JSON is malformed"),
-        (second(observation=NO_POLE), r"line 2, is damaged: expected array, got null - at \$\.observation\.instances\[0\]\.pole"),
         (second(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
         (second(frame=77), r"000003 has no image 77, as .*attempts\.jsonl names frame 77"),
         (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
@@ -323,10 +315,8 @@ CIRCLE = observed(seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9)
         (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl, line 1, is damaged: JSON is malformed"),
         (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),
         (lambda folder: (folder / "config.toml").unlink(), r"has no config\.toml"),
-        (lambda folder: (folder / "models" / "models_info.json").unlink(), r"there is no file .*models_info\.json"),
         (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"has no images of episode 1"),
         (lambda folder: (folder / "train/000003/rgb/000000.png").unlink(), r"there is no .*rgb/000000\.png or \.jpg"),
-        (lambda folder: (folder / "train/000003/rgb/000000.png").write_bytes(b"x"), r"000000\.png is not an image"),
         (lambda folder: (folder / "train/000003/mask_visib/000000_000001.png").unlink(), r"there is no .*000000_000001\.png"),
     ],
 )
