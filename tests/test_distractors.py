@@ -327,7 +327,7 @@ FOLDERS = ("bin_textures", "table_textures", "background_textures", "distractor_
 EVERYTHING = PICKING | {
     "arrangement.max_objects": 4,
     "arrangement.upright": 0.5,
-    "bake.episodes": 3,
+    "bake.episodes": 2,
     "bake.formats": ["bop", "usd", "zarr"],
     "bins.shift": [0.05, 0.03],
     "bins.yaw": 20.0,
@@ -373,7 +373,5 @@ def test_bytes_do_not_depend_on_worlds(single, worlds):
 
 
 def test_episodes_look_different(single):
-    images = [cv2.imread(str(path)).astype(int) for path in sorted(single[0].glob("train/*/rgb/000000.png"))[::2]]
-    assert len(images) == 3
-    for first, second in ((0, 1), (0, 2), (1, 2)):
-        assert np.abs(images[first] - images[second]).mean() > 10
+    first, second = (cv2.imread(str(path)).astype(int) for path in sorted(single[0].glob("train/*/rgb/000000.png"))[::2])
+    assert np.abs(first - second).mean() > 10

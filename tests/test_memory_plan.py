@@ -284,7 +284,7 @@ WHOLE = st.one_of(
 VALUES = {int: WHOLE, float: st.floats(), tuple[int, int]: st.lists(st.one_of(WHOLE, st.integers(1, 8192)), min_size=2, max_size=2)}
 
 
-@hypothesis_settings(max_examples=fuzz_examples(200), deadline=5000)
+@hypothesis_settings(max_examples=fuzz_examples(100), deadline=5000)
 @given(data=st.data(), cuda=st.booleans(), mode=st.sampled_from(("pick", "move", "mixed")), cameras=st.sampled_from((None, 1, 1000)))
 def test_extreme_settings_give_a_plan_or_one_line(data, cuda, mode, cameras):
     chosen = data.draw(st.lists(st.sampled_from(NUMBERS), max_size=4, unique_by=lambda item: item[0]))
