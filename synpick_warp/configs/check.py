@@ -135,7 +135,7 @@ def _leaves(value: Any) -> Iterator[Any]:
 
 def _inside(leaf: Any, item: Setting) -> bool:
     """Whether a value is one of the choices, or within the bounds, of its setting."""
-    if item.choices:
+    if item.choices and not item.path:
         return leaf in item.choices
     if isinstance(leaf, str | bool):
         return True

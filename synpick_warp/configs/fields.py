@@ -73,8 +73,8 @@ def setting(
 ) -> Any:
     """Declare a setting: a field of a dataclass. `doc`: meaning, in sentences. `choices`: allowed strings; empty: any. `parse`: converts a
     value as TOML has it to one of the field's type; raises ValueError with what is allowed. `allowed`: what is allowed, where type, range
-    and choices do not say it. `path`: whether it names a file or folder; in a file of settings it is then relative to that file, else to
-    the current folder."""
+    and choices do not say it. `path`: whether it names a file or folder, or something else by one of `choices`; in a file of settings
+    it is then relative to that file, else to the current folder."""
     return dataclasses.field(default=default, metadata={"doc": doc, "choices": choices, "parse": parse, "allowed": allowed, "path": path})
 
 

@@ -13,6 +13,7 @@ from synpick_warp.codes import MAX_INSTANCES, Tone, names
 from synpick_warp.configs.cell.bins import BinRow, Bins, Cell, Tote
 from synpick_warp.configs.cell.cameras import CameraRow, Cameras, DepthSensor, Effects, Rig, Still
 from synpick_warp.configs.cell.gripper import Gripper, Suction
+from synpick_warp.configs.cell.props import PropRow
 from synpick_warp.configs.episodes.manipulation import Move, Perception, Pick, Picks, Target
 from synpick_warp.configs.episodes.objects import COUNTS, Counts, ObjectRow, Objects, parse_counts
 from synpick_warp.configs.episodes.randomize import Randomize
@@ -319,6 +320,7 @@ class Config:
     picks: Picks = field(default_factory=Picks)
     camera: tuple[CameraRow, ...] = ()
     bin: tuple[BinRow, ...] = ()
+    prop: tuple[PropRow, ...] = ()
     object_rows: tuple[ObjectRow, ...] = ()
     splits: tuple[Split, ...] = ()
     """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""

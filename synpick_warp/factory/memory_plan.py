@@ -34,6 +34,7 @@ from synpick_warp.scenes.bins import GUIDES, make_bins
 from synpick_warp.scenes.build import FREE_DOFS
 from synpick_warp.scenes.capacities import FEW
 from synpick_warp.scenes.grippers import make_head
+from synpick_warp.scenes.props import make_props
 from synpick_warp.stages.arrays import DryArray, Row, dry_run
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import TransferSettings, choose_transfers
@@ -43,6 +44,7 @@ from synpick_warp.stages.perception.perceive import allocate_votes
 from synpick_warp.stages.render.cameras import allocate_lenses
 from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
 from synpick_warp.stages.render.postprocess import KeptColors
+from synpick_warp.stages.render.props import allocate_placed
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import blank_scene
@@ -114,25 +116,28 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1, pieces: int
         size, layers = rig.sizes[group[0]], rig.chosen(group[0], config.render.layers)
         sections = replace(config.render, layers=layers), config.effects, config.depth_sensor
         with dry_run() as arrays:
-            scene = blank_scene(count, *size, device, transparent or config.randomize.object_transmission.kind != OFF or None)
+            glass = transparent or config.randomize.object_transmission.kind != OFF or None
+            scene = blank_scene(count, *size, device, glass, len(config.prop))
             counts = {"instances": objects, "views": views["view"], "histories": history_count(rig, worlds, index)}
             Renderer(scene, *sections, seed=0, depth_scale=1.0, colors=rig.writes(group[0], COLOR), **counts)
             if config.randomize != Randomize() or transparent:
-                allocate_materials(views["view"] * materials_of_view(objects), 1, device)
+                allocate_materials(views["view"] * materials_of_view(objects + len(config.prop)), 1, device)
+            allocate_placed(worlds, objects, len(config.prop), device)
             if rig.draws_lens(group[0]):
                 _ = [allocate_lenses(views, device) for _ in range(RING if device.is_cuda else 1)]
         host = choose_transfers(config.bop, size[1], device, needs.images, needs.depth_files) if writers else None
         terms += _images(arrays, views, count, layers, host, device)
     if may_pick(config.bake, config.splits):
-        terms.append(_perception(config.perception, worlds, objects, device))
-    built = (config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces)
+        terms.append(_perception(config.perception, worlds, objects, device, len(config.prop)))
+    solid = sum(len(prop.pieces) for prop in make_props(config.prop, config.cell.bins))
+    built = (config.arrangement, config.physics, config.cell.bins, bool(config.bin), device.is_cuda, pieces, solid)
     terms += [Term(row[0], (row,), keys) for row, keys in newton_rows(worlds, *built)]
     if PICKS in config.bake.formats:
         planned = DataLayout.of(config).planned
         trying = count_trial_worlds(config.picks, planned, device)
         batch = count_batch(config.picks, planned, trying)
         terms += _trials(sizes | {"world": trying, "body": trying * bodies}, count_rows(batch, worlds), config.physics, device)
-        terms.append(_perception(config.perception, trying, objects, device))
+        terms.append(_perception(config.perception, trying, objects, device, len(config.prop)))
         terms += [Term(f"{row[0]} of trials", (row,), ("picks.worlds", *keys)) for row, keys in newton_rows(trying, *built)]
     if writers:
         # A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
@@ -276,12 +281,13 @@ def _images(
         yield _term(f"pinned copies of {views:,} views", copied, _VIEWS, "pinned ", on_device=False)
 
 
-def _perception(settings: Perception, worlds: int, objects: int, device: wp.Device) -> Term:
-    """Images, contours and votes of a batch of worlds that plan grasps, with at most `objects` objects each."""
+def _perception(settings: Perception, worlds: int, objects: int, device: wp.Device, props: int) -> Term:
+    """Images, contours and votes of a batch of worlds that plan grasps, with at most `objects` objects, and `props`, each."""
     count = count_views(settings, worlds, objects, device)
     width, height = settings.resolution
     with dry_run() as arrays:
-        allocate_batch(settings, objects, count, device)
+        allocate_batch(settings, objects, count, device, props)
+        allocate_placed(worlds, objects, props, device)
         allocate_visibility(count, width, height, objects, device)
         allocate_background(1, width, height, device)
         allocate_votes(settings, objects, count, device)
@@ -329,13 +335,20 @@ _BODY, _SHAPE = (3200, 5700), 680
 
 
 def newton_rows(
-    worlds: int, arrangement: Arrangement, physics: Physics, bins: Sequence[BinSizes], own_bins: bool, is_cuda: bool, pieces: int = 1
+    worlds: int,
+    arrangement: Arrangement,
+    physics: Physics,
+    bins: Sequence[BinSizes],
+    own_bins: bool,
+    is_cuda: bool,
+    pieces: int = 1,
+    solid: int = 0,
 ) -> Iterator[tuple[Row, tuple[str, ...]]]:
     """Rows of Newton's arrays, each with the full keys of the settings by which it grows.
 
     Where `arrangement.counts` sets the number of bodies, they are counted, and rows are within 10 % of what is allocated. A volume budget
     may need few of them, and rows are a lower bound. `own_bins`: whether bins are the user's own, which have shapes of their own;
-    `is_cuda`: whether the arrays lie in a GPU's memory; `pieces`: as of `plan_memory`."""
+    `is_cuda`: whether the arrays lie in a GPU's memory; `pieces`: as of `plan_memory`; `solid`: collision shapes of props."""
     bodies = most_objects(arrangement.counts)
     # The capacities of many objects follow from their number.
     many = ("bake.worlds", "arrangement.max_objects") if arrangement.max_objects > FEW else ()
@@ -347,10 +360,10 @@ def newton_rows(
     if bodies:
         size = worlds * bodies * (_BODY[is_cuda] + _SHAPE * pieces)
         yield ("Newton's bodies", (worlds * bodies,), "", size), ("bake.worlds", "arrangement.max_objects")
-    if own_bins or bodies:
+    if own_bins or bodies or solid:
         # A separating axis for each pair of a world's shapes, of all bins with their guide walls, and at least one for each object.
         objects = pieces * bodies or arrangement.max_objects
-        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(bins)) + objects
+        shapes = sum(len(one.pieces) + GUIDES for one in make_bins(bins)) + objects + solid
         row = ("separating axes", (worlds, shapes * (shapes - 1) // 2), "", worlds * 2 * shapes * (shapes - 1))
         yield row, many or ("bake.worlds",)
 

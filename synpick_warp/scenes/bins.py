@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.configs.cell.bins import DIVIDER, TOTE, BinRow, BinSizes, Point, Tote
+from synpick_warp.configs.cell.bins import DIVIDER, TOTE, BinRow, BinSizes, Tote
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.bin_meshes.colliders import FLOOR_DEPTH, MIN_WALL
@@ -18,7 +18,7 @@ from synpick_warp.scenes.bin_meshes.inside import HeightField
 from synpick_warp.scenes.bin_meshes.reading import bin_material, read_bin
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.grippers import finger_fixture, make_head
-from synpick_warp.scenes.modelling import Patch, at_height, join, loft, make_mesh, rounded_rectangle, solid, strips
+from synpick_warp.scenes.modelling import Patch, at_height, block, join, loft, make_mesh, rounded_rectangle, solid, strips
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Interior, Material
 
 GUIDES, GUIDE_THICKNESS = 4, 0.1
@@ -116,14 +116,9 @@ def _make_pallet(sizes: BinSizes) -> Bin:
     # The runners' tops end inside the boards, so that no faces are coplanar.
     runners = (-length, -RUNNER * length, length - 2 * RUNNER * length)
     boxes += [((x, -width, base), (x + 2 * RUNNER * length, width, -BOARD / 2)) for x in runners]
-    mesh = make_mesh(join(*(_box_patch(low, high) for low, high in boxes)), centered=False)
+    mesh = make_mesh(join(*(block(low, high) for low, high in boxes)), centered=False)
     pieces = (box_piece((-length, -width, base), (length, width, 0.0)),) if sizes.is_visible else ()
     return Bin(sizes, Fixture(mesh, Material(WOOD, None, 0.0, WOOD_ROUGHNESS)), pieces)
-
-
-def _box_patch(low: Point, high: Point) -> Patch:
-    ring = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
-    return solid(np.stack([at_height(ring, low[2]), at_height(ring, high[2])]))
 
 
 def guide_walls(sizes: BinSizes, height: float) -> tuple[ConvexPiece, ...]:

@@ -1,4 +1,4 @@
-"""Simulation model: one newton.Model with N identical worlds of tote, guide walls, gripper, and body slots for catalog objects.
+"""Simulation model: one newton.Model with N identical worlds of tote, guide walls, props, gripper, and body slots for catalog objects.
 
 Episodes need no new model. Every world has the same bodies; a body slot becomes an object by selecting one of Newton's body variants,
 or stays empty. Single-hull objects and compound (decomposed) ones have slots of their own, since a slot has as many shapes as its
@@ -216,6 +216,8 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     for index, one in enumerate(bins):
         parts += [] if index == 0 else add(index, one.pieces, False)
         parts += add(index, guide_walls(one.sizes, config.physics.guide_height), True)
+    for pose, piece in ((wp.transform(*prop.pose), piece) for prop in catalog.props for piece in prop.pieces):
+        world.add_shape_convex_hull(-1, xform=pose, mesh=hull_mesh(piece), cfg=shape)
     head = make_head(config.gripper)
     gripper = add_gripper(world, config.gripper, head, shape)
     variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound), find_drawn(config.arrangement, catalog))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.codes import Stream
 from synpick_warp.configs.calibration.lens import with_matrix
 from synpick_warp.configs.cell.bins import BinSizes
-from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter, Rig, lens_map
+from synpick_warp.configs.cell.cameras import WORLD, CameraRow, Jitter, Pose, Rig, lens_map
 from synpick_warp.configs.cell.gripper import Gripper
 from synpick_warp.configs.episodes.manipulation import Pick
 from synpick_warp.errors import ConfigError
@@ -43,18 +43,22 @@ def _make_camera(label: str, row: CameraRow) -> Camera:
         matrix = np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     else:
         matrix = np.array(row.matrix, dtype=float)
-    pose = row.pose
+    rotation, position = place(label, row.pose)
+    return Camera(width, height, matrix, rotation, -dot(rotation, position), row.name, lens_map(row), row.fixed_to or WORLD)
+
+
+def place(label: str, pose: Pose) -> tuple[np.ndarray, np.ndarray]:
+    """World-to-frame rotation (3, 3) and position (3) [m] of a pose with OpenCV's axes; `label`: of its owner, for messages."""
     if pose.matrix is not None:
         to_world = np.array(pose.matrix, dtype=float)
         # The digits of a file end; the columns of a rotation must stay perpendicular.
-        rotation, position = nearest_rotation(to_world[:3, :3]).T, to_world[:3, 3]
-    else:
-        position = np.array(pose.position, dtype=float)
-        if pose.quaternion is not None:
-            rotation = Rotation.from_quat(pose.quaternion).as_matrix().T
-        else:
-            rotation = _look_at(label, position, np.array(pose.look_at, dtype=float), np.array(pose.up, dtype=float))
-    return Camera(width, height, matrix, rotation, -dot(rotation, position), row.name, lens_map(row), row.fixed_to or WORLD)
+        return nearest_rotation(to_world[:3, :3]).T, to_world[:3, 3]
+    position = np.array(pose.position, dtype=float)
+    if pose.quaternion is not None:
+        return Rotation.from_quat(pose.quaternion).as_matrix().T, position
+    if pose.look_at is None:
+        return np.eye(3), position
+    return _look_at(label, position, np.array(pose.look_at, dtype=float), np.array(pose.up, dtype=float)), position
 
 
 def _look_at(label: str, position: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:

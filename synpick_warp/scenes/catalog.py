@@ -19,6 +19,7 @@ from synpick_warp.scenes.assets.models_info import FileModelInfo, check_against_
 from synpick_warp.scenes.collision.hulls import hull_size, is_concave, mass_properties
 from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects, solids
+from synpick_warp.scenes.props import make_props
 from synpick_warp.scenes.symmetries.detection import add_symmetries
 from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, RawObject, TriangleMesh
@@ -60,10 +61,11 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     entries = _load_entries(config.bake.models, rules, cache_dir, report)
     if not config.arrangement.counts:
         _report_undrawable(entries, config.arrangement.volume, report)
+    props = make_props(config.prop, config.cell.bins, report)
     if not config.randomize.most_distractors:
-        return Catalog(tuple(entries))
+        return Catalog(tuple(entries), props=props)
     others = _load_entries(config.randomize.distractor_models, rules, cache_dir, report, entries)
-    return Catalog(tuple(entries), tuple(replace(entry, obj_id=FIRST_DISTRACTOR - index) for index, entry in enumerate(others)))
+    return Catalog(tuple(entries), tuple(replace(entry, obj_id=FIRST_DISTRACTOR - index) for index, entry in enumerate(others)), props)
 
 
 def _load_entries(

@@ -176,6 +176,12 @@ def solid(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
     return sections((rings, rect), ends=(rect, rect))
 
 
+def block(low: tuple[float, float, float], high: tuple[float, float, float], rect: Rect = NO_TEXTURE) -> Patch:
+    """Box between two corners."""
+    ring = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return solid(np.stack([at_height(ring, low[2]), at_height(ring, high[2])]), rect)
+
+
 def sections(*parts: tuple[np.ndarray, Rect], ends: tuple[Rect, Rect]) -> Patch:
     """Closed solid of lofts, each of rings and a texture rectangle, the first and the last with a cap in the rectangles `ends`."""
     lofts = [loft(*part) for part in parts]

@@ -141,6 +141,20 @@ class CatalogEntry:
     """Area on which a suction cup seals [m²], and its fraction of the surface; None: not measured."""
 
 
+@dataclass(frozen=True, eq=False)
+class Prop:
+    """Part of the cell that is neither bin, gripper nor object, and has no label."""
+
+    name: str
+    fixture: "Fixture"
+    pose: tuple[float, ...]
+    """x, y, z [m] and quaternion x, y, z, w: to the world, or to the frame of the gripper's shaft."""
+    follows: bool
+    """Whether it follows the gripper."""
+    pieces: Shape = ()
+    """Collision shapes in its own frame."""
+
+
 FIRST_DISTRACTOR = -2
 """obj_id of the first distractor; others count down. Where there is no object at all it is -1."""
 
@@ -152,6 +166,8 @@ class Catalog:
     entries: tuple[CatalogEntry, ...]
     distractors: tuple[CatalogEntry, ...] = field(default=(), hash=False)
     """Objects without labels; their obj_ids are -2, -3 and so on."""
+    props: tuple[Prop, ...] = field(default=(), hash=False)
+    """What stands around them."""
 
     @property
     def bodies(self) -> tuple[CatalogEntry, ...]:
@@ -160,8 +176,8 @@ class Catalog:
 
     @property
     def object_ids(self) -> np.ndarray:
-        """obj_id of all bodies (body) int32."""
-        return np.array([body.obj_id for body in self.bodies], np.int32)
+        """obj_id of all bodies, then of props as if they were distractors (body) int32."""
+        return np.array([body.obj_id for body in self.bodies] + [FIRST_DISTRACTOR] * len(self.props), np.int32)
 
     def __len__(self) -> int:
         return len(self.entries)

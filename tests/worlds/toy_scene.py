@@ -11,7 +11,7 @@ from synpick_warp.codes import Effect
 from synpick_warp.configs.schema import FAST, Bop, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, Prop, TriangleMesh
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers, view_buffer_sizes
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
@@ -63,6 +63,7 @@ class ToyScene:
     light_exposure: float = 0.0
     table: bool = False
     looks: Looks | None = None
+    props: tuple[Prop, ...] = ()
     config: Config = field(default_factory=Config)
 
     def settings(self) -> Config:
@@ -153,7 +154,7 @@ def views_of(toy: ToyScene, device: wp.Device, cameras: Any = None) -> Any:
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     """The renderer's constant data of a toy scene."""
     settings = toy.settings()
-    catalog = Catalog(tuple(toy.entries))
+    catalog = Catalog(tuple(toy.entries), props=toy.props)
     return build_render_scene(settings.render, -settings.tote.wall, catalog, toy.fixtures, toy.cameras, toy.lights, device, toy.looks)
 
 

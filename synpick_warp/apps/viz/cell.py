@@ -22,6 +22,7 @@ from synpick_warp.scenes.bins import make_bins, make_fixtures
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import read_objects
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.props import make_props
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, RawObject
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, allocate_view_buffers
@@ -71,7 +72,7 @@ class CellScene:
             objects = read_objects(config.bake.models, config.objects, config.object_rows, config.cell.bins, report)
         self.objects = objects
         self.laid = [lay_out(self.objects, sizes) for sizes in self.sizes]
-        catalog = Catalog(tuple(map(_entry, self.objects)))
+        catalog = Catalog(tuple(map(_entry, self.objects)), props=make_props(config.prop, self.sizes, report))
         light = next(sky for sky in skies() if sky.name == _SKY)
         with compiling_if_cold(config, device, progress, online=True):
             fixtures = make_fixtures(bins, config.gripper)

@@ -188,11 +188,11 @@ def _read(preset_or_file: str) -> Values:
 def _locate(document: dict[str, Any], folder: str) -> None:
     """Make the paths in a document absolute that are relative to its folder; whatever else is wrong with them is left as it is."""
     for name, kind in (sections() | table_lists()).items():
-        paths = [key for key, item in settings_of(kind).items() if item.path]
+        paths = {key: item.choices for key, item in settings_of(kind).items() if item.path}
         content = document.get(name)
         for table in content if isinstance(content, list) else [content]:
-            for key in paths:
-                if isinstance(table, dict) and table.get(key) and isinstance(table[key], str):
+            for key, names in paths.items():
+                if isinstance(table, dict) and table.get(key) and isinstance(table[key], str) and table[key] not in names:
                     table[key] = os.path.abspath(os.path.join(folder, os.path.expanduser(table[key])))
 
 
@@ -394,7 +394,7 @@ def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
             continue
         if comments:
             lines.append(f"# {describe_setting(item)}")
-        value = os.path.abspath(given[name]) if item.path and given[name] else given[name]
+        value = os.path.abspath(given[name]) if item.path and given[name] and given[name] not in item.choices else given[name]
         lines.append(f"{name} = {format_toml(value)}")
     return lines
 

@@ -110,14 +110,14 @@ def _rows(rows: tuple[CameraRow, ...]) -> Iterator[Conflict]:
             yield f"{key}.name", f"names that differ; {name} comes {counts[name]} times"
         if (row.fov is None) == (row.matrix is None):
             yield f"{key}.{'fov' if row.matrix is None else 'matrix'}", "either fov or matrix"
-        yield from _pose(f"{key}.pose", row.pose)
+        yield from find_pose_conflicts(f"{key}.pose", row.pose)
 
 
-def _pose(key: str, pose: Pose) -> Iterator[Conflict]:
-    """Yield conflicts within a pose."""
+def find_pose_conflicts(key: str, pose: Pose, forms: Sequence[tuple[str, ...]] = FORMS) -> Iterator[Conflict]:
+    """Yield conflicts within a pose, which has the keys of one of `forms`."""
     given = {name for name in ("matrix", "position", "quaternion", "look_at", "up") if getattr(pose, name) is not None}
-    if given not in map(set, FORMS):
-        yield key, " or ".join(f"{{{', '.join(form)}}}" for form in FORMS)
+    if given not in map(set, forms):
+        yield key, " or ".join(f"{{{', '.join(form)}}}" for form in forms)
     elif pose.axes == OPENGL and pose.look_at is not None:
         yield f"{key}.axes", "none beside look_at and up, which have no axes"
     elif pose.quaternion is not None and abs(math.hypot(*pose.quaternion) - 1.0) > ORTHONORMAL:

@@ -7,13 +7,16 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
+from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.configs.cell.bins import OWN, PALLET, TOTE, BinRow, Bins, BinSizes, Tote
+from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.configs.cell.gripper import Gripper, find_gripper_conflicts
+from synpick_warp.configs.cell.props import PropRow
 from synpick_warp.configs.dataset import MAX_SHARD_SCENES, DataLayout, bake_modes, may_pick, possible_modes
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects
 from synpick_warp.configs.fields import Conflict
-from synpick_warp.configs.rules.camera_rules import find_camera_conflicts
+from synpick_warp.configs.rules.camera_rules import FORMS, find_camera_conflicts, find_pose_conflicts
 from synpick_warp.configs.schema import FORMATS, MIXED, STILL, Bake, Bop, Config, Move, Physics, Pick, Settle, Split
 from synpick_warp.errors import format_value
 
@@ -29,6 +32,7 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
     bins, bop = config.cell.bins, config.bop
     yield from _modes(config.bake, config.splits)
     yield from _bins(config.bins, config.bin)
+    yield from _props(config.prop, config.arrangement.max_objects)
     for key, row in config.cell.tables.items():
         yield from _box(key, row)
     if config.move.start_height < config.move.height:
@@ -120,6 +124,19 @@ def _bins(bins: Bins, rows: Sequence[BinRow]) -> Iterator[Conflict]:
         yield "bin[0].weight", "more than 0 of at least one bin"
     if bins.kind == PALLET and any(side > pallet for side, pallet in zip(bins.area, bins.pallet_size, strict=False)):
         yield "bins.area", f"at most the pallet's length and width, {format_value(bins.pallet_size[:2])} [m]"
+
+
+def _props(rows: Sequence[PropRow], objects: int) -> Iterator[Conflict]:
+    """Yield conflicts of the [[prop]] tables; `objects`: capacity of a world."""
+    names = [row.name for row in rows]
+    for index, row in enumerate(rows):
+        if not _NAME.fullmatch(row.name) or names.count(row.name) > 1:
+            yield f"prop[{index}].name", "lower-case letters, digits and underscores, at most 32, other than those of other props"
+        yield from find_pose_conflicts(f"prop[{index}].pose", row.pose, (("position",), *FORMS))
+        if row.collide and row.follows == GRIPPER:
+            yield f"prop[{index}].collide", "false for what follows the gripper, which collides as gripper.mesh"
+    if objects + len(rows) > MAX_INSTANCES:
+        yield "arrangement.max_objects", f"at most {MAX_INSTANCES - len(rows)}, as {len(rows)} props count in pictures, too"
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:

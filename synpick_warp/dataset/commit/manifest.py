@@ -103,7 +103,7 @@ _YOUNGER: dict[str, dict[str, Any]] = {
     "randomize": given_values(Randomize()),
 }
 YOUNGER_SETTINGS: dict[str, Any] = {f"{section}.{name}": value for section, table in _YOUNGER.items() for name, value in table.items()}
-YOUNGER_SETTINGS |= {"camera": [], "bin": []}
+YOUNGER_SETTINGS |= {"camera": [], "bin": [], "prop": []}
 """Settings that older manifests lack, and what held before: left out where they have these values, so that older data sets can still be
 read, and resumed with them."""
 _ADDED = ("bop", "polygons", False)
@@ -159,6 +159,8 @@ def fixed_settings(config: Config) -> dict[str, Any]:
             del table[name]
     for row in settings.get("bin", ()):
         row.pop("file", None)
+    for row in settings.get("prop", ()):
+        del row["mesh"]
     for row in settings["object_rows"]:
         for name in [name for name in _YOUNGER_KEYS if not row[name]]:
             del row[name]

@@ -361,12 +361,13 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors, textures, maps and glass, without the names of their files, and over each object: its mesh,
+    SHA-256 over objects, lights, distractors, props, textures, maps and glass, without the names of their files, and over each object: its mesh,
     material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a field
     of `Catalog` or `EnvironmentMap` changes every manifest.
     """
     textures = {"textures": _digest_data(tuple(looks.textures.values()))} if looks and looks.all_textures else {}
     distractors = {"distractors": _digest_data(catalog.distractors)} if catalog.distractors else {}
+    distractors |= {"props": _digest_data(tuple((prop, prop.fixture.material.maps) for prop in catalog.props))} if catalog.props else {}
     maps = {body.obj_id: (body.material.maps,) for body in catalog.bodies if body.material.maps is not None}
     textures |= {"maps": _digest_data(tuple(maps.values()))} if maps else {}
     glass = {body.obj_id: (body.material.glass,) for body in catalog.bodies if body.material.glass != OPAQUE}

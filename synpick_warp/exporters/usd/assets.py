@@ -1,4 +1,4 @@
-"""Asset library shared by all USD episodes: one file per object and bin, and gripper shaft ("finger"), cup and table; and
+"""Asset library shared by all USD episodes: one file per object, bin and prop, and gripper shaft ("finger"), cup and table; and
 environment maps: EXR files, and the parameters of dome and distant lights."""
 
 # pxr's modules are filled when they are loaded, invisible to type checkers.
@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Physics, Render
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd import parts
-from synpick_warp.exporters.usd.episode import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset
+from synpick_warp.exporters.usd.episode import FLOOR, TEXTURES, StageLight, bin_asset, drawn_texture, object_asset, prop_asset
 from synpick_warp.scenes import environment
 from synpick_warp.scenes.bins import FLOOR_DROP, TABLE_ROUGHNESS, TABLE_SIZE, make_bins
 from synpick_warp.scenes.grippers import finger_collider, finger_fixture, make_head, rod_inertia
@@ -44,6 +44,9 @@ def write_library(library: Path, context: ExportContext) -> None:
             name = bin_asset(one.sizes)
             mesh = project_from_box(one.fixture.mesh) if looks and looks.bin_textures else one.fixture.mesh
             _save(library, name, _make_fixture(library, physics, name, replace(one.fixture, mesh=mesh), one.pieces))
+    for prop in context.catalog.props:
+        name = prop_asset(prop.name)
+        _save(library, name, _make_fixture(library, physics, name, prop.fixture, prop.pieces))
     finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
     parts.add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)

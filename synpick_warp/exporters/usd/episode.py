@@ -85,6 +85,8 @@ class UsdSettings:
     """obj_id -> name of the object."""
     surfaces: dict[str, AssetSurface]
     """Materials by asset, of those that looks are drawn for; empty: looks are not randomized."""
+    props: tuple[tuple[str, tuple[float, ...], bool], ...] = ()
+    """Name of each prop, its pose, and whether this is in the frame of the gripper's shaft."""
 
 
 def bin_asset(sizes: BinSizes) -> str:
@@ -95,6 +97,11 @@ def bin_asset(sizes: BinSizes) -> str:
 def object_asset(obj_id: int) -> str:
     """Name of an object's asset: stem of its file, and name of its root prim. Distractors have obj_ids from FIRST_DISTRACTOR downwards."""
     return f"obj_{obj_id:06d}" if obj_id >= 0 else f"distractor_{FIRST_DISTRACTOR - obj_id:06d}"
+
+
+def prop_asset(name: str) -> str:
+    """Name of a prop's asset."""
+    return f"prop_{name}"
 
 
 TICKS = 64

@@ -79,6 +79,7 @@ class UsdExporter(EpisodeExporter[TickSpool]):
             cameras=context.cameras,
             lights=tuple(make_stage_light(index, light, settings.render.exposure) for index, light in enumerate(context.lights)),
             names={body.obj_id: body.name for body in context.catalog.bodies},
+            props=tuple((prop.name, prop.pose, prop.follows) for prop in context.catalog.props),
             surfaces=self._surfaces() if context.looks else {},
         )
 

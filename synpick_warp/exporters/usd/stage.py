@@ -44,6 +44,7 @@ SHAFT = 1
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
 """Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
 BIN = f"{ROOT}/Bin"
+PROPS = f"{ROOT}/Props"
 
 
 def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: episode.UsdSettings) -> Sdf.Layer:
@@ -75,6 +76,10 @@ def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: episode.Usd
     for path, part, look in _drawn(assets, looks):
         if look:
             _add_look(stage, path, part, look, settings.surfaces[assets[path]])
+    for name, pose, follows in settings.props:
+        path = f"{FIXTURES['finger'] if follows else PROPS}/{name}"
+        _add_moving(stage, path, np.array([pose]), np.ones(1, bool), np.zeros(1, int))
+        assets[path] = episode.prop_asset(name)
     for index, camera in enumerate(settings.cameras):
         drawn = {key: np.array(value) for key, value in (end.row.get("cameras") or {}).get(camera.name, {}).items() if key in CAMERA_KEYS}
         _add_camera(stage, camera.name or f"camera_{index}", replace(camera, **drawn), ticks["fixture_pose"][:, SHAFT])

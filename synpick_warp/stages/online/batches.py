@@ -231,7 +231,7 @@ class ViewBatch:
     Attributes:
         color: Colour image, sRGB, red first (B, H, W, 3) uint8; None for cameras without colour in their modalities.
         depth: Planar depth in units of `depth_scale` mm; 0: no surface (B, H, W) uint16.
-        instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
+        instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table with props, and fixtures (`Segment`)
             (B, H, W) uint8.
         mask_words, mask_first, mask_box, mask_length: Amodal masks as bits, each in its own box (B, W) uint32, (B, I) int32, (B, I, 4)
             int32 [px], (B) int32: words in use, the others mean nothing; see `InstanceMasks`. `amodal_masks` makes images of them. W is not

@@ -56,7 +56,7 @@ class CandidateSampler:
         self._draws = sizes["draw"] = int(kernels.POOL) + self.uniform + 1
         self._pool = allocate_struct(POOL, sizes, self.device)
         images = self.images
-        self._shot = make_shot(images.scene, Frames(), images.bodies, images.gbuffer, views)
+        self._shot = make_shot(images.scene, Frames(), images.bodies, images.gbuffer, images.drawn)
         self._sampling = allocate_struct(SAMPLING, {"world": simulation.layout.worlds, "one": 1}, self.device)
         self._sampling.count = self.count
         self._graph: wp.Graph | None = None

@@ -18,6 +18,7 @@ from synpick_warp.stages.arrays import allocate, allocate_struct, array_group, d
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.cameras import VIEW_CAMERAS
+from synpick_warp.stages.render.props import PropPlacer
 from synpick_warp.stages.render.raster import Rasterizer, allocate_visibility
 from synpick_warp.stages.render.scene import RenderScene, build_grid, with_cameras
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
@@ -65,11 +66,11 @@ Batch = tuple[Any, Any, Any, PerceptionArrays, SegmentationScratch]
 """Arrays of a batch of worlds: the structs `Views`, `ViewBodies` and `GBuffer`, and the arrays of their segmentation."""
 
 
-def allocate_batch(settings: schema.Perception, instances: int, views: int, device: wp.Device) -> Batch:
-    """Allocate the arrays of a batch of `views` worlds with `instances` instances each."""
+def allocate_batch(settings: schema.Perception, instances: int, views: int, device: wp.Device, props: int = 0) -> Batch:
+    """Allocate the arrays of a batch of `views` worlds with `instances` instances, and `props`, each."""
     width, height = settings.resolution
     sizes = {"view": views, "row": height, "column": width, "instance": instances, "point": settings.contour_points}
-    sizes |= body_sizes(instances, width, height)
+    sizes |= body_sizes(instances + props, width, height)
     views_of_worlds, bodies, gbuffer = (allocate_struct(kind, sizes, device) for kind in (VIEWS, VIEW_BODIES, GBUFFER))
     views_of_worlds.cameras = allocate_struct(VIEW_CAMERAS, sizes, device)
     arrays, scratch = allocate(PerceptionArrays, sizes, device), allocate(SegmentationScratch, sizes, device)
@@ -99,7 +100,7 @@ class PerceptionImages:
 
     `scene` is the renderer's with the camera of perception alone, at the resolution of perception; `views`, `bodies` and `gbuffer` are the
     structs `Views`, `ViewBodies` and `GBuffer` of the batch. The caller fills `views.world` (view): each world once; -1: the view is
-    unused. `arrays` and `scratch` are those of `Segmenter`."""
+    unused. `drawn` are the same views with props as instances, as `bodies` has them. `arrays` and `scratch` are those of `Segmenter`."""
 
     def __init__(self, settings: schema.Perception, rig: Rig, render_scene: RenderScene, worlds: int, instances: int) -> None:
         """Allocate scratch and render the static background, by meshes, materials and table of the renderer's scene, whose cameras are not
@@ -113,17 +114,22 @@ class PerceptionImages:
         seen = resized(rig.rows[rig.index(settings.camera)], settings.resolution)
         camera = make_cameras(Rig((seen,), rig.is_listed))
         self.scene = with_cameras(render_scene, camera)
-        self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(settings, instances, count, device)
+        self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(
+            settings, instances, count, device, render_scene.prop_count
+        )
         self.views.world.fill_(-1)
         self.views.count, self.views.instances = count, instances
+        self.props = PropPlacer(self.scene, instances)
+        self.drawn = self.props.widen(self.views)
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
         self.rasterizer = Rasterizer(self.scene, 1.0, count, instances)
 
     def render(self, snapshot: Snapshot) -> None:
         """Rasterize each view's world without gripper shaft and cup. Unused views keep their content."""
-        scene, views = self.scene, self.views
+        scene, views = self.scene, self.drawn
         wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
-        set_up_views(scene, snapshot, self.fixture_visible, views, self.bodies)
+        set_up_views(scene, self.props.place(snapshot, self.fixture_visible), self.fixture_visible, views, self.bodies)
         self.rasterizer.rasterize(self.bodies, views, self.gbuffer)
         inputs = [scene.meshes, scene.grid, self.bodies, views]
         launch_pixels(intersect_hits_kernel, self.pixels, inputs, [self.gbuffer], scene.device)
+        self.props.hide(self.gbuffer.segment, views.count)

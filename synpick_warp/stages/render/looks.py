@@ -165,6 +165,12 @@ class Dresser:
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
         surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)
+        if scene.prop_count:
+            # Materials that nothing changes, those of the props' meshes.
+            surfaces.recolor.fill_(np.eye(3))
+            surfaces.repeats.fill_(1.0)
+            rows = np.tile(scene.props.first + np.arange(scene.prop_count), (views, 1))
+            self._props = slice(instances - scene.prop_count, instances), wp.array(rows, dtype=wp.int32, device=scene.device)
         paths = RandomizedScene()
         for name in PathScene.vars:
             setattr(paths, name, surfaces if name == "surfaces" else getattr(scene.paths, name))
@@ -181,6 +187,9 @@ class Dresser:
             outputs=[scene.surfaces],
             device=scene.device,
         )
+        if scene.prop_count:
+            bodies_of_props, rows = self._props
+            wp.copy(scene.surfaces.row[:, bodies_of_props], rows)
 
 
 def shade_floor(scene: RenderScene, shot: Any, image: Any) -> None:

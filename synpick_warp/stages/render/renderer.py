@@ -13,6 +13,7 @@ from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.looks import Dresser
 from synpick_warp.stages.render.postprocess import PostProcessor, has_effects
+from synpick_warp.stages.render.props import PropPlacer
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
@@ -65,8 +66,10 @@ class Renderer:
             histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
             colors: Whether colour images are wanted; else they stay as they are, and nothing is shaded.
         """
-        sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
-        self.dresser = Dresser(scene, seed, instances, views) if scene.looks is not None or scene.has_details else None
+        self.props = PropPlacer(scene, instances)
+        bodies = self.props.bodies
+        sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(bodies, scene.width, scene.height)
+        self.dresser = Dresser(scene, seed, bodies, views) if scene.looks is not None or scene.has_details else None
         self.scene = scene = self.dresser.scene if self.dresser else scene
         self.instances = instances
         self.views = views
@@ -83,15 +86,15 @@ class Renderer:
             if settings.mode == schema.REFERENCE:
                 self.shading = ReferenceRenderer(settings, seed, scene)
             else:
-                self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
+                self.shading = DenoisedRenderer(settings, seed, scene, bodies, views, histories)
                 kept, history_row = histories if self.shading.reuses else 0, self.shading.flags.history_row
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
         self.behind: SceneBehind | None = None
         if scene.is_transparent and self.shading is not None:
-            self.behind = SceneBehind(scene, self.shading, self.rasterizer, (settings, seed), instances, views, histories)
+            self.behind = SceneBehind(scene, self.shading, self.rasterizer, (settings, seed), bodies, views, histories)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
-        self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
+        self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, bodies, views)
         self.annotator = Annotator(scene, instances, views, kept)
         self.damage = self.rasterizer.whole
 
@@ -107,8 +110,8 @@ class Renderer:
         if views.count == 0:
             return
         device = self.scene.device
-        views = self.render_gbuffer(snapshot, views, out, placed)
-        shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, views)
+        snapshot, views = self.render_gbuffer(snapshot, views, out, placed)
+        shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, self.props.widen(views))
         if layers is not None:
             with scope("layers", device):
                 self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1])
@@ -120,21 +123,25 @@ class Renderer:
                     self.shading.shade(snapshot, self.behind.render(snapshot, shot), self.image, self.behind.add)
             with scope("post-process", device):
                 self.postprocessor.process(shot, self.image, out)
+        shot.views = views
         with scope("annotate", device):
             self.annotator.annotate(shot, self.damage, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
-        """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the views with their cameras."""
+        """First part of `render`: G-buffer, images of depth and instances, and amodal masks. Returns the snapshot with props, and the views
+        with their cameras."""
         scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed[0])
+        snapshot, wide = self.props.place(snapshot, snapshot.fixture_visible), self.props.widen(views)
         with scope("set up views", scene.device):
-            set_up_views(scene, snapshot, snapshot.fixture_visible, views, self.bodies, placed is not None)
+            set_up_views(scene, snapshot, snapshot.fixture_visible, wide, self.bodies, placed is not None)
             if self.dresser:
-                self.dresser.dress(snapshot, views, self.bodies)
+                self.dresser.dress(snapshot, wide, self.bodies)
             if self.behind:
-                self.behind.group(views, self.bodies)
+                self.behind.group(wide, self.bodies)
         self.damage = self.rasterizer.whole
         if isinstance(self.shading, DenoisedRenderer):
-            self.damage = self.shading.find_damage(snapshot, self.bodies, views) or self.damage
+            self.damage = self.shading.find_damage(snapshot, self.bodies, wide) or self.damage
         with scope("rasterize", scene.device):
-            self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out, self.damage)
-        return views
+            self.rasterizer.rasterize(self.bodies, wide, self.gbuffer, out, self.damage)
+            self.props.hide(out.instance, views.count)
+        return snapshot, views

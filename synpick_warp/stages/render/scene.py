@@ -31,6 +31,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
+from synpick_warp.kernels.render.visibility.props import Props
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.bins import TABLE_ROUGHNESS
 from synpick_warp.scenes.environment import LUMINANCE
@@ -73,13 +74,16 @@ class RenderScene:
     grid: Any
     """The struct `ImageGrid` of the cameras' images."""
     obj_id: wp.array
-    """obj_id of each catalog mesh (entry) int32; negative: a distractor, without label."""
+    """obj_id of each catalog mesh (entry) int32; negative: a distractor or prop, without label."""
     camera_count: int
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
     """Owners of the meshes whose handles `meshes` holds."""
     looks: Looks | None = None
     """What episodes draw their looks from; the textures' materials are the last rows of `surfaces`."""
+    props: Any = None
+    """The struct `Props`; None: there are none."""
+    prop_count: int = 0
     suction_maps: Any = None
     """The struct `SuctionScene`: cup and centres of mass, of the layers `suction_seal` and `suction_wrench`."""
 
@@ -111,11 +115,13 @@ ALL_MAPS = int(NORMAL_MAP) | int(ROUGHNESS_MAP) | int(METALLIC_MAP)
 """Bits of `Surfaces.maps` of a material with maps: a file that states only some has its constants in the others."""
 
 
-def blank_scene(cameras: int, width: int, height: int, device: wp.Device, glass: Any = None) -> RenderScene:
-    """Scene of cameras without content: in a dry run, constructors ask it for sizes alone. `glass`: True if objects are transparent."""
+def blank_scene(cameras: int, width: int, height: int, device: wp.Device, glass: Any = None, props: int = 0) -> RenderScene:
+    """Scene of cameras, and a number of props, without content: in a dry run, constructors ask it for sizes alone. `glass`: True if objects
+    are transparent."""
     content = dict.fromkeys(("meshes", "surfaces", "cameras", "lights", "table", "paths", "plain"))
-    ids = wp.empty(0, dtype=wp.int32, device="cpu")
-    return RenderScene(**content, grid=build_grid(width, height), obj_id=ids, camera_count=cameras, device=device, keep=(), glass=glass)
+    ids, grid = wp.empty(0, dtype=wp.int32, device="cpu"), build_grid(width, height)
+    more = {"glass": glass, "prop_count": props}
+    return RenderScene(**content, grid=grid, obj_id=ids, camera_count=cameras, device=device, keep=(), **more)
 
 
 def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
@@ -379,6 +385,23 @@ def build_suction_scene(catalog: Catalog, radius: float, device: wp.Device) -> A
     return suction
 
 
+def build_props(catalog: Catalog, device: wp.Device) -> Any:
+    """The struct `Props` of the props of a catalog, whose meshes are behind those of its bodies."""
+    result = Props()
+    result.first = len(catalog.bodies)
+    result.pose = wp.array(np.array([prop.pose for prop in catalog.props]).reshape(-1, 7), dtype=wp.transform, device=device)
+    result.follows = wp.array([int(prop.follows) for prop in catalog.props], dtype=wp.int32, device=device)
+    return result
+
+
+def build_table(settings: schema.Render, height: float) -> Any:
+    """The struct `Table` of a table at this z [m]."""
+    table = Table()
+    table.visible, table.height = int(settings.table), height
+    table.half = wp.vec2(*(0.5 * size if size > 0.0 else FAR for size in settings.table_size))
+    return table
+
+
 def build_render_scene(
     settings: schema.Render,
     table_height: float,
@@ -395,7 +418,7 @@ def build_render_scene(
     Args:
         settings: Settings of the renderer.
         table_height: z of the table, on which the first bin stands [m].
-        catalog: The objects; `Snapshot.catalog_index` is the index into it.
+        catalog: The objects; `Snapshot.catalog_index` is the index into it. Its props are the meshes behind them.
         fixtures: Bins, then gripper shaft and cup, each in its own frame.
         cameras: Cameras of one image size; `Views.camera` is the index into it.
         lights: Environment maps; `Snapshot.light` is the index into it.
@@ -405,17 +428,15 @@ def build_render_scene(
     """
     # The first bin comes last, see `fixture_mesh`.
     bins, grip = fixtures[:-GRIPPER], fixtures[-GRIPPER:]
-    fixtures = (*reversed(bins), *grip)
+    fixtures = (*(prop.fixture for prop in catalog.props), *reversed(bins), *grip)
     shapes = [entry.mesh for entry in catalog.bodies] + [fixture.mesh for fixture in fixtures]
     if looks and looks.bin_textures:
-        first = len(catalog.bodies)
+        first = len(catalog.bodies) + len(catalog.props)
         shapes[first : first + len(bins)] = map(project_from_box, shapes[first : first + len(bins)])
     materials = [each.material for each in (*catalog.bodies, *fixtures)] + [Material(settings.table_color, None, 0.0, TABLE_ROUGHNESS)]
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
-    meshes, keep = build_meshes(shapes, len(catalog.bodies) + len(bins) - 1, device, bins[0].interior if len(bins) == 1 else None)
-    table = Table()
-    table.visible, table.height = int(settings.table), table_height
-    table.half = wp.vec2(*(0.5 * size if size > 0.0 else FAR for size in settings.table_size))
+    meshes, keep = build_meshes(shapes, len(shapes) - len(grip) - 1, device, bins[0].interior if len(bins) == 1 else None)
+    table = build_table(settings, table_height)
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes, paths.table = meshes, table
@@ -438,4 +459,6 @@ def build_render_scene(
         looks=looks,
         suction_maps=build_suction_scene(catalog, cup_radius, device),
         glass=build_glass(materials, len(catalog.bodies), looks, device),
+        props=build_props(catalog, device),
+        prop_count=len(catalog.props),
     )
