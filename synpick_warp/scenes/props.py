@@ -54,8 +54,9 @@ def _make_prop(row: PropRow, bins: Sequence[BinSizes], report: Callable[[str], N
     turn = Rotation.from_matrix(rotation.T).as_quat().round(DECIMALS)
     for sizes in bins if pieces else ():
         if (share := _filled(sizes, [matmul(piece.vertices.astype(np.float64), rotation) + position for piece in pieces])) > MOST_FILLED:
+            owner = " ".join(dict.fromkeys((sizes.noun, sizes.name)))
             rule = f"move it, or let it not collide; each connected part collides as its convex hull, of these {len(pieces)}"
-            raise ConfigError(f"{label} fills {share:.0%} of the {sizes.noun} {sizes.name}, where objects are dropped; {rule}")
+            raise ConfigError(f"{label} fills {share:.0%} of the {owner}, where objects are dropped; {rule}")
     return Prop(row.name, fixture, (*position.tolist(), *turn.tolist()), row.follows == GRIPPER, pieces)
 
 
