@@ -361,7 +361,7 @@ def remove_path(path: Path) -> None:
 def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: Looks | None = None) -> dict[str, str]:
     """Content digests of a bake's inputs, by which a resumed bake recognizes other objects or lights: the manifest's INPUTS.
 
-    SHA-256 over objects, lights, distractors, props, textures, maps and glass, without the names of their files, and over each object: its mesh,
+    SHA-256 over objects, lights, distractors, props, textures, maps and glass, without file names, and over each object: its mesh,
     material, collision shape, mass properties and symmetries. Names and order of the dataclasses' fields are hashed, too: renaming a field
     of `Catalog` or `EnvironmentMap` changes every manifest.
     """
