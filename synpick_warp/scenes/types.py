@@ -61,11 +61,19 @@ class Material:
     MAP_CENTER is 0 and 1 and 255 are -1 and 1; roughness and metallic, 0 to 255. None: no maps."""
     glass: Glass = field(default=OPAQUE, hash=False)
     """Transmission."""
+    opacity: np.ndarray | None = field(default=None, hash=False)
+    """Part of the transmission that a texel lacks (H, W) uint8, such as a label: 0 none, 255 all. None: nowhere."""
+
+    @property
+    def map_names(self) -> frozenset[str]:
+        """Values that vary over the texture beside colour."""
+        names = () if self.maps is None else ("normal", "roughness", "metallic")
+        return frozenset(names if self.opacity is None else (*names, "opacity"))
 
     @property
     def transmission(self) -> float:
-        """Fraction of the light that passes through; metals are opaque."""
-        return self.glass.transmission * (1.0 - self.metallic)
+        """Fraction of the light that passes through, at most; metals are opaque."""
+        return self.glass.transmission * (1.0 - self.metallic if self.maps is None else 1.0)
 
 
 class HullSize(NamedTuple):

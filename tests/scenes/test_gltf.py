@@ -339,7 +339,7 @@ def test_what_is_ignored_is_one_line(tmp_path):
 
 def glass(alpha: float = 1.0, mode: str = "OPAQUE", **extensions: Any) -> Builder:
     named = {f"KHR_materials_{name}": value for name, value in extensions.items()}
-    return Builder(**pbr(baseColorFactor=[1, 1, 1, alpha]), alphaMode=mode, extensions=named)
+    return Builder(**pbr(baseColorFactor=[1, 1, 1, alpha], metallicFactor=0), alphaMode=mode, extensions=named)
 
 
 def test_transmission_is_that_of_extensions_and_of_blending(tmp_path):
@@ -361,12 +361,24 @@ def test_what_transmission_leaves_out_is_said(tmp_path):
     assert said == ["ignored: the texture of transmission but for its mean, absorption, or the texture of thickness"]
     assert glass(ior={"ior": 1.3}).read(tmp_path)[2] == ["ignored: KHR_materials_ior"]
     assert glass(0.5, "MASK").read(tmp_path)[2] == ["ignored: transparency"]
-    mixed = glass(transmission={"transmissionFactor": 1.0}).with_(nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
+
+
+def test_parts_keep_their_transmission(tmp_path):
+    """An opaque part, such as a label, has the opacity that the clearest one lacks; it may be a metal beside glass."""
+    mixed = glass(0.5, "BLEND", transmission={"transmissionFactor": 0.5}).with_(
+        nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}]
+    )
     mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
     mixed.content["materials"].append({})
-    _, finish, said = mixed.read(tmp_path)
-    assert finish.glass == OPAQUE
-    assert said == ["ignored: transparency of some of its parts: an object has one for all"]
+    mesh, finish, said = mixed.read(tmp_path)
+    assert not said
+    made = finish.complete(0.0, 0.5)
+    assert (made.glass.transmission, made.transmission) == (0.75, 0.75)
+    assert made.texture.shape[2] == 3
+    assert set(np.unique(made.opacity)) == {0, 255}
+    column, row = (mesh.uv * (1.0, -1.0) + (0.0, 1.0)).T * np.array([[made.opacity.shape[1]], [made.opacity.shape[0]]])
+    at_vertices = made.opacity[row.astype(int), column.astype(int)]
+    assert np.bincount(at_vertices // 255).tolist() == [len(mesh.uv) // 2] * 2
 
 
 @pytest.mark.parametrize(

@@ -370,7 +370,7 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: L
     distractors |= {"props": _digest_data(tuple((prop, prop.fixture.material.maps) for prop in catalog.props))} if catalog.props else {}
     maps = {body.obj_id: (body.material.maps,) for body in catalog.bodies if body.material.maps is not None}
     textures |= {"maps": _digest_data(tuple(maps.values()))} if maps else {}
-    glass = {body.obj_id: (body.material.glass,) for body in catalog.bodies if body.material.glass != OPAQUE}
+    glass = {body.obj_id: (body.material.glass, body.material.opacity) for body in catalog.bodies if body.material.glass != OPAQUE}
     textures |= {"glass": _digest_data(tuple(glass.values()))} if glass else {}
     added = {body.obj_id: maps.get(body.obj_id, ()) + glass.get(body.obj_id, ()) for body in catalog.bodies}
     given = [(body, *more) if (more := added[body.obj_id]) else body for body in catalog.bodies]

@@ -94,7 +94,7 @@ def _add_shapes(
 ) -> None:
     """Add an asset's visible mesh with its material, and its collision shapes."""
     root, friction = _add_contact_material(stage, physics)
-    surface = parts.add_surface(stage, f"{root}/Materials/Surface", material, texture, maps=() if material.maps is None else parts.MAPS)
+    surface = parts.add_surface(stage, f"{root}/Materials/Surface", material, texture, maps=material.map_names)
     parts.add_mesh(stage, f"{root}/Visual", mesh, surface)
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     for index, piece in enumerate(pieces):

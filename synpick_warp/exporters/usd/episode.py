@@ -49,14 +49,14 @@ class AssetSurface:
     material: Material
     texture: str | None
     """File of its texture, relative to the asset library; None: it has none."""
-    has_maps: bool = False
-    """Whether normal and roughness-metallic maps are stored next to the texture."""
+    maps: frozenset[str] = frozenset()
+    """Names of the maps that are stored next to the texture."""
 
     @staticmethod
     def of(name: str, material: Material) -> "AssetSurface":
         """That of the asset of this name."""
         texture = None if material.texture is None else texture_file(name)
-        return AssetSurface(replace(material, texture=None, maps=None), texture, material.maps is not None)
+        return AssetSurface(replace(material, texture=None, maps=None, opacity=None), texture, material.map_names)
 
 
 def texture_file(name: str) -> str:

@@ -108,8 +108,8 @@ def add_surface(
     maps: Collection[str] = (),
 ) -> UsdShade.Material:
     """Add a metallic-roughness material (UsdPreviewSurface). The texture, a file relative to the layer or None, repeats, and is multiplied
-    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates; `maps`: which of `MAPS` hold, whose
-    files lie beside the texture."""
+    by the base colour in linear light, and by `gain`; `repeats` is a factor on texture coordinates; `maps`: which of `Material.map_names`
+    hold, whose files lie beside the texture."""
     surface = UsdShade.Material.Define(stage, path)
     shader = _add_shader(stage, f"{path}/Surface", "UsdPreviewSurface")
     surface.CreateSurfaceOutput().ConnectToSource(shader.CreateOutput("surface", Sdf.ValueTypeNames.Token))
@@ -138,6 +138,10 @@ def add_surface(
         image = _add_image(stage, f"{path}/Normals", normal, "raw", place, (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0))
         found = image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
         shader.CreateInput("normal", Sdf.ValueTypeNames.Normal3f).ConnectToSource(found)
+    if "opacity" in maps and material.transmission > 0.0:
+        share = material.transmission
+        image = _add_image(stage, f"{path}/Opacity", texture.replace(".png", OPACITY), "raw", place, (share,) * 4, (1.0 - share,) * 4)
+        shader.GetInput("opacity").ConnectToSource(image.CreateOutput("r", Sdf.ValueTypeNames.Float))
     if {"roughness", "metallic"} & set(maps):
         image = _add_image(stage, f"{path}/Values", values, "raw", place, (1.0, 1.0, 1.0, 1.0))
         for channel, name in (("g", "roughness"), ("b", "metallic")):
@@ -163,10 +167,8 @@ def _add_image(
     return image
 
 
-MAPS = ("normal", "roughness", "metallic")
-"""Maps of a material ..."""
-NORMALS, VALUES = "_normal.png", "_values.png"
-"""... and endings of their files: normals as in glTF, and roughness (green) with metallic (blue)."""
+NORMALS, VALUES, OPACITY = "_normal.png", "_values.png", "_opacity.png"
+"""Endings of the files of a material's maps: normals as in glTF, roughness (green) with metallic (blue), and opacity."""
 
 
 def write_texture(library: Path, name: str, material: Material) -> str | None:
@@ -176,6 +178,8 @@ def write_texture(library: Path, name: str, material: Material) -> str | None:
         return None
     file = texture_file(name)
     write_synced(library / file, encode_png(material.texture))
+    if material.opacity is not None:
+        write_synced(library / file.replace(".png", OPACITY), encode_png(np.repeat(material.opacity[..., None], 3, axis=2)))
     if material.maps is not None:
         x, y = (material.maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
         normal = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0))], axis=-1)

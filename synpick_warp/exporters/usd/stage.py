@@ -16,7 +16,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 from synpick_warp.codes import Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd import episode
-from synpick_warp.exporters.usd.parts import MAPS, add_label, add_property, add_surface, set_units
+from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
 from synpick_warp.scenes.types import Camera, Material
@@ -277,7 +277,7 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
     glass = replace(given.glass, transmission=look.get("transmission", given.glass.transmission))
     material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness), glass=glass)
-    maps = set(MAPS) - look.keys() if surface.has_maps and "texture" not in look else ()
+    maps = surface.maps - look.keys() if "texture" not in look else ()
     add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, maps)
 
 

@@ -42,15 +42,16 @@ class FileMaterial:
     color: tuple[float, float, float]
     """Base colour factor, sRGB in 0..1; multiplies the texture in linear light."""
     texture: np.ndarray | None
-    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`."""
+    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`. A last channel more is
+    `Material.opacity`."""
     metallic: float | None
     roughness: float | None
     glass: Glass = OPAQUE
 
     @property
     def has_maps(self) -> bool:
-        """Whether the texture has more channels than colour."""
-        return self.texture is not None and self.texture.shape[2] > 3
+        """Whether the texture has maps behind its colours."""
+        return self.texture is not None and self.texture.shape[2] > 4
 
     @property
     def is_white_with_maps(self) -> bool:
@@ -60,9 +61,17 @@ class FileMaterial:
     def complete(self, metallic: float, roughness: float) -> Material:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
-        if self.texture is None or not self.has_maps:
+        if self.texture is None or self.texture.shape[2] == 3:
             return Material(self.color, self.texture, *given, glass=self.glass)
-        return Material(self.color, self.texture[..., :3].copy(), *given, self.texture[..., 3:].copy(), self.glass)
+        maps = self.texture[..., 3:7].copy() if self.has_maps else None
+        opacity = self.texture[..., -1].copy() if self.texture.shape[2] in (4, 8) else None
+        return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity)
+
+    def add_opacity(self, most: float) -> "FileMaterial":
+        """Material of the transmission `most`, whose texture's last channel says by how much less it transmits."""
+        texture = np.full((MIN_MAP_SIDE, MIN_MAP_SIDE, 3), 255, np.uint8) if self.texture is None else self.texture
+        opacity = np.full((*texture.shape[:2], 1), round(255.0 * (1.0 - self.glass.transmission / most)), np.uint8)
+        return replace(self, texture=np.concatenate([texture, opacity], axis=2), glass=replace(self.glass, transmission=most))
 
     def add_maps(self, **maps: np.ndarray) -> "FileMaterial":
         """Material with normal (H, W, 2), roughness and metallic (H, W, 1) maps, uint8 as of `Material.maps`, of any sizes; those that are
@@ -278,7 +287,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
     places: dict[tuple[int, tuple[float, ...]], int] = {}
     blocks, index = [], []
     for uv, material in parts:
-        texture = None if uv is None and not material.has_maps else material.texture
+        texture = None if uv is None and (material.texture is None or material.texture.shape[2] == 3) else material.texture
         key = (id(texture), material.color)
         if key not in places:
             places[key] = len(blocks)

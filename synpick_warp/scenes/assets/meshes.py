@@ -35,7 +35,7 @@ from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.wavefront import read_obj
-from synpick_warp.scenes.types import OPAQUE, TriangleMesh
+from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -328,16 +328,13 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
     all parts state both, they are averaged by area."""
     if len(parts) == 1:
         return parts[0]
-    parts = _share_maps(parts, notes)
+    parts = _share_opacity(_share_maps(parts, notes))
     first = parts[0].material
     if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
         parts = [_unroll(part, notes) for part in parts]
         moved, texture = appearance.join_textures([(part.uv, part.material) for part in parts], str(path), notes.said)
         parts = [replace(part, uv=np.broadcast_to(uv, (len(part.vertices), 2))) for uv, part in zip(moved, parts, strict=True)]
         first = replace(first, color=appearance.WHITE, texture=texture)
-    if len({part.material.glass.transmission for part in parts}) > 1:
-        notes.ignored.append("transparency of some of its parts: an object has one for all")
-        first = replace(first, glass=OPAQUE)
     mean = {}
     for name in ("metallic", "roughness"):
         known = [(value, _area(part)) for part in parts if (value := getattr(part.material, name)) is not None]
@@ -383,6 +380,20 @@ def _share_maps(parts: list[MeshPart], notes: Notes) -> list[MeshPart]:
             given = replace(given, texture=made[key])
         shared.append(replace(part, material=given))
     return shared
+
+
+def _share_opacity(parts: list[MeshPart]) -> list[MeshPart]:
+    """Give all parts the glass of the clearest one, and textures with its opacity, if they transmit different parts of the light."""
+    clearest = max((part.material.glass for part in parts), key=lambda glass: glass.transmission)
+    if all(part.material.glass.transmission == clearest.transmission for part in parts):
+        return parts
+    made: dict[Any, appearance.FileMaterial] = {}
+    for part in parts:
+        key = id(part.material.texture), part.material.glass
+        if key not in made:
+            made[key] = part.material.add_opacity(clearest.transmission)
+    new = ((part, made[id(part.material.texture), part.material.glass].texture) for part in parts)
+    return [replace(part, material=replace(part.material, texture=texture, glass=clearest)) for part, texture in new]
 
 
 def _unroll(part: MeshPart, notes: Notes) -> MeshPart:

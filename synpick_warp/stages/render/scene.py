@@ -12,13 +12,17 @@ from synpick_warp.configs.episodes.randomize import OFF
 from synpick_warp.kernels.render.images.layers import SuctionScene
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
-from synpick_warp.kernels.render.lighting.materials import (
+from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
+from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
+from synpick_warp.kernels.render.lighting.surfaces import (
     METALLIC_MAP,
     METALLIC_MASK,
     METALLIC_SHIFT,
     NORMAL_MAP,
     NORMAL_STEPS,
     NORMAL_ZERO,
+    OPACITY_MASK,
+    OPACITY_SHIFT,
     ROUGHNESS_MAP,
     ROUGHNESS_MASK,
     ROUGHNESS_SHIFT,
@@ -27,8 +31,6 @@ from synpick_warp.kernels.render.lighting.materials import (
     TRIANGLE_RECORDS,
     Surfaces,
 )
-from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
-from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Meshes, Table
 from synpick_warp.kernels.render.visibility.props import Props
@@ -143,6 +145,12 @@ def pack_texels(image: np.ndarray) -> np.ndarray:
     return red | green << bits | blue << 2 * bits
 
 
+def pack_opacity(opacity: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Bits of the texels (H W) uint32 of a mip level of this shape (H, W, 3) for a material's opacity."""
+    level = cv2.resize(opacity, shape[1::-1], interpolation=cv2.INTER_AREA)
+    return np.rint(level.reshape(-1) / 255.0 * int(OPACITY_MASK)).astype(np.uint32) << int(OPACITY_SHIFT)
+
+
 def detail_levels(maps: np.ndarray) -> list[np.ndarray]:
     """Mip pyramid of maps (H, W, 4) uint8 as of `Material.maps`, packed (H W) uint32. The variance of the normals below a texel widens
     its roughness (Toksvig, 2005), as the squared GGX width, which is averaged."""
@@ -246,6 +254,8 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     mapped = map_in_threads(lambda material: None if material.maps is None else detail_levels(material.maps), materials)
     for row, (chain, levels) in enumerate(zip(chains, mapped, strict=True)):
         packed = [pack_texels(image) for image in chain]
+        if (opacity := materials[row].opacity) is not None:
+            packed = [texels | pack_opacity(opacity, image.shape) for texels, image in zip(packed, chain, strict=True)]
         texels += packed
         details += packed if levels is None else levels
         for level, image in enumerate(packed):

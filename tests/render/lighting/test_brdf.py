@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.kernels.render.lighting import sampling
-from synpick_warp.kernels.render.lighting.materials import MAX_WIDENING, PIXEL_VARIANCE, widen_roughness
+from synpick_warp.kernels.render.lighting.brdf import MAX_WIDENING, PIXEL_VARIANCE, widen_roughness
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.render import scene

@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import UNOCCLUDED, Config, Render
 from synpick_warp.kernels.render.lighting import wear
-from synpick_warp.kernels.render.lighting.materials import ROUGHNESS_MASK, ROUGHNESS_SHIFT
+from synpick_warp.kernels.render.lighting.surfaces import (
+    ROUGHNESS_MASK,
+    ROUGHNESS_SHIFT,
+)
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import MAP_CENTER, Material
 from synpick_warp.stages.render.looks import make_noise

@@ -92,6 +92,17 @@ def test_thick_glass_bends_light_as_a_tilted_slab(device):
     assert abs(abs(place(thick) - place(0.0)) - 150.0 * shift / 0.95) < 1.0
 
 
+def test_labels_are_opaque(device):
+    """One half of the texture is; USD's and glTF's maps have the same."""
+    texture, opacity = np.full((8, 8, 3), 255, np.uint8), np.zeros((8, 8), np.uint8)
+    opacity[:, :4] = 255
+    half = replace(pane(1.0), texture=texture, opacity=opacity)
+    images = [picture(device, each).radiance[INSIDE] for each in (half, surface(roughness=0.3), pane(1.0))]
+    label, clear = slice(0, 6), slice(10, 16)
+    np.testing.assert_allclose(images[0][:, label], images[1][:, label], atol=1e-3)
+    np.testing.assert_allclose(images[0][:, clear], images[2][:, clear], atol=1e-3)
+
+
 def test_pictures_depend_on_neither_batches_nor_reuse(device):
     """Of bodies that move, appear and disappear, over frames."""
     glass = [

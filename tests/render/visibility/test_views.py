@@ -6,7 +6,14 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.lighting.materials import AnySurfaces, RandomizedSurfaces, Surfaces, material_of
+from synpick_warp.kernels.render.lighting.materials import (
+    material_of,
+)
+from synpick_warp.kernels.render.lighting.surfaces import (
+    AnySurfaces,
+    RandomizedSurfaces,
+    Surfaces,
+)
 from synpick_warp.kernels.render.visibility.camera import (
     AnyViews,
     CameraTable,

@@ -36,6 +36,10 @@ ALBEDO_COLUMNS = wp.constant(32)
 """Columns of the albedo table: √cosine j / (ALBEDO_COLUMNS - 1), because the albedo changes fastest at grazing angles."""
 ALBEDO_SAMPLES = wp.constant(4096)
 """Directions per entry of the albedo table: its error is about 1e-4."""
+PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
+"""Variance of a uniformly distributed position in a pixel, along one axis [px²]."""
+MAX_WIDENING = wp.constant(0.18)
+"""Specular anti-aliasing: largest increase of the squared GGX width alpha² (Tokuyoshi and Kaplanyan, 2019)."""
 MIN_LOBE_PROBABILITY = wp.constant(0.25)
 """Smallest probability of sampling a lobe that is not black."""
 
@@ -139,6 +143,13 @@ def bend_normal(normal: wp.vec3, outgoing: wp.vec3) -> wp.vec3:
     if cosine >= MIN_FACING:
         return normal
     return wp.normalize(normal + (MIN_FACING - cosine) * outgoing)
+
+
+@wp.func
+def widen_roughness(roughness: float, normal_spread: float) -> float:
+    """Specular anti-aliasing: widen the GGX lobe by the variance of the normals in a pixel's footprint (Kaplanyan et al., 2016)."""
+    alpha = roughness * roughness
+    return wp.sqrt(wp.sqrt(wp.min(alpha * alpha + wp.min(PIXEL_VARIANCE * normal_spread * normal_spread, MAX_WIDENING), 1.0)))
 
 
 @wp.func

@@ -9,7 +9,11 @@ import warp as wp
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.render.lighting.labels import Label, place_label
-from synpick_warp.kernels.render.lighting.materials import METALLIC_MAP, ROUGHNESS_MAP, RandomizedSurfaces
+from synpick_warp.kernels.render.lighting.surfaces import (
+    METALLIC_MAP,
+    ROUGHNESS_MAP,
+    RandomizedSurfaces,
+)
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
@@ -75,7 +79,7 @@ class DrawnMaterial:
     wear: wp.vec4
     """As in `RandomizedSurfaces`."""
     glass: wp.vec3
-    """As in `RandomizedSurfaces`; metals are opaque."""
+    """As in `RandomizedSurfaces`; metals are opaque, unless a map says where they are."""
     label: float
     """Width of the label [m]; 0: none."""
 
@@ -119,7 +123,8 @@ def draw_material(table: LookTable, surfaces: RandomizedSurfaces, base: int, key
     glass = surfaces.glass[base]
     if table.distribution[part, Look.TRANSMISSION].kind != LookKind.OFF:
         glass[0] = draw_look(table, key, part, Look.TRANSMISSION)[0]
-    glass[0] = glass[0] * (1.0 - result.metallic)
+    if (result.maps & METALLIC_MAP) == 0:
+        glass[0] = glass[0] * (1.0 - result.metallic)
     result.glass = glass
     if table.distribution[part, Look.LABEL].kind != LookKind.OFF:
         result.label = draw_look(table, key, part, Look.LABEL)[0]

@@ -9,7 +9,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf, view_factors, widen_roughness
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import (
     Lights,
@@ -21,19 +21,20 @@ from synpick_warp.kernels.render.lighting.environment import (
     unit_heading,
 )
 from synpick_warp.kernels.render.lighting.materials import (
-    Surface,
     interpolate_surface,
     make_table_surface,
     map_table,
     material_at,
     wear_at,
-    widen_roughness,
 )
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
+from synpick_warp.kernels.render.lighting.surfaces import (
+    Surface,
+)
 from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios

@@ -17,8 +17,6 @@ from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.materials import (
-    RandomizedSurfaces,
-    Surfaces,
     interpolate_surface,
     make_table_surface,
     map_table,
@@ -31,6 +29,10 @@ from synpick_warp.kernels.render.lighting.sampling import (
     environment_pdf,
     sample_environment,
     scrambled_point,
+)
+from synpick_warp.kernels.render.lighting.surfaces import (
+    RandomizedSurfaces,
+    Surfaces,
 )
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
