@@ -12,7 +12,7 @@ from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import Glass
 from tests.render.lighting.test_dirty_tiles import CAMERAS, ENTRIES, ROOM, play, scripts
 from tests.render.lighting.test_shadows import LAMPS
-from tests.worlds.shapes import UPRIGHT, camera, even_light, sheet, sun, surface
+from tests.worlds.shapes import UPRIGHT, camera, distorted, even_light, sheet, sun, surface
 from tests.worlds.toy_scene import ToyScene, assert_same, build_scene, render_objects, with_render
 
 VIEW = camera(48, 32, 150.0, (0.0, 0.0, 1.0))
@@ -29,16 +29,17 @@ def pane(transmission, color=(1.0, 1.0, 1.0), ior=1.5, thickness=0.0):
     return replace(surface(color, roughness=0.3), glass=Glass(transmission, ior, thickness))
 
 
-def picture(device, material, mode=UNOCCLUDED, mesh=PANE, floor=None, lights=EVEN, **more):
+def picture(device, material, mode=UNOCCLUDED, mesh=PANE, floor=None, lights=EVEN, view=VIEW, **more):
     below = (sheet(0.6, 0.5), floor or surface(texture=CHECKS))
     placed = [below] if material is None else [below, (mesh, material, RAISED)]
-    return render_objects(device, *placed, view=VIEW, config=with_render(mode, samples=64), lights=lights, **more)
+    return render_objects(device, *placed, view=view, config=with_render(mode, samples=64), lights=lights, **more)
 
 
+@pytest.mark.parametrize("view", [VIEW, distorted(VIEW, -0.2, 0.05, 0.0, 0.0)], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("mode", [UNOCCLUDED, FAST, REFERENCE])
-def test_clear_glass_vanishes_in_even_light_over_a_white_floor(device, mode):
+def test_clear_glass_vanishes_in_even_light_over_a_white_floor(device, mode, view):
     """What the coat reflects and what passes are all light."""
-    with_pane, without = (picture(device, material, mode, floor=surface()) for material in (pane(1.0), None))
+    with_pane, without = (picture(device, material, mode, floor=surface(), view=view) for material in (pane(1.0, thickness=0.01), None))
     np.testing.assert_allclose(with_pane.radiance[INSIDE], without.radiance[INSIDE], rtol=0.03)
 
 
