@@ -342,6 +342,7 @@ BROKEN = {
 """Group and name of what a package adds: its module, and what is said of it."""
 
 
+@pytest.mark.slow
 def test_packages_of_others_bake_their_format_with_their_gripper_and_layer_and_broken_ones_harm_only_what_uses_them(tmp_path):
     folder = tmp_path / "extras" / "broken_extras-1.0.dist-info"
     folder.mkdir(parents=True)
