@@ -427,16 +427,6 @@ def test_a_selection_reads_rows_when_they_are_asked_for():
     assert rows["speed"].tolist() == [11.0, 13.0]
 
 
-def test_asking_a_selection_for_a_name_gathers_nothing():
-    class Unread(dict[str, np.ndarray]):
-        def __getitem__(self, name: str) -> np.ndarray:
-            raise AssertionError(f"{name} was read")
-
-    rows = SelectedRows(Unread(speed=np.arange(4.0)), np.array([1]))
-    assert "speed" in rows
-    assert "force" not in rows
-
-
 # ---- waiting for copies ----
 
 
