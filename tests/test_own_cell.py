@@ -23,11 +23,7 @@ from synpick_warp.configs.schema import FORMATS
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.factory.episodes import BakeSummary
 from synpick_warp.factory.pipeline import run_bake
-from synpick_warp.kernels.render.lighting.surfaces import (
-    METALLIC_SHIFT,
-    ROUGHNESS_MASK,
-    ROUGHNESS_SHIFT,
-)
+from synpick_warp.kernels.render.lighting.surfaces import METALLIC_SHIFT, ROUGHNESS_MASK, ROUGHNESS_SHIFT
 from synpick_warp.scenes.bins import make_bins
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE

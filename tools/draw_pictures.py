@@ -41,6 +41,9 @@ STRIP_SETTINGS = COMMON | {
 }
 PICK_SETTINGS = COMMON | {
     "bake.mode": "pick",
+    "arrangement.counts": {"bracket": 16},
+    "pick.failures": 1,
+    "pick.forgive": False,
     "gripper.kind": "suction_array",
     "gripper.cups": [[-0.011, 0.0], [0.011, 0.0]],
     # The first camera is the one that perception uses; the second is drawn.

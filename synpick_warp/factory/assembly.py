@@ -149,9 +149,7 @@ def build_factory(
     planned = DataLayout.of(config).planned if episodes is None else max(expected, len(episodes))
     needs = Needs.of(config)
     writers = count_writers(config.bake.writers, needs.slot_bytes)
-    keeps, config = config.render.reuse, fit_to_device(without_pictures(config), device, planned, writers, processes)
-    if keeps and not config.render.reuse:
-        progress.note("memory is too short to keep resting parts of pictures from frame to frame (render.reuse): same files, but slower")
+    config = _with_note(config, fit_to_device(without_pictures(config), device, planned, writers, processes), progress)
     check_memory(plan_memory(config, device, writers), device, processes)
     with compiling_if_cold(config, device, progress):
         stages = build_stages(config, device, progress, episodes, needs.physics, longest_first)
@@ -161,10 +159,17 @@ def build_factory(
 def build_online(config: Config, progress: Progress, episodes: Sequence[int]) -> Stages:
     """Load assets and build the stages of a stream or an environment, whose views stay on the device. Errors as of `build_factory`."""
     device = pick_device(config.bake.device)
-    config = fit_to_device(config, device, max(1, len(episodes)), NO_WRITERS)
+    config = _with_note(config, fit_to_device(config, device, max(1, len(episodes)), NO_WRITERS), progress)
     check_memory(plan_memory(config, device, NO_WRITERS), device)
     with explain_shortage(config), compiling_if_cold(config, device, progress, online=True):
         return build_stages(config, device, progress, episodes)
+
+
+def _with_note(config: Config, fitted: Config, progress: Progress) -> Config:
+    """Settings after `fit_to_device`; a note if these do without kept pictures."""
+    if config.render.reuse and not fitted.render.reuse:
+        progress.note("memory is too short to keep resting parts of pictures from frame to frame (render.reuse): same files, but slower")
+    return fitted
 
 
 def is_cache_warm(device: wp.Device) -> bool:

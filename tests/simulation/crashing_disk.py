@@ -1,6 +1,6 @@
 """Fault injection into the file system: from the n-th modification of a folder on, each raises `Dead`, as if the process were killed there.
 
-A power cut additionally truncates the files that were not flushed by fsync.
+A power cut additionally truncates the files that were not flushed by fsync or syncfs.
 """
 
 from __future__ import annotations

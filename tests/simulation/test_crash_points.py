@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -95,6 +98,22 @@ def test_a_finished_data_set_outlives_a_power_cut(tmp_path):
     disk.cut_power()
     verdict = verify(tmp_path / "out")
     assert (verdict.problem, verdict.finished) == ("", True)
+
+
+def test_a_file_system_is_flushed_where_the_system_can(tmp_path, monkeypatch):
+    checksums.sync_file_system(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        checksums.sync_file_system(tmp_path / "missing")
+    calls: list[str] = []
+    monkeypatch.setattr(os, "sync", lambda: calls.append("sync"))
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(syncfs=lambda handle: -1))
+    monkeypatch.setattr(ctypes, "get_errno", lambda: errno.EPERM)
+    checksums.sync_file_system(tmp_path)
+    assert calls == ["sync"]
+    monkeypatch.setattr(ctypes, "get_errno", lambda: errno.EIO)
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+        checksums.sync_file_system(tmp_path)
+    assert calls == ["sync"]
 
 
 @pytest.mark.parametrize(("case", "turn"), turns("merge", all_of="merge"))

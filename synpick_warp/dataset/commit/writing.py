@@ -266,7 +266,7 @@ def finalize_data_set(
         (out / PARTIAL).mkdir()
         known = manifest.committed_episodes(out) if episodes is None else list(episodes)
         paths = build_lists(out, may_pick(settings.bake, settings.layout.splits)) + finalize(kinds, out, settings, pool, known)
-        sync_file_system(out)  # Images are not flushed one by one: until here, a resumed bake would find what a power cut has taken.
+        sync_file_system(out)  # Images are not flushed one by one: until here, a resumed bake finds what a power cut has cut short.
         write_manifest_entry(out, manifest.INDICES, paths, {"episodes": known})
     except OSError as error:
         raise output_error(out, error) from error

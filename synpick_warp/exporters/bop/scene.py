@@ -274,7 +274,7 @@ def commit_scenes(scenes: tuple[tuple[Path, Path], ...], out: Path, settings: tu
     checksums.
 
     JSON files and folder entries are synced to disk before the rename. Images are at least in the page cache: they survive the end
-    of this process, but not necessarily a power cut.
+    of this process, and a power cut once the data set is finished.
     """
     for (scene, place), own in zip(scenes, settings, strict=True):
         spooled_checksums(out, place).write_text(complete_scene(scene, place, own), encoding="utf-8")

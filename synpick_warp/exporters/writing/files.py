@@ -3,6 +3,7 @@ SHA-256 lists in the format of `sha256sum`."""
 
 import contextlib
 import ctypes
+import errno
 import hashlib
 import json
 import os
@@ -172,18 +173,18 @@ def sync_folder(folder: Path) -> None:
 
 
 def sync_file_system(folder: Path) -> None:
-    """Flush all that was written to a folder's file system (syncfs of Linux, else sync), once for many thousand files. Raises OSError if
-    the system could not write some of it."""
+    """Flush all that was written to a folder's file system, once for many thousand files: by syncfs of Linux, or where there is none, or a
+    sandbox forbids it, by sync. Raises OSError if the system could not write some of it."""
     syncfs = getattr(ctypes.CDLL(None, use_errno=True), "syncfs", None)
-    if syncfs is None:
-        os.sync()
-        return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        if syncfs(handle):
-            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(folder))
+        code = syncfs(handle) and ctypes.get_errno() if syncfs else errno.ENOSYS
     finally:
         os.close(handle)
+    if code in (errno.ENOSYS, errno.EINVAL, errno.EPERM):
+        os.sync()
+    elif code:
+        raise OSError(code, os.strerror(code), str(folder))
 
 
 class Folder:

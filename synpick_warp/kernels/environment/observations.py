@@ -3,12 +3,8 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-)
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surfaces,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface
+from synpick_warp.kernels.render.lighting.surfaces import Surfaces
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 from synpick_warp.kernels.state import Motion, Plans, Seals, Worlds

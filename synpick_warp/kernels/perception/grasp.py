@@ -3,12 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.perception.components import Patches
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-)
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surfaces,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface
+from synpick_warp.kernels.render.lighting.surfaces import Surfaces
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, camera_ray
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.state import Observations, Plans

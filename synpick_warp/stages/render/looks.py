@@ -15,10 +15,7 @@ from synpick_warp.kernels.distributions import LookDistribution, LookTable
 from synpick_warp.kernels.render.lighting.background import shade_floor_kernel
 from synpick_warp.kernels.render.lighting.looks import draw_looks_kernel, dress_bodies_kernel
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene, RandomizedScene
-from synpick_warp.kernels.render.lighting.surfaces import (
-    RandomizedSurfaces,
-    Surfaces,
-)
+from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces
 from synpick_warp.kernels.render.lighting.wear import NOISE_SIZE, make_noise_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES

@@ -10,10 +10,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import UNOCCLUDED, Config, Render
 from synpick_warp.kernels.render.lighting import wear
-from synpick_warp.kernels.render.lighting.surfaces import (
-    ROUGHNESS_MASK,
-    ROUGHNESS_SHIFT,
-)
+from synpick_warp.kernels.render.lighting.surfaces import ROUGHNESS_MASK, ROUGHNESS_SHIFT
 from synpick_warp.scenes.looks import Looks
 from synpick_warp.scenes.types import MAP_CENTER, Material
 from synpick_warp.stages.render.looks import make_noise
@@ -125,31 +122,34 @@ def measure_wear(device, kind: int, amount: float, footprint: float = 0.0) -> np
 
 @pytest.mark.parametrize("coverage", [0.05, 0.3, 0.5, 0.9])
 def test_rust_and_stains_cover_their_fraction_of_the_surface(device, coverage):
-    assert 1.0 - measure_wear(device, 1, coverage)[:, 1].mean() == pytest.approx(coverage, abs=0.06)
-    assert 2.0 * (1.0 - measure_wear(device, 2, coverage)[:, 1].mean()) == pytest.approx(coverage, abs=0.06)
+    assert 1.0 - measure_wear(device, 1, coverage)[:, 1].mean() == pytest.approx(coverage, rel=0.35, abs=0.01)
+    assert 2.0 * (1.0 - measure_wear(device, 2, coverage)[:, 1].mean()) == pytest.approx(coverage, rel=0.35, abs=0.01)
 
 
 def test_scratches_are_few_and_fade_into_a_wide_pixel(device):
     sharp, wide = (measure_wear(device, 0, 1.0, footprint)[:, 2] for footprint in (0.0, 0.2))
     assert 0.01 < (sharp > 0.45).mean() < 0.4
     assert (wide > 0.45).mean() < 0.05
+    usual = measure_wear(device, 0, 1.0, 0.01)[:, 2]
+    assert (usual.mean() - 0.3) / 0.3 == pytest.approx(float(wear.MEAN_SHARE[0]), rel=0.25)
     # Their light is kept in the mean, as far as they do not overlap.
     assert wide.mean() - 0.3 == pytest.approx(sharp.mean() - 0.3, rel=0.5)
 
 
 def test_a_label_covers_its_rectangle_of_one_side_and_has_codes(device):
     metal = surface(color=(0.5, 0.5, 0.5), metallic=1.0, roughness=0.3)
-    looks = Looks(Randomize(object_label=Distribution.parse(0.2)), (), ())
+    looks = Looks(Randomize(object_label=Distribution.parse(0.15)), (), ())
 
-    def drawn(mesh, **options):
-        return render_objects(device, (mesh, metal, FLAT), view=VIEW, config=PLAIN, lights=(sun((0.7, 0.5, 0.5)),), **options).radiance[0]
+    def drawn(pose, **options):
+        return render_objects(device, (SQUARE, metal, pose), view=VIEW, config=PLAIN, lights=(sun((0.7, 0.5, 0.5)),), **options).radiance[0]
 
-    label = np.abs(drawn(SQUARE, looks=looks) - drawn(SQUARE)).max(axis=2) > 0.0
-    # 100 px/m; it is turned a little.
-    assert label.sum() == pytest.approx(20 * 12, abs=25)
-    assert drawn(SQUARE, looks=looks)[label].std() > 0.1 * drawn(SQUARE, looks=looks)[label].mean()
-    behind = replace(SQUARE, faces=SQUARE.faces[:, ::-1])
-    assert np.array_equal(drawn(behind, looks=looks), drawn(behind))
+    upside_down = (*FLAT[:3], 1.0, 0.0, 0.0, 0.0)
+    sides = [(drawn(pose, looks=looks), drawn(pose)) for pose in (FLAT, upside_down)]
+    labels = sorted((np.abs(with_label - plain).max(axis=2) > 0.0 for with_label, plain in sides), key=np.sum)
+    # 100 px/m; it is turned a little, and nowhere else.
+    assert [labels[0].sum(), labels[1].sum()] == [0, pytest.approx(15 * 9, abs=20)]
+    print_of = next(with_label for with_label, plain in sides if not np.array_equal(with_label, plain))[labels[1]]
+    assert print_of.std() > 0.1 * print_of.mean()
 
 
 def test_each_object_wears_its_own_way_and_plastic_does_not_rust(device):

@@ -6,14 +6,8 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.lighting.materials import (
-    material_of,
-)
-from synpick_warp.kernels.render.lighting.surfaces import (
-    AnySurfaces,
-    RandomizedSurfaces,
-    Surfaces,
-)
+from synpick_warp.kernels.render.lighting.materials import material_of
+from synpick_warp.kernels.render.lighting.surfaces import AnySurfaces, RandomizedSurfaces, Surfaces
 from synpick_warp.kernels.render.visibility.camera import (
     AnyViews,
     CameraTable,
@@ -195,4 +189,4 @@ def test_structs_of_the_arguments_choose_the_kernel(surfaces, views, rows, devic
 
 def test_plain_structs_have_nothing_of_looks():
     """Known: a cell without looks has neither the rows nor the code that reads them."""
-    assert set(RandomizedSurfaces.vars) - set(Surfaces.vars) == {"row", "recolor", "repeats", "wear", "pattern", "glass"}
+    assert set(RandomizedSurfaces.vars) - set(Surfaces.vars) == {"row", "recolor", "repeats", "wear", "pattern", "noise", "glass", "label"}

@@ -10,17 +10,9 @@ from synpick_warp.kernels.render.images.camera_effects import SensorParameters, 
 from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, make_brdf, widen_roughness
 from synpick_warp.kernels.render.lighting.color import luminance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-    make_table_surface,
-    map_table,
-    material_at,
-    wear_at,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surface,
-)
+from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
 from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, in_image, tile_pixel

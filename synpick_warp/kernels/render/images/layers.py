@@ -11,17 +11,9 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-    make_table_surface,
-    map_table,
-    material_at,
-    wear_at,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surface,
-)
+from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.visibility.camera import (
     NEAR_PLANE,
     AnyViews,

@@ -4,14 +4,9 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.environment import lamp_center, lamp_irradiance, sh_irradiance
-from synpick_warp.kernels.render.lighting.materials import (
-    map_table,
-    sample_base_color,
-)
+from synpick_warp.kernels.render.lighting.materials import map_table, sample_base_color
 from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surface,
-)
+from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.visibility.camera import camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views

@@ -9,11 +9,7 @@ import warp as wp
 from synpick_warp.codes import Look, LookKind, LookPart
 from synpick_warp.kernels.distributions import LookTable, draw_look, look_key
 from synpick_warp.kernels.render.lighting.labels import Label, place_label
-from synpick_warp.kernels.render.lighting.surfaces import (
-    METALLIC_MAP,
-    ROUGHNESS_MAP,
-    RandomizedSurfaces,
-)
+from synpick_warp.kernels.render.lighting.surfaces import METALLIC_MAP, ROUGHNESS_MAP, RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import AnyViews
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views

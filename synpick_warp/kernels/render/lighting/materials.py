@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.labels import LABEL_ROUGHNESS, find_place, label_reflectance
+from synpick_warp.kernels.render.lighting.labels import LABEL_ROUGHNESS, label_coordinates, label_reflectance
 from synpick_warp.kernels.render.lighting.surfaces import (
     METALLIC_MAP,
     METALLIC_MASK,
@@ -112,7 +112,8 @@ def place_details(
     footprint: float,
     to_world: wp.mat33,
 ) -> Surface:
-    """Shading data with tangent and place, if the material may have maps or wear; `footprint` [m] is the pixel's on the surface."""
+    """Shading data with tangent, place and label, if the material may have maps, wear or a label; `footprint` [m] is the pixel's on the
+    surface."""
     return surface
 
 
@@ -127,7 +128,7 @@ def place_details(  # noqa: F811
     footprint: float,
     to_world: wp.mat33,
 ) -> Surface:
-    """Shading data with tangent and place. The tangent is that of the triangle: the edge along which only u grows."""
+    """Shading data with tangent, place and label. The tangent is that of the triangle: the edge along which only u grows."""
     result = surface
     is_worn = has_wear(surfaces.wear[surface.row])
     is_bumpy = (surfaces.maps[surface.row] & NORMAL_MAP) != 0
@@ -141,7 +142,7 @@ def place_details(  # noqa: F811
     other = meshes.corner[3 * first + 2] - a
     point = a + barycentric[1] * edge + (1.0 - barycentric[0] - barycentric[1]) * other
     if is_labelled:
-        at = find_place(label, point, wp.transpose(to_world) * surface.face_normal)
+        at = label_coordinates(label, point, wp.transpose(to_world) * surface.face_normal)
         if wp.max(wp.abs(at[0]), wp.abs(at[1])) < 1.0:
             result.label = wp.vec3(at[0], at[1], footprint * wp.length(label.along))
     if is_worn:

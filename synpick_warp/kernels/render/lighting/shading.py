@@ -20,21 +20,13 @@ from synpick_warp.kernels.render.lighting.environment import (
     rotate_z,
     unit_heading,
 )
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-    make_table_surface,
-    map_table,
-    material_at,
-    wear_at,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
-from synpick_warp.kernels.render.lighting.surfaces import (
-    Surface,
-)
+from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios

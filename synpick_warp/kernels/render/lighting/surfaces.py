@@ -120,7 +120,7 @@ class Surface:
     place_footprint: float
     """Width of the pixel's footprint on the surface, in the same unit."""
     label: wp.vec3
-    """Coordinates on the body's label, and the pixel's footprint in them; 0: it shows none."""
+    """Coordinates on the body's label, and the pixel's width in half widths of it; a width of 0: the surface shows none."""
 
 
 @wp.struct

@@ -8,17 +8,9 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import coat_albedo, make_brdf, widen_roughness
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-    material_at,
-    sample_base_color,
-    transmission_at,
-    wear_at,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, material_at, sample_base_color, transmission_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
-from synpick_warp.kernels.render.lighting.surfaces import (
-    RandomizedSurfaces,
-)
+from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import hit_position
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, ViewBodies, body_of
 from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS

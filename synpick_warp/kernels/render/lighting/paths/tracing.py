@@ -16,13 +16,7 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import (
-    interpolate_surface,
-    make_table_surface,
-    map_table,
-    material_at,
-    wear_at,
-)
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
 from synpick_warp.kernels.render.lighting.sampling import (
     EnvironmentCdf,
     EnvironmentSample,
@@ -30,10 +24,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
     sample_environment,
     scrambled_point,
 )
-from synpick_warp.kernels.render.lighting.surfaces import (
-    RandomizedSurfaces,
-    Surfaces,
-)
+from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, ShadedImage, Table, body_of
@@ -169,7 +160,7 @@ def make_vertex(
     is_mean: bool,
 ) -> Vertex:
     """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray; `is_mean`: with
-    the mean wear of the surface, whose noise no one can tell from a ratio or a reflection, and which costs more than the ray.
+    the mean wear of the surface, as after the first bounce, in the reference, too: its noise costs more than the ray.
     """
     bodies = shot.bodies
     surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
