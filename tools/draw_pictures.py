@@ -41,7 +41,7 @@ STRIP_SETTINGS = COMMON | {
 }
 PICK_SETTINGS = COMMON | {
     "bake.mode": "pick",
-    "arrangement.counts": {"bracket": 16},
+    "arrangement.counts": {"bracket": 8},
     "pick.failures": 1,
     "pick.forgive": False,
     "gripper.kind": "suction_array",
