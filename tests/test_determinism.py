@@ -240,6 +240,8 @@ def test_linear_algebra_agrees_with_lapack():
     turns = Rotation.random(5, random_state=1)
     near = turns.as_matrix() + 1e-2 * stack
     np.testing.assert_allclose(linear_algebra.nearest_rotation(near), Rotation.from_matrix(near).as_matrix(), atol=1e-14)
+    for turn in (*turns, *Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity()):
+        np.testing.assert_allclose(abs(linear_algebra.quaternion(turn.as_matrix()) @ turn.as_quat()), 1.0, atol=1e-14)
     vector = turns.as_rotvec()[0]
     angle = float(linear_algebra.norm(vector))
     np.testing.assert_allclose(linear_algebra.rotation(vector / angle, angle), turns[0].as_matrix(), atol=2e-12)

@@ -290,7 +290,7 @@ DRAWN: dict[str, Any] = {
     **{f"object_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "rust", "stains", "dust")},
     **{f"bin_{wear}": {"uniform": [0, 0.8]} for wear in ("scratches", "stains", "dust")},
     "object_label": {"choice": [0, 0.03]},
-    "bin_label": 0.05,
+    "bin_label": {"choice": [0.05, 0.1]},
     "bin_color": ANY_COLOR,
     "bin_roughness": {"uniform": [0.2, 0.9]},
     "bin_metallic": {"choice": [0, 1]},

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.cell.cameras import GRIPPER, in_opencv_axes
@@ -22,7 +21,7 @@ from synpick_warp.scenes.cameras import place
 from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.embedded.props import make_embedded
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Prop, TriangleMesh
-from synpick_warp.system.linear_algebra import DECIMALS, matmul
+from synpick_warp.system.linear_algebra import DECIMALS, matmul, quaternion
 
 SIDES = (1e-3, 100.0)
 """Least and largest longest side of a prop [m]: less is lost in the contact margin, and more is an error of the unit."""
@@ -51,7 +50,7 @@ def _make_prop(row: PropRow, bins: Sequence[BinSizes], report: Callable[[str], N
     for line in lines:
         report(f"{label}: {line}")
     rotation, position = place(label, in_opencv_axes(row.pose))
-    turn = Rotation.from_matrix(rotation.T).as_quat().round(DECIMALS)
+    turn = quaternion(rotation.T).round(DECIMALS)
     for sizes in bins if pieces else ():
         if (share := _filled(sizes, [matmul(piece.vertices.astype(np.float64), rotation) + position for piece in pieces])) > MOST_FILLED:
             owner = " ".join(dict.fromkeys((sizes.noun, sizes.name)))

@@ -105,3 +105,12 @@ def rotation(axis: np.ndarray, angle: float | np.ndarray) -> np.ndarray:
     cosine, sine = wave / np.sqrt(wave[0] ** 2 + wave[1] ** 2)
     cross = np.cross(np.eye(3), axis[..., None, :])
     return cosine * np.eye(3) + sine * cross + (1.0 - cosine) * axis[..., :, None] * axis[..., None, :]
+
+
+def quaternion(matrix: np.ndarray) -> np.ndarray:
+    """Quaternion (4), x, y, z, w, of a rotation matrix (3, 3): the largest row of its outer product with itself (Shepperd, 1978)."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    rows = [1 + a - e - i, b + d, c + g, h - f], [b + d, 1 - a + e - i, f + h, c - g]
+    rows += [c + g, f + h, 1 - a - e + i, d - b], [h - f, c - g, d - b, 1 + a + e + i]
+    largest = np.array(rows[max(range(4), key=lambda index: rows[index][index])])
+    return largest / norm(largest)
