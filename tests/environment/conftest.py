@@ -1,5 +1,6 @@
 """A small environment of whole picks, which the tests of this room share."""
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -32,10 +33,10 @@ ARGUMENTS: dict[str, Any] = {
 """Of `make_choice`."""
 
 
-def build(device: Any, **changed: Any) -> PickingEnvironment:
-    """An environment of ARGUMENTS with changes, which need not be Gymnasium's."""
+def build(device: Any, source: Path | str = "smoke", **changed: Any) -> PickingEnvironment:
+    """An environment of ARGUMENTS with changes, which need not be Gymnasium's, by another preset or file."""
     choice = make_choice(**(ARGUMENTS | changed))
-    return make_picking(choice, "smoke", SETTINGS, str(device))
+    return make_picking(choice, source, SETTINGS, str(device))
 
 
 def centers(instances: np.ndarray) -> np.ndarray:

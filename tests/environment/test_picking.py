@@ -34,6 +34,14 @@ def floor_pixels(obs) -> np.ndarray:
 # ---- seeds ----
 
 
+def test_looks_and_props_change_no_observation_of_geometry(device, tmp_path):
+    """The frame has maps and stands beside the images; materials are drawn."""
+    prop = 'name = "frame"\nmesh = "frame"\npose = { position = [50.0, 0.0, 0.0] }\n'
+    (tmp_path / "cell.toml").write_text(f'preset = "smoke"\n[randomize]\nobject_brightness = 0.5\n[[prop]]\n{prop}')
+    sources = ("smoke", tmp_path / "cell.toml")
+    assert same(*(build(device, source, obs=("depth", "instances", "normals")).reset(seed=3)[0] for source in sources))
+
+
 def test_an_episode_index_names_a_pile(environment):
     info = environment.reset(seed=3)[1]
     first = environment.observe()

@@ -16,7 +16,7 @@ class PropRow:
     """A prop: scenery that is drawn, hides objects, casts shadows and is mirrored, but has no label. Not in the paper."""
 
     REQUIRED: ClassVar = ("name", "mesh", "pose")
-    name: str = setting("", "Unique name of at most 32 lower-case letters, digits and underscores.")
+    name: str = setting("", "Unique name of at most 32 lower-case letters, digits and underscores, a letter first.")
     mesh: str = setting(
         "",
         "Mesh file (.stl, .ply, .obj, .glb, .gltf, .step), in metres, or the name of an embedded prop.",
@@ -29,6 +29,7 @@ class PropRow:
     collide: bool = setting(False, "Collide, as the convex hull of each connected part of the mesh.")
     follows: str = setting(
         WORLD,
-        "What carries the prop: the world, or the gripper (the pose is in the frame of its shaft, and it is seen where that is).",
+        "What carries the prop: the world, or the gripper (the pose is in the frame of its shaft, and it is seen where that is, where the "
+        "layer suction_seal takes it for an obstacle).",
         choices=(WORLD, GRIPPER),
     )

@@ -16,7 +16,7 @@ from synpick_warp.configs.dataset import MAX_SHARD_SCENES, DataLayout, bake_mode
 from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.episodes.objects import EMBEDDED, most_objects
 from synpick_warp.configs.fields import Conflict
-from synpick_warp.configs.rules.camera_rules import FORMS, find_camera_conflicts, find_pose_conflicts
+from synpick_warp.configs.rules.camera_rules import FORMS, NAME, find_camera_conflicts, find_pose_conflicts
 from synpick_warp.configs.schema import FORMATS, MIXED, STILL, Bake, Bop, Config, Move, Physics, Pick, Settle, Split
 from synpick_warp.errors import format_value
 
@@ -130,8 +130,9 @@ def _props(rows: Sequence[PropRow], objects: int) -> Iterator[Conflict]:
     """Yield conflicts of the [[prop]] tables; `objects`: capacity of a world."""
     names = [row.name for row in rows]
     for index, row in enumerate(rows):
-        if not _NAME.fullmatch(row.name) or names.count(row.name) > 1:
-            yield f"prop[{index}].name", "lower-case letters, digits and underscores, at most 32, other than those of other props"
+        if not NAME.fullmatch(row.name) or names.count(row.name) > 1:
+            rule = "a lower-case letter, then such letters, digits and underscores, at most 32, other than those of other props"
+            yield f"prop[{index}].name", rule
         yield from find_pose_conflicts(f"prop[{index}].pose", row.pose, (("position",), *FORMS))
         if row.collide and row.follows == GRIPPER:
             yield f"prop[{index}].collide", "false for what follows the gripper, which collides as gripper.mesh"

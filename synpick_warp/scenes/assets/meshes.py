@@ -35,7 +35,7 @@ from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.wavefront import read_obj
-from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.scenes.types import OPAQUE, TriangleMesh
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -191,6 +191,9 @@ def read_cell_mesh(
     found = read_mesh(path, UNITS[unit], MeshOptions(substitute=True), report)
     if found.material.glass.transmission > 0.0:
         report(f"{path}: ignored: transparency, which objects alone have")
+        texture = found.material.texture
+        opaque = replace(found.material, glass=OPAQUE, texture=None if texture is None else texture[..., :3])
+        found = found._replace(material=opaque)
     if len(found.mesh.faces) > MAX_CELL_FACES:
         raise CatalogError(f"{path} has {len(found.mesh.faces):,} triangles; allowed: {MAX_CELL_FACES:,}; decimate the mesh")
     lengths = np.ptp(found.mesh.vertices.astype(np.float64), axis=0)

@@ -129,7 +129,7 @@ class Sight:
         padded[: len(worlds)] = worlds
         images.views.world.assign(padded)
         images.render(snapshot)
-        inputs = [images.scene.meshes, images.scene.surfaces, images.scene.grid, images.bodies, images.gbuffer, images.views]
+        inputs = [images.scene.meshes, images.scene.surfaces, images.scene.grid, images.bodies, images.gbuffer, images.drawn]
         outputs = [arrays.depth, arrays.segment, arrays.normal, arrays.cloud]
         launch_pixels(observations.copy_images_kernel, images.pixels, inputs, outputs, self.device)
 

@@ -1,6 +1,6 @@
 """Perception images: G-buffers of one camera without the gripper, for batches of worlds, entirely on the device."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import warp as wp
@@ -113,7 +113,8 @@ class PerceptionImages:
             raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
         seen = resized(rig.rows[rig.index(settings.camera)], settings.resolution)
         camera = make_cameras(Rig((seen,), rig.is_listed))
-        self.scene = with_cameras(render_scene, camera)
+        # Its kernels read the normals of meshes alone, not materials that are drawn.
+        self.scene = replace(with_cameras(render_scene, camera), surfaces=render_scene.plain.surfaces)
         self.views, self.bodies, self.gbuffer, self.arrays, self.scratch = allocate_batch(
             settings, instances, count, device, render_scene.prop_count
         )

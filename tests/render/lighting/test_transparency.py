@@ -9,7 +9,7 @@ from synpick_warp.configs.episodes.randomize import Distribution, Randomize
 from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.looks import Looks
-from synpick_warp.scenes.types import Glass
+from synpick_warp.scenes.types import MAP_CENTER, Glass
 from tests.render.lighting.test_dirty_tiles import CAMERAS, ENTRIES, ROOM, play, scripts
 from tests.render.lighting.test_shadows import LAMPS
 from tests.worlds.shapes import UPRIGHT, camera, distorted, even_light, sheet, sun, surface
@@ -123,3 +123,6 @@ def test_pictures_depend_on_neither_batches_nor_reuse(device):
 def test_metals_are_opaque(device):
     metal = replace(pane(1.0), metallic=1.0)
     assert_same(picture(device, metal), picture(device, replace(surface(roughness=0.3), metallic=1.0)), "color")
+    texture, maps = np.full((4, 4, 3), 255, np.uint8), np.broadcast_to(np.uint8([MAP_CENTER, MAP_CENTER, 77, 255]), (4, 4, 4))
+    mapped = [replace(one, texture=texture, maps=maps) for one in (pane(1.0), surface(roughness=0.3))]
+    assert_same(*(picture(device, one) for one in mapped), "color")

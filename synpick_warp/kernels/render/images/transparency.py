@@ -55,7 +55,7 @@ def add_scene_behind_kernel(
     down = intrinsics[1] * (bent[1] / bent[2] - ray[1])
     at_row = clamp_index(row + int(wp.round(down)), grid.height)
     at_column = clamp_index(column + int(wp.round(right)), grid.width)
-    if behind_depth[view, at_row, at_column] < hit.depth:
+    if bent[2] <= 0.0 or behind_depth[view, at_row, at_column] < hit.depth:
         at_row = row
         at_column = column
     image_inout.radiance[view, row, column] += wp.cw_mul(light.weight, resolve_radiance(behind, view, at_row, at_column))

@@ -347,10 +347,7 @@ def texel_opacity(surfaces: RandomizedSurfaces, index: int) -> float:
 
 @wp.func
 def transmission_at(surfaces: RandomizedSurfaces, surface: Surface) -> float:
-    """Transmission at a hit: that of its row, less what its texels lack, by a bilinear look-up in the nearest mip level; labels
-    are opaque."""
-    if surface.label[2] > 0.0:
-        return 0.0
+    """Transmission at a hit: that of its row, less what its texels lack, by a bilinear look-up in the nearest mip level."""
     transmission = surfaces.glass[surface.row][0]
     if transmission == 0.0 or surfaces.texture_size[surface.row][0] == 0:
         return transmission
@@ -390,10 +387,10 @@ def material_at(surfaces: Surfaces, surface: Surface, wear: Wear) -> SurfaceMate
 
 @wp.func
 def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
-    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share. Its colour is that of what
-    it does not transmit."""
+    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share. Labels are opaque, and so
+    is metal."""
     result = SurfaceMaterial()
-    result.color = (1.0 - transmission_at(surfaces, surface)) * sample_base_color(surfaces, surface)
+    result.transmission = transmission_at(surfaces, surface)
     result.metallic = surfaces.metallic[surface.row]
     result.roughness = surfaces.roughness[surface.row]
     result.normal = surface.normal
@@ -406,7 +403,10 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> S
             result.roughness = details[2]
         if (maps & METALLIC_MAP) != 0:
             result.metallic = details[3]
+            result.transmission = result.transmission * (1.0 - result.metallic)
+    result.color = (1.0 - result.transmission) * sample_base_color(surfaces, surface)
     if surface.label[2] > 0.0:
+        result.transmission = 0.0
         shade = label_reflectance(surfaces.pattern[surface.row], wp.vec2(surface.label[0], surface.label[1]), surface.label[2])
         result.color = wp.vec3(shade, shade, shade)
         result.metallic = 0.0

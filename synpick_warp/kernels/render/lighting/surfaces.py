@@ -125,9 +125,11 @@ class Surface:
 
 @wp.struct
 class SurfaceMaterial:
-    """Material of a surface at one hit: linear base colour, metallic, perceptual roughness, and shading normal towards the viewer."""
+    """Material of a surface at one hit: linear base colour of what it does not transmit, metallic, perceptual roughness, shading normal
+    towards the viewer, and transmission."""
 
     color: wp.vec3
     metallic: float
     roughness: float
     normal: wp.vec3
+    transmission: float

@@ -8,7 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import coat_albedo, make_brdf, widen_roughness
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, material_at, sample_base_color, transmission_at, wear_at
+from synpick_warp.kernels.render.lighting.materials import interpolate_surface, material_at, sample_base_color, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import RandomizedScene
 from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces
 from synpick_warp.kernels.render.visibility.camera import hit_position
@@ -96,15 +96,13 @@ def passing_light(scene: RandomizedScene, shot: AnyShot, view: int, hit: Hit, ra
     cameras = shot.views.cameras
     outgoing = -wp.normalize(cameras.to_world[view] * ray)
     surface = interpolate_surface(scene.meshes, scene.surfaces, shot.bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
-    transmission = transmission_at(scene.surfaces, surface)
     wear = wear_at(scene.surfaces, surface, False)
     material = material_at(scene.surfaces, surface, wear)
     roughness = widen_roughness(material.roughness, surface.normal_spread)
     brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     # Dust covers; what is no metal does not rust.
-    result.weight = (
-        transmission * (1.0 - wear.share[3]) * (1.0 - coat_albedo(brdf, brdf.albedo)) * sample_base_color(scene.surfaces, surface)
-    )
+    passing = material.transmission * (1.0 - wear.share[3]) * (1.0 - coat_albedo(brdf, brdf.albedo))
+    result.weight = passing * sample_base_color(scene.surfaces, surface)
     cosine = wp.dot(brdf.normal, outgoing)
     eta = 1.0 / glass[1]
     bent = (eta * cosine - wp.sqrt(1.0 - eta * eta * (1.0 - cosine * cosine))) * brdf.normal - eta * outgoing
