@@ -279,6 +279,8 @@ class Segment(enum.IntEnum):
 
 MAX_INSTANCES = int(Segment.TABLE) - 1
 """Most instances of a world: segmentation ids that are left beside those of `Segment`."""
+SHAFT = 1
+"""Column of the gripper's shaft in the poses of fixtures: after the bin, before the cups."""
 
 
 class Tone(enum.IntEnum):

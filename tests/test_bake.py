@@ -266,7 +266,7 @@ def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
 
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
-    """A batch in the middle cannot be written, or the last."""
+    """Writing fails in a middle batch, or in the last one."""
     left = [int(share * (baked.summary.views // CAMERAS - 1))]
     write = BopExporter.write_views
 

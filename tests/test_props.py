@@ -89,7 +89,7 @@ def test_episodes_draw_no_looks_of_props(device):
 # ---- data sets ----
 
 SLAB = 0.03
-"""Thickness of the slab that objects lie on [m]."""
+"""Thickness of the colliding plate on which objects rest [m]."""
 ROWS = (
     PropRow("slab", "", Pose(position=(0.0, 0.0, SLAB / 2)), collide=True),
     PropRow("frame", "frame", Pose(position=(0.0, 0.0, 0.0))),

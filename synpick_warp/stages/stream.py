@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.codes import Measure, Status, column_names
+from synpick_warp.codes import SHAFT, Measure, Status, column_names
 from synpick_warp.scenes.cameras import EpisodeCameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy
@@ -22,8 +22,6 @@ from synpick_warp.views.frames import FrameBatch, SelectedRows, TickBatch, most_
 
 OWN_ARRAYS = 6
 """Arrays that a report copies before those of its namespaces: of `WorldStatus`, then objects and poses."""
-SHAFT = 1
-"""Column of the gripper's shaft in poses of fixtures."""
 # Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
 _REPORTED = ("last_fixture_pose",)
 """Further arrays, which `TickBatch` does not have."""

@@ -114,7 +114,7 @@ def _rows(rows: tuple[CameraRow, ...]) -> Iterator[Conflict]:
 
 
 def find_pose_conflicts(key: str, pose: Pose, forms: Sequence[tuple[str, ...]] = FORMS) -> Iterator[Conflict]:
-    """Yield conflicts within a pose, which has the keys of one of `forms`."""
+    """Yield conflicts of a pose whose keys are not those of one of `forms`, or whose values do not make a rigid transform."""
     given = {name for name in ("matrix", "position", "quaternion", "look_at", "up") if getattr(pose, name) is not None}
     if given not in map(set, forms):
         yield key, " or ".join(f"{{{', '.join(form)}}}" for form in forms)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.codes import Ending, LookPart
+from synpick_warp.codes import SHAFT, Ending, LookPart
 from synpick_warp.configs.cell.cameras import GRIPPER
 from synpick_warp.exporters.usd import episode
 from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
@@ -39,8 +39,6 @@ INSTANCE = "instance"
 DISTRACTOR = "distractor"
 """Prefix of the distractors' prim names."""
 ROOT = "/Episode"
-SHAFT = 1
-"""Column of the gripper's shaft in poses of fixtures."""
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
 """Asset and prim of each row of `TickBatch.fixture_pose`; a bin that is no tote has the prim BIN."""
 BIN = f"{ROOT}/Bin"

@@ -166,7 +166,7 @@ class Dresser:
         is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
         surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)
         if scene.prop_count:
-            # Materials that nothing changes, those of the props' meshes.
+            # Props keep the materials of their meshes: identity for what the drawn materials of views change.
             surfaces.recolor.fill_(np.eye(3))
             surfaces.repeats.fill_(1.0)
             rows = np.tile(scene.props.first + np.arange(scene.prop_count), (views, 1))

@@ -1,4 +1,4 @@
-"""Props of a cell in pictures: bodies behind the instances of each world, which segmentation shows as the table."""
+"""Props in the renderer: bodies appended to the instances of each world, with the segmentation id of the table."""
 
 from dataclasses import replace
 from typing import Any
@@ -12,7 +12,7 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import make_views
 
 PLACED = ("catalog_index", "pose", "last_catalog_index", "last_pose")
-"""Arrays of a snapshot that have props."""
+"""Arrays of a snapshot to which props are appended."""
 
 
 def allocate_placed(worlds: int, instances: int, props: int, device: wp.Device) -> Snapshot | None:
@@ -21,20 +21,21 @@ def allocate_placed(worlds: int, instances: int, props: int, device: wp.Device) 
 
 
 class PropPlacer:
-    """Adds the props of a scene to snapshots and views; without any, it returns what it is given. Owns its scratch, whose size follows from
-    the first snapshot.
+    """Appends a scene's props to the instances of snapshots and views, and returns these unchanged in a scene without props. Allocates its
+    scratch for the number of worlds of the first snapshot.
 
     Attributes:
-        bodies: Instances and props of a world.
+        bodies: Number of instances and props of a world.
     """
 
     def __init__(self, scene: RenderScene, instances: int) -> None:
-        """Take the props of `scene`, in worlds of `instances` instances."""
+        """Create a placer. `scene`: has the props. `instances`: instance capacity of a world."""
         self.scene, self.instances, self.bodies = scene, instances, instances + scene.prop_count
         self._placed: Snapshot | None = None
 
     def place(self, snapshot: Snapshot, fixture_visible: wp.array) -> Snapshot:
-        """Snapshot with the props as further instances; `fixture_visible`: as of `set_up_views`."""
+        """Append the props to a copy of a snapshot's instances. `fixture_visible`: as of `set_up_views`; hidden grippers hide what follows
+        them."""
         if not self.scene.prop_count:
             return snapshot
         device, worlds = self.scene.device, snapshot.pose.shape[0]
@@ -46,13 +47,13 @@ class PropPlacer:
         return placed
 
     def widen(self, views: Any) -> Any:
-        """The struct `Views` or `LensViews` with the props as further instances."""
+        """Copy the struct `Views` or `LensViews`, with the props counted among the instances."""
         if not self.scene.prop_count:
             return views
         return make_views(views.world, views.camera, views.count, self.bodies, views.cameras, views.slot)
 
     def hide(self, segment: wp.array, views: int) -> None:
-        """Show props as the table in the first `views` images of segmentation ids (view, row, column)."""
+        """Replace the ids of props by the table's in the first `views` segmentation images (view, row, column)."""
         if self.scene.prop_count:
             dim = (views, *segment.shape[1:])
             wp.launch(hide_props_kernel, dim=dim, inputs=[self.instances], outputs=[segment], device=self.scene.device)

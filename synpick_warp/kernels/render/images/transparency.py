@@ -2,18 +2,18 @@
 
 import warp as wp
 
-from synpick_warp.codes import Segment, Stream
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.images.antialias import resolve_radiance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.paths.tracing import (
     TERMINATED,
-    PathContext,
     PathRules,
     RandomizedScene,
     extend_path,
     init_path,
     make_vertex,
     next_vertex,
+    pixel_context,
 )
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point
 from synpick_warp.kernels.render.lighting.transparency import passing_light
@@ -21,7 +21,6 @@ from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_cam
 from synpick_warp.kernels.render.visibility.camera import camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, ShadedImage, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
-from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,20 +64,14 @@ def add_scene_behind_kernel(
 def trace_scene_behind_kernel(
     scene: RandomizedScene, shot: AnyShot, opaque: ViewBodies, rules: PathRules, first: int, image_inout: ShadedImage
 ):
-    """Add to the path-traced reference what is behind transparent bodies: each path that begins on one goes on behind it, on `opaque`
-    bodies. Random numbers are those of `trace_paths_kernel`. Launched over view, pixel (tile order, from flat index `first` on)."""
-    grid, snapshot, views = shot.grid, shot.snapshot, shot.views
+    """Path-traced transmission: camera paths that meet a transparent body continue behind it, among `opaque` bodies alone, and their mean
+    radiance is added to the image. Random numbers are those of `trace_paths_kernel`. Launched over view, pixel (tile order, from flat index
+    `first` on)."""
+    grid, views = shot.grid, shot.views
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    world = views.world[view]
-    context = PathContext()
-    context.view = view
-    context.first_light = snapshot.light[world]
-    context.light = snapshot.light[world]
-    context.yaw = snapshot.light_yaw[world]
-    pixel = (views.camera[view] * grid.height + row) * grid.width + column
-    context.key = mix(stream_key(rules.seed, snapshot.episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
+    context = pixel_context(shot, rules, view, row, column)
     footprint = 1.0 / (views.cameras.intrinsics[view][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
     for index in range(rules.samples):

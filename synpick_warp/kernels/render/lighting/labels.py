@@ -62,7 +62,7 @@ def frame_of(middle: wp.vec3, normal: wp.vec3, turn: float, width: float) -> Lab
 
 @wp.func
 def count_spots(meshes: Meshes, mesh: int, label: Label) -> int:
-    """Number of the label's middle and corners that lie on the mesh, no deeper below or above than half the label's height."""
+    """Support of a label: how many of its middle and four corners have the mesh within half the label's height along the normal."""
     depth = 1.0 / wp.length(label.across)
     count = int(1)
     for corner in range(4):

@@ -47,7 +47,7 @@ def group_of(surfaces: RandomizedSurfaces, view: int, body: int) -> int:
 
 @wp.kernel
 def group_bodies_kernel(surfaces: RandomizedSurfaces, bodies: ViewBodies, groups_out: BodyGroups):
-    """Order the present bodies of each view by group, and in each as before. Launched over view, rank."""
+    """Sort the bodies of each view by `group_of`, stably: opaque ones first. Launched over view, rank."""
     view, rank = wp.tid()
     present = bodies.present[view]
     own = int(-1)

@@ -2,13 +2,10 @@
 
 import warp as wp
 
-from synpick_warp.codes import Segment
+from synpick_warp.codes import SHAFT, Segment
 from synpick_warp.kernels.state import Snapshots
 
 wp.set_module_options({"enable_backward": False})
-
-SHAFT = wp.constant(1)
-"""Column of the gripper's shaft in poses of fixtures."""
 
 
 @wp.struct

@@ -278,7 +278,8 @@ class _Reader:
             self.notes.ignored.append("emission")
 
     def glass(self, material: schema.GltfMaterial) -> Glass:
-        """Transmission of a material by its extensions or, where it blends, by its alpha; of a texture of either, the mean or nothing."""
+        """Transmission of a material: KHR_materials_transmission, else 1 - alpha in alphaMode BLEND. A transmission texture counts by its
+        mean, an alpha texture is ignored."""
         extensions, alpha = material.extensions or schema.MaterialExtensions(), 1.0
         given, volume = extensions.transmission or schema.Transmission(), extensions.volume or schema.Volume()
         if material.alphaMode == "BLEND" and material.pbrMetallicRoughness:

@@ -259,6 +259,21 @@ def escaped_radiance(scene: AnyScene, rules: PathRules, context: PathContext, li
 
 
 @wp.func
+def pixel_context(shot: AnyShot, rules: PathRules, view: int, row: int, column: int) -> PathContext:
+    """Constants of the paths of a pixel of the reference, all in the light of the whole map."""
+    snapshot, views = shot.snapshot, shot.views
+    world = views.world[view]
+    context = PathContext()
+    context.view = view
+    context.first_light = snapshot.light[world]
+    context.light = snapshot.light[world]
+    context.yaw = snapshot.light_yaw[world]
+    pixel = (views.camera[view] * shot.grid.height + row) * shot.grid.width + column
+    context.key = mix(stream_key(rules.seed, snapshot.episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
+    return context
+
+
+@wp.func
 def init_path(width: float) -> Path:
     """Start a path at the surface that the camera sees; `width` is its footprint's there [m]."""
     path = Path()
@@ -331,19 +346,11 @@ def trace_paths_kernel(scene: AnyScene, shot: AnyShot, rules: PathRules, first: 
     Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again. Launched
     over view, pixel (tile order, from flat index `first` on).
     """
-    grid, snapshot, views = shot.grid, shot.snapshot, shot.views
+    grid, views = shot.grid, shot.views
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
-    camera = views.camera[view]
-    world = views.world[view]
-    context = PathContext()
-    context.view = view
-    context.first_light = snapshot.light[world]
-    context.light = snapshot.light[world]
-    context.yaw = snapshot.light_yaw[world]
-    pixel = (camera * grid.height + row) * grid.width + column
-    context.key = mix(stream_key(rules.seed, snapshot.episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
+    context = pixel_context(shot, rules, view, row, column)
     footprint = 1.0 / (views.cameras.intrinsics[view][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
     for index in range(rules.samples):
