@@ -166,9 +166,11 @@ def build_online(config: Config, progress: Progress, episodes: Sequence[int]) ->
 
 
 def _with_note(config: Config, fitted: Config, progress: Progress) -> Config:
-    """Settings after `fit_to_device`; a note if these do without kept pictures."""
-    if config.render.reuse and not fitted.render.reuse:
-        progress.note("memory is too short to keep resting parts of pictures from frame to frame (render.reuse): same files, but slower")
+    """Settings after `fit_to_device`; a note if these keep fewer pictures, or none."""
+    render = fitted.render
+    if (render.reuse, render.reuse_worlds) != (config.render.reuse, config.render.reuse_worlds):
+        part = f" of more than {render.reuse_worlds} of {fitted.bake.worlds} worlds" if render.reuse else ""
+        progress.note(f"memory is too short to keep resting parts of pictures{part} from frame to frame (render.reuse): same files, slower")
     return fitted
 
 

@@ -43,7 +43,6 @@ from synpick_warp.stages.perception.images import allocate_batch, count_views
 from synpick_warp.stages.perception.perceive import allocate_votes
 from synpick_warp.stages.render.cameras import allocate_lenses
 from synpick_warp.stages.render.looks import allocate_materials, materials_of_view
-from synpick_warp.stages.render.postprocess import KeptColors
 from synpick_warp.stages.render.props import allocate_placed
 from synpick_warp.stages.render.raster import allocate_background, allocate_visibility
 from synpick_warp.stages.render.renderer import Renderer
@@ -61,9 +60,7 @@ from synpick_warp.system.hardware.device import ALL, pick_device, pick_devices
 from synpick_warp.system.hardware.free_memory import free_device_memory, free_host_memory
 
 KEPT_PICTURES = "pictures kept over frames"
-"""Name of the term of `render.reuse` ..."""
-KEPT_ARRAYS = (KeptColors.__name__, "VisibilityBuffer", "KeptMasks", "BorderCounts", "KeptSources")
-"""... and the declarations of its arrays."""
+"""Name of the term of `render.reuse`."""
 EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 ROW_BYTES = 12
@@ -268,11 +265,11 @@ def _images(
         else:
             ring, _ = allocate_ring(sizes, layers, host, device)
             copied = [array for batch in ring for array in batch.copied(host.on_demand).values()]
-    history, background = ([array for array in arrays if name in array.spec.shape] for name in ("world_camera", "camera"))
-    others = [array for array in arrays if not {"world_camera", "camera"}.intersection(array.spec.shape)]
-    kept = [array for array in history if array.name.startswith(KEPT_ARRAYS)]
+    over_frames = ("world_camera", "kept", "camera")
+    history, kept, background = ([array for array in arrays if name in array.spec.shape] for name in over_frames)
+    others = [array for array in arrays if not set(over_frames).intersection(array.spec.shape)]
     if history:
-        yield _term("light averaged over frames", (array for array in history if array not in kept), _HISTORY)
+        yield _term("light averaged over frames", history, _HISTORY)
     # Kernels index these by image, row and column.
     yield _term(KEPT_PICTURES, kept, _HISTORY, indexed=False)
     yield _term(f"images of {views:,} views of {size}", others + images, _VIEWS)
@@ -393,9 +390,9 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     the host's memory. What settings name stays, whether it fits or not."""
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
-    while terms := _short_terms(split_memories(plan_memory(config, device, writers), device, processes)):
-        if any(term.name == KEPT_PICTURES and term.size for term in terms):
-            config = config.with_values({"render.reuse": False})
+    while terms := (short := _short_memory(split_memories(plan_memory(config, device, writers), device, processes)))[0]:
+        if kept := sum(term.size for term in terms if term.name == KEPT_PICTURES):
+            config = _keep_less(config, kept, int((_planned(terms) - short[1]) / HEADROOM), device)
             continue
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
@@ -451,9 +448,20 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _short_terms(memories: Iterable[tuple[list[Term], int]]) -> Sequence[Term]:
-    """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`; empty: all fit."""
-    return next((terms for terms, free in memories if _planned(terms) > free), ())
+def _short_memory(memories: Iterable[tuple[list[Term], int]]) -> tuple[Sequence[Term], int]:
+    """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`, and its size; no terms: all fit."""
+    return next(((terms, free) for terms, free in memories if _planned(terms) > free), ((), 0))
+
+
+def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Config:
+    """Settings that keep the tiles of so many worlds less that `excess` of the `kept` [bytes] are free, or of none. If not all worlds are
+    kept, a batch of views needs as many rows again."""
+    rig, worlds, objects, is_partial = config.rig, config.bake.worlds, config.arrangement.max_objects, config.render.reuse_worlds > 0
+    batches = (views_per_batch(config.render, rig, worlds, objects, device, group) for group in range(len(rig.groups)))
+    scratch = max(-(-views // len(group)) for views, group in zip(batches, rig.groups, strict=True))
+    count = min(config.render.reuse_worlds or worlds, worlds)
+    left = count - -(-(count + scratch * is_partial) * excess // kept) - scratch * (not is_partial)
+    return config.with_values({"render.reuse_worlds": left} if left > 0 else {"render.reuse": False})
 
 
 def _planned(terms: Sequence[Term]) -> int:

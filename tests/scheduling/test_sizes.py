@@ -132,15 +132,27 @@ def test_settings_that_are_named_stay(give):
     assert fit_to_device(config, GPU, 512) == config.with_values({"render.reuse": False})
 
 
-def test_a_bake_says_that_it_does_not_keep_pictures(monkeypatch):
+@pytest.mark.parametrize(("gpu", "least"), [(40.0, 50), (48.0, 150), (80.0, 400)])
+def test_pictures_of_as_many_worlds_are_kept_as_fit(give, gpu, least):
+    give(gpu)
+    fitted = fit_to_device(load_config("synpick", {"bake.worlds": 512, "render.views_per_batch": 24}), GPU, 1024)
+    worlds = fitted.render.reuse_worlds
+    assert worlds > least
+    for count, fits in ((worlds, True), (worlds + 12, False)):
+        sizes = [term.size for term in plan_memory(fitted.with_values({"render.reuse_worlds": count}), GPU) if term.on_device]
+        assert (HEADROOM * sum(sizes) + RUNTIME_BYTES <= gpu * GIB) == fits
+
+
+@pytest.mark.parametrize(("key", "value", "part"), [("reuse", False, "pictures from"), ("reuse_worlds", 3, "than 3 of 8 worlds")])
+def test_a_bake_says_that_it_does_not_keep_pictures(monkeypatch, key, value, part):
     notes: list[str] = []
     progress = SilentProgress()
     monkeypatch.setattr(progress, "note", notes.append)
-    monkeypatch.setattr(assembly, "fit_to_device", lambda config, *_: config.with_values({"render.reuse": False}))
+    monkeypatch.setattr(assembly, "fit_to_device", lambda config, *_: config.with_values({f"render.{key}": value}))
     monkeypatch.setattr(assembly, "compiling_if_cold", Mock(side_effect=InterruptedError))
     with pytest.raises(InterruptedError):
-        assembly.build_factory(Config(), progress)
-    assert ["render.reuse" in note for note in notes] == [True]
+        assembly.build_factory(load_config("synpick", {"bake.worlds": 8}), progress)
+    assert [part in note for note in notes] == [True]
 
 
 def test_processes_share_the_hosts_memory(give):

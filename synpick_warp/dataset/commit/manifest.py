@@ -74,6 +74,7 @@ FREE_SETTINGS = (
     "bake.writers",
     "render.views_per_batch",
     "render.reuse",
+    "render.reuse_worlds",
     "perception.views",
     "gripper.mesh",
     "picks.worlds",

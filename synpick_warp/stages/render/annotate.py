@@ -13,7 +13,7 @@ from synpick_warp.stages.render.scene import RenderScene
 
 BORDER_BOXES = struct_arrays(boxes_counts.BorderBoxes, "view_instance", length=("one",))
 BORDER_COUNTS = struct_arrays(boxes_counts.BorderCounts, "view", "instance", boxes=("view", "instance", "one", "side"))
-KEPT_COUNTS = struct_arrays(boxes_counts.BorderCounts, "world_camera", "instance", boxes=("world_camera", "instance", "one", "side"))
+KEPT_COUNTS = struct_arrays(boxes_counts.BorderCounts, "kept", "instance", boxes=("kept", "instance", "one", "side"))
 
 
 class Annotator:
@@ -24,7 +24,7 @@ class Annotator:
         `kept`: number of views whose counts beyond the image are kept from frame to frame."""
         self.scene = scene
         self.border_boxes: Any = allocate_struct(BORDER_BOXES, {"view_instance": views * instances, "one": 1}, scene.device)
-        sizes = {"view": views, "world_camera": kept, "instance": instances, "one": 1, "side": 4}
+        sizes = {"view": views, "kept": kept, "instance": instances, "one": 1, "side": 4}
         self.border: Any = allocate_struct(KEPT_COUNTS if kept else BORDER_COUNTS, sizes, scene.device)
 
     def annotate(self, shot: Any, damage: Any, out: ViewBuffers) -> None:

@@ -52,6 +52,7 @@ from synpick_warp.stages.render.sampling_rates import (
     first_frame_paths,
     interleaved_threads,
     keeps_frames,
+    kept_views,
     paths_per_coarse_pixel,
     shadow_size,
     supersamples,
@@ -104,12 +105,12 @@ LIGHT_HISTORY = struct_arrays(
 TILE_FLAGS = struct_arrays(
     TileFlags,
     "view",
-    history_row=("view",),
+    **dict.fromkeys(("history_row", "kept_row", "holds"), ("view",)),
     stages=("view", "cell_tile"),
     due=("view", "cell_tile"),
     shadowed=("view", "shadow_tile"),
     dirty=("view", "tile"),
-    bodies=("world_camera", "tile", "body_word"),
+    bodies=("kept", "tile", "body_word"),
 )
 MOVING_BODIES = struct_arrays(
     MovingBodies,
@@ -132,7 +133,7 @@ PATH_QUEUES = struct_arrays(
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 KEPT_RATIOS = struct_arrays(RatioImages, "world_camera", "cell_row", "cell_column")
 SHADOW_RAYS = struct_arrays(ShadowRays, "view", "shadow_row", "shadow_column")
-KEPT_SOURCES = struct_arrays(KeptSources, "world_camera", "source_word")
+KEPT_SOURCES = struct_arrays(KeptSources, "kept", "source_word")
 FOOTPRINT_LISTS = struct_arrays(FootprintLists, "view", "chunk", footprint=("view", "chunk", "chunk_footprint"))
 
 
@@ -244,15 +245,15 @@ class DenoisedRenderer:
         self.shadow_grid = build_coarse_grid(scene.grid, shadow_size(size), edge_rays(size))
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.first_samples = first_frame_paths(render, scene.width, histories)
-        self.rules.min_roughness = MIN_ROUGHNESS
-        self.rules.firefly_clamp = FIREFLY_CLAMP
+        self.rules.min_roughness, self.rules.firefly_clamp = MIN_ROUGHNESS, FIREFLY_CLAMP
         self.variance_scale = SINGLE_PATH_VARIANCE_SCALE if self.rules.samples == 1 else 1.0
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
         self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
         self.history.frame.fill_(int(NEVER))
         keeps = keeps_frames(render, histories)
-        self.reuses = render.reuse and keeps
-        sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if keeps else 0}
+        self.history.kept = self.kept = kept_views(render, scene.camera_count, histories)
+        self.kept_rows = self.kept + views if 0 < self.kept < histories else self.kept
+        sizes |= body_sizes(instances, scene.width, scene.height) | {"world_camera": histories if keeps else 0, "kept": self.kept_rows}
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
@@ -268,13 +269,12 @@ class DenoisedRenderer:
         self.antialias = render.antialias
         self.coverage_rays = coverage_rays(render, scene.width, histories)
         sizes["cell_tile"], sizes["shadow_tile"] = self.coarse.grid.tiles, self.shadow_grid.grid.tiles
-        kept = sizes if self.reuses else sizes | {"world_camera": 0}
-        self.flags = allocate_struct(TILE_FLAGS, kept, scene.device)
+        self.flags = allocate_struct(TILE_FLAGS, sizes, scene.device)
         self.flags.stages.fill_(ALL_STAGES)
         self.flags.history_row.assign(np.arange(views))
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate_struct(FOOTPRINT_LISTS, sizes, scene.device)
-        self.kept_sources = allocate_struct(KEPT_SOURCES, kept, scene.device)
+        self.kept_sources = allocate_struct(KEPT_SOURCES, sizes, scene.device)
 
     def shade(self, snapshot: Snapshot, shot: Any, image: Any, add: Callable[[Any, Any], None] | None = None) -> None:
         """Render the radiance of a batch of views, for which `find_damage` was called. `snapshot`: the worlds. `shot`: the struct
@@ -309,7 +309,7 @@ class DenoisedRenderer:
         wp.launch(kernel_for(advance_history_kernel, views), inputs=inputs, outputs=[self.history, self.moving, self.flags], **options)
         inputs = [self.scene.meshes, snapshot.bundle, views.world, views.instances, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
-        if not self.reuses:
+        if self.kept == 0:
             return None
         dim, outputs = (views.count, self.scene.grid.tiles), [self.moving, self.flags]
         wp.launch(mark_damaged_tiles_kernel, dim=dim, inputs=[bodies], outputs=outputs, device=self.scene.device, block_dim=PIXEL_BLOCK)
@@ -378,7 +378,7 @@ class DenoisedRenderer:
 
     def mark_relit_tiles(self, shot: Any) -> None:
         """Mark the tiles that differ from the frame before in light and shadows; nothing without reuse."""
-        if self.reuses:
+        if self.kept:
             inputs = [self.coarse, self.shadow_grid, shot]
             dim = (shot.views.count, shot.grid.tiles)
             kernel = kernel_for(mark_relit_tiles_kernel, *inputs)
@@ -386,7 +386,7 @@ class DenoisedRenderer:
 
     def plan_passes(self, shot: Any, image: Any) -> None:
         """Plan what is computed anew in each tile, once all dirty ones are marked; nothing without reuse."""
-        if self.reuses:
+        if self.kept:
             inputs, dim = [shot.grid, self.flags], (shot.views.count, shot.grid.tiles)
             wp.launch(plan_passes_kernel, dim=dim, inputs=inputs, outputs=[image], device=self.scene.device, block_dim=PIXEL_BLOCK)
 
@@ -424,11 +424,11 @@ class DenoisedRenderer:
         if self.kept_sources.word.size:
             dim, inputs = (shot.views.count, shot.grid.tiles, int(TILE_HEIGHT) + 1), [shot.grid, self.flags, self.coverage_rays]
             wp.launch(forget_sources_kernel, dim=dim, inputs=inputs, outputs=[self.kept_sources], **options)
-        inputs, outputs = [self.footprints, shot, self.flags.history_row], [image, lists, self.kept_sources]
+        inputs, outputs = [self.footprints, shot, self.flags.kept_row], [image, lists, self.kept_sources]
         dim = shot.views.count * self.footprints.tiles * int(TILE_PIXELS)
         wp.launch(kernel_for(find_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)
         threads = FOOTPRINT_THREADS if device.is_cuda else CPU_FOOTPRINT_THREADS
-        inputs = [self.scene.plain, self.footprints, shot, lists, self.flags.history_row, threads]
+        inputs = [self.scene.plain, self.footprints, shot, lists, self.flags.kept_row, threads]
         outputs = [image, self.kept_sources]
         dim = shot.views.count * lists.count.shape[1] * threads
         wp.launch(kernel_for(resolve_footprints_kernel, *inputs), dim=dim, inputs=inputs, outputs=outputs, **options)

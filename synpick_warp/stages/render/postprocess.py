@@ -36,7 +36,7 @@ class LensArrays:
 class KeptColors:
     """Colour images of the last frame of each world and camera."""
 
-    color: wp.array = device_array("world_camera", "row", "column", dtype=wp.vec3ub)
+    color: wp.array = device_array("kept", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
 
 
@@ -70,7 +70,7 @@ class PostProcessor:
     """Turns radiance into sRGB images. Owns its scratch; `process` only launches, so a CUDA graph can capture it."""
 
     def __init__(
-        self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int, history_row: wp.array | None = None, kept: int = 0
+        self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int, kept_row: wp.array | None = None, kept: int = 0
     ) -> None:
         """Allocate scratch, if an effect needs it.
 
@@ -80,12 +80,12 @@ class PostProcessor:
             seed: Seed of the bake.
             scene: Constant data.
             views: Largest number of views in a batch.
-            history_row: (view) int32: indices of the kept images of a batch's views; None: nothing is kept.
+            kept_row: (view) int32: indices of the kept images of a batch's views; None: nothing is kept.
             kept: Number of images that are kept from frame to frame, for tiles that are not computed anew.
         """
         self.scene = scene
-        sizes = {"world_camera": kept, "row": scene.height, "column": scene.width}
-        self.kept, self.rows = allocate(KeptColors, sizes, scene.device).color, history_row if kept else None
+        sizes = {"kept": kept, "row": scene.height, "column": scene.width}
+        self.kept, self.rows = allocate(KeptColors, sizes, scene.device).color, kept_row if kept else None
         self.effects = make_effect_ranges(effects, seed) if has_effects(effects) else None
         self.settings = PostProcessSettings()
         self.settings.seed = seed

@@ -33,8 +33,8 @@ KEPT_WORDS = 2
 
 _BLOCKS: dict[str, tuple[str, ...]] = {"block": ("view", "block"), "blocks": ("view",)}
 VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", **_BLOCKS)
-KEPT_VISIBILITY = struct_arrays(VisibilityBuffer, "world_camera", "row", "column", **_BLOCKS)
-KEPT_MASKS = struct_arrays(KeptMasks, "world_camera", "instance", words=("world_camera", "kept_word"), length=("world_camera",))
+KEPT_VISIBILITY = struct_arrays(VisibilityBuffer, "kept", "row", "column", **_BLOCKS)
+KEPT_MASKS = struct_arrays(KeptMasks, "kept", "instance", words=("kept", "kept_word"), length=("kept",))
 
 
 class Rasterizer:
@@ -67,7 +67,7 @@ class Rasterizer:
         self.counts_per_meter = counts_per_meter
         self.visibility = allocate_visibility(views, scene.width, scene.height, instances, scene.device, kept)
         words = KEPT_WORDS * most_words(scene.width, scene.height)
-        self.kept_masks = allocate_struct(KEPT_MASKS, {"world_camera": kept, "instance": instances, "kept_word": words}, scene.device)
+        self.kept_masks = allocate_struct(KEPT_MASKS, {"kept": kept, "instance": instances, "kept_word": words}, scene.device)
         self.whole = whole_damage(views, scene.device)
         self.background = background
         if background is None:
@@ -117,7 +117,7 @@ def render_background(scene: RenderScene, gbuffer: Any) -> None:
 
 def allocate_visibility(views: int, width: int, height: int, instances: int, device: wp.Device, kept: int = 0) -> Any:
     """Allocate the struct `VisibilityBuffer`; `kept`: as of `Rasterizer`."""
-    sizes = {"view": views, "world_camera": kept, "row": height, "column": width, "block": max(BLOCKS, INSTANCE_BLOCKS * instances)}
+    sizes = {"view": views, "kept": kept, "row": height, "column": width, "block": max(BLOCKS, INSTANCE_BLOCKS * instances)}
     return allocate_struct(KEPT_VISIBILITY if kept else VISIBILITY_BUFFER, sizes, device)
 
 

@@ -82,13 +82,13 @@ class Renderer:
             self.image = allocate_image(sizes, scene.device)
             if has_effects(effects) or scene.is_transparent:
                 settings = replace(settings, reuse=False)
-            history_row = None
+            kept_row = None
             if settings.mode == schema.REFERENCE:
                 self.shading = ReferenceRenderer(settings, seed, scene)
             else:
                 self.shading = DenoisedRenderer(settings, seed, scene, bodies, views, histories)
-                kept, history_row = histories if self.shading.reuses else 0, self.shading.flags.history_row
-            self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, history_row, kept)
+                kept, kept_row = self.shading.kept_rows, self.shading.flags.kept_row
+            self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, kept_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
         self.behind: SceneBehind | None = None
         if scene.is_transparent and self.shading is not None:

@@ -53,6 +53,13 @@ def keeps_frames(render: Render, histories: int) -> bool:
     return bool(histories and render.history)
 
 
+def kept_views(render: Render, cameras: int, histories: int) -> int:
+    """Number of views, worlds times `cameras`, of which tiles are kept: those of the first `render.reuse_worlds` worlds, or all."""
+    if not (render.reuse and keeps_frames(render, histories)):
+        return 0
+    return min(histories, render.reuse_worlds * cameras or histories)
+
+
 def accumulates(render: Render, histories: int) -> bool:
     """Whether light is accumulated over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
     return keeps_frames(render, histories) and traces_paths(render)

@@ -67,7 +67,7 @@ def with_cameras(views: Any, cameras: Any) -> Any:
 def whole_damage(views: int, device: wp.Device) -> Any:
     """The struct `Damage` of views without a previous frame: all is damaged."""
     damage = allocate_struct(DAMAGE, {"view": views, "none": 0}, device)
-    damage.history_row.assign(np.arange(views))
+    damage.kept_row.assign(np.arange(views))
     return damage
 
 

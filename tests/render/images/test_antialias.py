@@ -347,7 +347,7 @@ def test_sources_with_a_corner_in_a_damaged_tile_are_unknown(device, samples):
     grid, numbers = build_grid(21, 10), np.random.default_rng(samples)
     dirty = numbers.choice(np.array([0, 0, 0, DAMAGED, RELIT], np.uint8), (40, grid.tiles))
     flags, kept, footprints = TileFlags(), KeptSources(), 22 * 11
-    flags.dirty, flags.history_row = (wp.array(array, device=device) for array in (dirty, np.arange(40, dtype=np.int32)[::-1].copy()))
+    flags.dirty, flags.kept_row = (wp.array(array, device=device) for array in (dirty, np.arange(40, dtype=np.int32)[::-1].copy()))
     kept.word = wp.zeros((40, -(-footprints * samples // 16)), dtype=wp.uint32, device=device)
     wp.launch(forget_sources_kernel, (40, grid.tiles, 5), [grid, flags, samples], [kept], device=device)
     bits = np.unpackbits(kept.word.numpy()[::-1].copy().view(np.uint8), axis=1, bitorder="little")[:, : footprints * 2 * samples]

@@ -23,6 +23,8 @@ FRAMES = 24
 CAMERAS = (camera(90, 61, 200.0, (0.0, 0.0, 1.2)), camera(90, 61, 240.0, (0.05, 0.0, 1.5)))
 ENTRIES = [entry(sheet(0.5, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.03, 3)), entry(box(0.08, 0.01, 0.03))]
 ROOM = 6
+KEPT = ((True, 0), (True, 1), (False, 0))
+"""`render.reuse` and `reuse_worlds`: tiles of both worlds are kept, of the first, of none."""
 
 
 def scripts(seed: int) -> list[ToyScene]:
@@ -88,15 +90,17 @@ def play(renderer: Renderer, frames: list, toy: ToyScene, seed: int) -> tuple[li
 )
 def test_kept_tiles_have_the_bytes_of_whole_pictures(device, size, lights, mode):
     frames, pictures, shares = scripts(size), {}, {}
-    for reuse in (True, False):
-        config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse, mode=mode)
+    for seed, (reuse, worlds) in enumerate(KEPT):
+        config = with_render(coarse_pixel=size, coarse_paths=1, reuse=reuse, reuse_worlds=worlds, mode=mode)
         toy = ToyScene(ENTRIES, frames[0], CAMERAS, lights=(lights,), instances=ROOM, config=config)
         renderer = make_renderer(toy.settings(), build_scene(toy, device), ROOM, 4, histories=4)
-        pictures[reuse], shares[reuse] = play(renderer, frames, toy, seed=int(reuse))
-    for frame, (kept, whole) in enumerate(zip(pictures[True], pictures[False], strict=True)):
+        pictures[seed], shares[seed] = play(renderer, frames, toy, seed=seed)
+    for frame, (kept, part, whole) in enumerate(zip(*pictures.values(), strict=True)):
         for name in whole:
             np.testing.assert_array_equal(kept[name], whole[name], err_msg=f"{name} of frame {frame}")
-    assert np.mean(shares[True]) < 0.9 < np.mean(shares[False]) == 1.0
+            np.testing.assert_array_equal(part[name], whole[name], err_msg=f"{name} of frame {frame}, one world kept")
+    assert np.mean(shares[0]) < np.mean(shares[1]) < np.mean(shares[2]) == 1.0
+    assert np.mean(shares[0]) < 0.9
 
 
 def test_a_still_scene_is_shaded_when_its_light_is_due(device):

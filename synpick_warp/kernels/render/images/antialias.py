@@ -237,7 +237,7 @@ def find_footprints_kernel(
     footprints: ImageGrid,
     # In:
     shot: AnyShot,
-    history_row: wp.array[int],  # (view)
+    kept_row: wp.array[int],  # (view)
     # Out:
     image_inout: ShadedImage,
     lists_inout: FootprintLists,
@@ -264,12 +264,12 @@ def find_footprints_kernel(
         return
     footprint = row * footprints.width + column
     if kept_inout.word.shape[0] > 0:
-        history, samples = history_row[view], image_inout.samples
-        sources = read_sources(kept_inout, history, footprint, samples)
+        kept, samples = kept_row[view], image_inout.samples
+        sources = read_sources(kept_inout, kept, footprint, samples)
         if sources != footprint_mask(samples):
             place_sources(image_inout, view, row, column, sources)
             return
-        clear_sources(kept_inout, history, footprint, samples)
+        clear_sources(kept_inout, kept, footprint, samples)
     if has_discontinuity(shot.gbuffer, grid, shot.views.cameras.intrinsics[view], view, top, left, bottom, right):
         chunk = tile_of(footprints, row, column) // CHUNK_TILES
         rank = wp.atomic_add(lists_inout.count, view, chunk, 1)
@@ -364,7 +364,7 @@ def resolve_footprints_kernel(
     # In:
     shot: AnyShot,
     lists: FootprintLists,
-    history_row: wp.array[int],  # (view)
+    kept_row: wp.array[int],  # (view)
     threads: int,
     # Out:
     image_inout: ShadedImage,
@@ -411,4 +411,4 @@ def resolve_footprints_kernel(
                 wp.atomic_or(image_inout.resolve, view, r, c, bits)
                 if kept_inout.word.shape[0] > 0:
                     word, shift = locate_sources(int(cell), samples)
-                    wp.atomic_or(kept_inout.word, history_row[view], word, bits << shift)
+                    wp.atomic_or(kept_inout.word, kept_row[view], word, bits << shift)

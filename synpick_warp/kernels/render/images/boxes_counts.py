@@ -40,7 +40,7 @@ class BorderCounts:
     """Amodal pixel counts and boxes of every instance beyond the image border, kept from frame to frame."""
 
     pixels: wp.array2d[int]
-    """(kept, instance); `kept` is the view's `Damage.history_row`."""
+    """(kept, instance); `kept` is the view's `Damage.kept_row`."""
     boxes: wp.array4d[int]
     """(kept, instance, one, side)."""
 
@@ -174,7 +174,7 @@ def list_border_boxes_kernel(
     view, instance = wp.tid()
     if not has_moved(damage, view, instance):
         return
-    row = damage.history_row[view]
+    row = damage.kept_row[view]
     border_inout.pixels[row, instance] = 0
     set_empty(border_inout.boxes, row, instance, AMODAL_BOX)
     box = bodies.box[view, instance]
@@ -238,8 +238,8 @@ def count_border_pixels_kernel(
                     amodal += 1
                     amodal_box = extend_box(amodal_box, row, column)
         if amodal > 0:
-            wp.atomic_add(border_inout.pixels, damage.history_row[view], instance, amodal)
-            merge_box(border_inout.boxes, damage.history_row[view], instance, AMODAL_BOX, amodal_box)
+            wp.atomic_add(border_inout.pixels, damage.kept_row[view], instance, amodal)
+            merge_box(border_inout.boxes, damage.kept_row[view], instance, AMODAL_BOX, amodal_box)
 
 
 @wp.kernel
@@ -250,7 +250,7 @@ def finish_boxes_counts_kernel(damage: Damage, border: BorderCounts, counts_inou
     """
     view, instance, box = wp.tid()
     if box == AMODAL_BOX:
-        row = damage.history_row[view]
+        row = damage.kept_row[view]
         counts_inout.pixels[view, instance, ALL] += border.pixels[row, instance]
         sides = border.boxes
         beyond = wp.vec4i(sides[row, instance, 0, 0], sides[row, instance, 0, 1], sides[row, instance, 0, 2], sides[row, instance, 0, 3])

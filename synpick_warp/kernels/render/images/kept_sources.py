@@ -18,7 +18,7 @@ class KeptSources:
     """Source pixels of the coverage samples of each footprint, valid until a tile of the footprint is damaged."""
 
     word: wp.array2d[wp.uint32]
-    """(row of the light history, word): SOURCE_BITS per sample, footprints in row-major order; a footprint's samples share a word. All bits
+    """(kept, word): SOURCE_BITS per sample, footprints in row-major order; a footprint's samples share a word. All bits
     of a footprint are 1 if its sources are unknown. Empty: nothing is kept."""
 
 
@@ -36,17 +36,17 @@ def locate_sources(footprint: int, samples: int) -> tuple[int, wp.uint32]:
 
 
 @wp.func
-def read_sources(kept: KeptSources, history: int, footprint: int, samples: int) -> wp.uint32:
+def read_sources(kept: KeptSources, row: int, footprint: int, samples: int) -> wp.uint32:
     """Read the source bits of a footprint; `footprint_mask` if they are unknown."""
     word, shift = locate_sources(footprint, samples)
-    return (kept.word[history, word] >> shift) & footprint_mask(samples)
+    return (kept.word[row, word] >> shift) & footprint_mask(samples)
 
 
 @wp.func
-def clear_sources(kept: KeptSources, history: int, footprint: int, samples: int):
+def clear_sources(kept: KeptSources, row: int, footprint: int, samples: int):
     """Set the source bits of a footprint to 0, so that each sample takes the radiance of its own pixel."""
     word, shift = locate_sources(footprint, samples)
-    wp.atomic_and(kept.word, history, word, ~(footprint_mask(samples) << shift))
+    wp.atomic_and(kept.word, row, word, ~(footprint_mask(samples) << shift))
 
 
 @wp.kernel
@@ -60,11 +60,11 @@ def forget_sources_kernel(grid: ImageGrid, flags: TileFlags, samples: int, kept_
     if (int(flags.dirty[view, tile]) & DAMAGED) == 0:
         return
     top, left = tile_corner(grid, tile)
-    history, share, width = flags.history_row[view], WORD_SAMPLES // samples, SOURCE_BITS * samples
+    row, share, width = flags.kept_row[view], WORD_SAMPLES // samples, SOURCE_BITS * samples
     first = wp.min(top + down, grid.height) * (grid.width + 1) + left
     last = first + wp.min(TILE_WIDTH, grid.width - left)
     for word in range(first // share, last // share + 1):
         begin, end = wp.max(first - word * share, 0), wp.min(last - word * share + 1, share)
         bits = (wp.uint32(0xFFFFFFFF) >> wp.uint32(32 - width * (end - begin))) << wp.uint32(width * begin)
-        if (kept_inout.word[history, word] & bits) != bits:
-            wp.atomic_or(kept_inout.word, history, word, bits)
+        if (kept_inout.word[row, word] & bits) != bits:
+            wp.atomic_or(kept_inout.word, row, word, bits)

@@ -69,24 +69,24 @@ def touch_bodies(moving: MovingBodies, view: int, word: int, members: wp.uint64)
 
 @wp.kernel
 def mark_damaged_tiles_kernel(bodies: ViewBodies, moving_inout: MovingBodies, flags_inout: TileFlags):
-    """Mark the tiles whose bodies changed since the previous frame, and the bodies in them; all if the history does not contain that frame.
+    """Mark the tiles whose bodies changed since the previous frame, and the bodies in them; all if that frame is not kept.
 
-    Writes `dirty`, `bodies` and, where the history contains that frame, `touched`. Launched over view, tile.
+    Writes `dirty`, `bodies` and, where that frame is kept, `touched`. Launched over view, tile.
     """
     view, tile = wp.tid()
-    history = flags_inout.history_row[view]
-    dirty = moving_inout.holds[view] == 0
+    kept = flags_inout.kept_row[view]
+    dirty = flags_inout.holds[view] == 0
     for word in range(flags_inout.bodies.shape[2]):
         members = tile_word(bodies, view, tile, word)
-        if members != flags_inout.bodies[history, tile, word]:
+        if members != flags_inout.bodies[kept, tile, word]:
             dirty = True
-            flags_inout.bodies[history, tile, word] = members
+            flags_inout.bodies[kept, tile, word] = members
         elif not dirty:
             dirty = any_moved(moving_inout, view, word, members)
     flags_inout.dirty[view, tile] = wp.uint8(wp.where(dirty, DAMAGED, 0))
-    if dirty and moving_inout.holds[view] != 0:
+    if dirty and flags_inout.holds[view] != 0:
         for word in range(flags_inout.bodies.shape[2]):
-            touch_bodies(moving_inout, view, word, flags_inout.bodies[history, tile, word])
+            touch_bodies(moving_inout, view, word, flags_inout.bodies[kept, tile, word])
 
 
 @kernel_of_views

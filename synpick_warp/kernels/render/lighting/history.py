@@ -66,22 +66,26 @@ class LightHistory:
     """Cameras of a world."""
     max_paths: int
     """Maximum history length [paths]; 0: no history is kept."""
+    kept: int
+    """Worlds times cameras, from the first on, of which tiles are kept from frame to frame."""
 
 
 @kernel_of_views
 def advance_history_kernel(snapshot: Frames, views: AnyViews, history_inout: LightHistory, moving_out: MovingBodies, flags_out: TileFlags):
-    """Write `holds` (the history contains the previous frame of the same episode), and set episode and frame of the history to this
-    frame's, and `history_row`.
+    """Write `holds` (the history contains the previous frame of the same episode), set episode and frame of the history to this frame's,
+    and choose the rows of `flags_out`: a view of which nothing is kept gets one behind the kept ones, as scratch.
 
     Launched over view.
     """
     view = wp.tid()
     world = views.world[view]
     slot = world * history_inout.cameras + views.slot[view]
+    is_kept = slot < history_inout.kept
     flags_out.history_row[view] = slot
-    moving_out.holds[view] = int(
-        history_inout.episode[slot] == snapshot.episode[world] and history_inout.frame[slot] + 1 == snapshot.frame[world]
-    )
+    flags_out.kept_row[view] = wp.where(is_kept, slot, history_inout.kept + view)
+    holds = history_inout.episode[slot] == snapshot.episode[world] and history_inout.frame[slot] + 1 == snapshot.frame[world]
+    moving_out.holds[view] = int(holds)
+    flags_out.holds[view] = int(holds and is_kept)
     history_inout.episode[slot] = snapshot.episode[world]
     history_inout.frame[slot] = snapshot.frame[world]
 

@@ -20,6 +20,10 @@ class TileFlags:
 
     history_row: wp.array[int]
     """(view): row of the light history; the view itself without histories."""
+    kept_row: wp.array[int]
+    """(view): row of everything else that is kept from frame to frame."""
+    holds: wp.array[int]
+    """(view): 1: what is kept there is the previous frame of the same episode; 0: all tiles are dirty."""
     stages: wp.array2d[wp.uint8]
     """(view, cell_tile): stages of the denoiser that the tile needs, bits as RATIO_STAGE."""
     due: wp.array2d[wp.uint8]
@@ -29,7 +33,7 @@ class TileFlags:
     dirty: wp.array2d[wp.uint8]
     """(view, tile): why pixels of the tile may differ from the previous frame: DAMAGED or RELIT; 0: all are equal."""
     bodies: wp.array3d[wp.uint64]
-    """(world_camera, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
+    """(kept, tile, word): bit k of word w: rays through the tile could hit body 64 w + k in the previous frame."""
 
 
 @wp.func

@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 class Damage:
     """Damage of the views of a batch since the previous frame, and the rows at which that frame is kept."""
 
-    history_row: wp.array[int]
+    kept_row: wp.array[int]
     """(view): row of everything that is kept from frame to frame; the view itself if nothing is."""
     holds: wp.array[int]
     """(view): 1: what is kept is the previous frame of the same episode; 0: all is damaged, and the other arrays are not read."""

@@ -144,7 +144,7 @@ def is_kept(damage: Damage, kept: KeptMasks, view: int, body: int) -> bool:
     """Whether a body is at rest and the masks of the previous frame are kept: its mask has the same box and the same words."""
     if has_moved(damage, view, body):
         return False
-    length = kept.length[damage.history_row[view]]
+    length = kept.length[damage.kept_row[view]]
     return length > 0 and length <= kept.words.shape[1]
 
 
@@ -159,7 +159,7 @@ def restore_masks_kernel(damage: Damage, kept: KeptMasks, threads: int, masks_in
     for i in range(thread, count_words(mask), threads):
         word = wp.uint32(0)
         if rests:
-            row = damage.history_row[view]
+            row = damage.kept_row[view]
             word = kept.words[row, kept.first[row, instance] + i]
         masks_inout.words[view, mask.first + i] = word
 
@@ -168,7 +168,7 @@ def restore_masks_kernel(damage: Damage, kept: KeptMasks, threads: int, masks_in
 def keep_masks_kernel(damage: Damage, masks: InstanceMasks, threads: int, kept_inout: KeptMasks):
     """Store the masks of this frame for the next one. Launched over view, thread: `threads` threads stride over a view's words."""
     view, thread = wp.tid()
-    row, length = damage.history_row[view], masks.length[view]
+    row, length = damage.kept_row[view], masks.length[view]
     kept_inout.length[row] = wp.where(length <= masks.words.shape[1], length, 0)
     for instance in range(thread, masks.first.shape[1], threads):
         kept_inout.first[row, instance] = masks.first[view, instance]

@@ -64,7 +64,7 @@ class VisibilityBuffer:
 
     nearest: wp.array3d[wp.uint64]
     """(kept, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle; `kept` is the view's
-    `Damage.history_row`."""
+    `Damage.kept_row`."""
     block: wp.array2d[wp.vec4i]
     """(view, block): rank of the body in `ViewBodies.order`, triangle, first row, first column."""
     blocks: wp.array[int]
@@ -161,7 +161,7 @@ def clear_visibility_kernel(grid: ImageGrid, damage: Damage, views: AnyViews, fi
         return
     if is_damaged(damage, grid, view, row, column):
         for right in range(column, wp.min(column + TILE_WIDTH, grid.width)):
-            visibility_out.nearest[damage.history_row[view], row, right] = EMPTY
+            visibility_out.nearest[damage.kept_row[view], row, right] = EMPTY
     if row == 0 and column == 0:
         visibility_out.blocks[view] = 0
 
@@ -190,7 +190,7 @@ def rasterize_triangles_kernel(
     view = index // (threads * slots)
     if rank >= bodies.present[view]:
         return
-    body, kept = bodies.order[view, rank], damage.history_row[view]
+    body, kept = bodies.order[view, rank], damage.kept_row[view]
     if body == views.instances and bodies.uses_background[view] != 0:
         return
     rests = is_kept(damage, kept_masks, view, body)
@@ -240,7 +240,7 @@ def rasterize_blocks_kernel(
     camera = views.camera[view]
     if camera < 0:
         return
-    intrinsics, kept = views.cameras.intrinsics[view], damage.history_row[view]
+    intrinsics, kept = views.cameras.intrinsics[view], damage.kept_row[view]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
@@ -306,7 +306,7 @@ def resolve_visibility_kernel(
     hit = Hit()
     hit.segment = Segment.NOTHING
     hit.depth = FAR
-    key = visibility.nearest[damage.history_row[view], row, column]
+    key = visibility.nearest[damage.kept_row[view], row, column]
     if key != EMPTY:
         hit = resolve_hit(meshes, bodies, view, views.instances, key, ray)
     if bodies.uses_background[view] != 0:
