@@ -366,7 +366,8 @@ def newton_rows(
 
 
 HEADROOM = 1.5
-"""Safety factor on the memory plan, which is a lower bound. Bakes on a CPU take 0.6 to 0.7 GiB beyond it."""
+"""Safety factor on the memory plan, which is a lower bound, but on kept pictures, whose arrays are all of it. Bakes on a CPU take 0.6 to
+0.7 GiB beyond it."""
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20
@@ -392,7 +393,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     config = with_enough_worlds(config, device, episodes)
     while terms := (short := _short_memory(split_memories(plan_memory(config, device, writers), device, processes)))[0]:
         if kept := sum(term.size for term in terms if term.name == KEPT_PICTURES):
-            config = _keep_less(config, kept, int((_planned(terms) - short[1]) / HEADROOM), device)
+            config = _keep_less(config, kept, with_headroom(terms) - short[1], device)
             continue
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
@@ -432,7 +433,7 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
         least = config.with_values({key: 1 for key in _OPEN_SIZES if not config.value(key)})
-        room = free_memory(None) // _planned(plan_memory(without_pictures(least), pick_device("cpu")))
+        room = free_memory(None) // with_headroom(plan_memory(without_pictures(least), pick_device("cpu")))
         picked *= max(1, min(count_cores(), room))
     return picked[: max(1, episodes)]
 
@@ -450,7 +451,7 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
 
 def _short_memory(memories: Iterable[tuple[list[Term], int]]) -> tuple[Sequence[Term], int]:
     """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`, and its size; no terms: all fit."""
-    return next(((terms, free) for terms, free in memories if _planned(terms) > free), ((), 0))
+    return next(((terms, free) for terms, free in memories if with_headroom(terms) > free), ((), 0))
 
 
 def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Config:
@@ -464,9 +465,10 @@ def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Con
     return config.with_values({"render.reuse_worlds": left} if left > 0 else {"render.reuse": False})
 
 
-def _planned(terms: Sequence[Term]) -> int:
+def with_headroom(terms: Sequence[Term]) -> int:
     """Memory that terms of a plan take with HEADROOM [bytes]."""
-    return int(HEADROOM * sum(term.size for term in terms)) + RUNTIME_BYTES
+    factors = (1.0 if term.name == KEPT_PICTURES else HEADROOM for term in terms)
+    return sum(int(factor * term.size) for factor, term in zip(factors, terms, strict=True)) + RUNTIME_BYTES
 
 
 def _least(key: str, device: wp.Device) -> int:

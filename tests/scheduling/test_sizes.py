@@ -29,6 +29,7 @@ from synpick_warp.factory.forecast import (
 )
 from synpick_warp.factory.memory_plan import (
     HEADROOM,
+    KEPT_PICTURES,
     RUNTIME_BYTES,
     advise_processes,
     check_memory,
@@ -64,6 +65,11 @@ GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 
 def views_per_batch(config: Config, device: Any) -> int:
     return view_ring.views_per_batch(config.render, config.rig, config.bake.worlds, config.arrangement.max_objects, device)
+
+
+def needed_bytes(config: Config, device: Any) -> float:
+    terms = [term for term in plan_memory(config, device) if term.on_device == device.is_cuda]
+    return sum((1.0 if term.name == KEPT_PICTURES else HEADROOM) * term.size for term in terms) + RUNTIME_BYTES
 
 
 @pytest.fixture
@@ -104,8 +110,7 @@ def test_worlds_follow_from_the_number_of_episodes(give, machine, episodes, worl
 def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     give(gpu)
     config = fit_to_device(load_config("synpick", {"bake.mode": mode}), GPU, 1024)
-    planned = sum(term.size for term in plan_memory(config, GPU) if term.on_device)
-    assert HEADROOM * planned + RUNTIME_BYTES <= gpu * GIB
+    assert needed_bytes(config, GPU) <= gpu * GIB
     # The larger part shrinks first: batches, or worlds where the light averaged over their frames is larger.
     assert config.bake.worlds >= min(512, 7.5 * gpu)
     if gpu >= 12.0:
@@ -125,28 +130,24 @@ def test_trajectories_alone_need_no_image_buffers(give):
 
 
 def test_settings_that_are_named_stay(give):
-    """But no pictures are kept over frames."""
-    give(2.0)
-    named = {"bake.worlds": 512, "render.views_per_batch": 25, "perception.views": 23, "bake.mode": "mixed"}
-    config = load_config("synpick", named)
+    give(2.0)  # No pictures are kept over frames.
+    config = load_config("synpick", {"bake.worlds": 512, "render.views_per_batch": 25, "perception.views": 23, "bake.mode": "mixed"})
     assert fit_to_device(config, GPU, 512) == config.with_values({"render.reuse": False})
 
 
-@pytest.mark.parametrize(("gpu", "least"), [(40.0, 50), (48.0, 150), (80.0, 400)])
+@pytest.mark.parametrize(("gpu", "least"), [(32.0, 20), (40.0, 150), (60.0, 400)])
 def test_pictures_of_as_many_worlds_are_kept_as_fit(give, gpu, least):
     give(gpu)
     fitted = fit_to_device(load_config("synpick", {"bake.worlds": 512, "render.views_per_batch": 24}), GPU, 1024)
-    worlds = fitted.render.reuse_worlds
-    assert worlds > least
-    for count, fits in ((worlds, True), (worlds + 12, False)):
-        sizes = [term.size for term in plan_memory(fitted.with_values({"render.reuse_worlds": count}), GPU) if term.on_device]
-        assert (HEADROOM * sum(sizes) + RUNTIME_BYTES <= gpu * GIB) == fits
+    assert fitted.render.reuse_worlds > least
+    for more, fits in ((0, True), (12, False)):
+        larger = fitted.with_values({"render.reuse_worlds": fitted.render.reuse_worlds + more})
+        assert (needed_bytes(larger, GPU) <= gpu * GIB) == fits
 
 
 @pytest.mark.parametrize(("key", "value", "part"), [("reuse", False, "pictures from"), ("reuse_worlds", 3, "than 3 of 8 worlds")])
 def test_a_bake_says_that_it_does_not_keep_pictures(monkeypatch, key, value, part):
-    notes: list[str] = []
-    progress = SilentProgress()
+    notes, progress = [], SilentProgress()
     monkeypatch.setattr(progress, "note", notes.append)
     monkeypatch.setattr(assembly, "fit_to_device", lambda config, *_: config.with_values({f"render.{key}": value}))
     monkeypatch.setattr(assembly, "compiling_if_cold", Mock(side_effect=InterruptedError))
@@ -182,7 +183,7 @@ def test_without_a_gpu_all_is_a_process_per_core_within_memory_and_episodes(give
     assert 2 <= len(few) < 12
     # The smallest sizes fit as often as was chosen, and not once more.
     least = load_config("synpick", {"bake.mode": "mixed", "bake.worlds": 1, "render.views_per_batch": 1, "perception.views": 1})
-    needed = HEADROOM * sum(term.size for term in plan_memory(least, CPU)) + RUNTIME_BYTES
+    needed = needed_bytes(least, CPU)
     assert len(few) * needed <= 12 * GIB < (len(few) + 1) * needed
     assert fit_to_device(config, CPU, 1000, processes=len(few)).bake.worlds >= 1
     give(host=0.5)
@@ -196,9 +197,8 @@ def test_named_processes_stay(give, cores):
 
 def test_a_bake_on_one_of_several_cores_is_told_of_the_others(give, cores, monkeypatch):
     config = load_config("synpick", {})
-    assert (
-        advise_processes(config, ["cpu"], 3) == "one process simulates on one CPU core; --devices all starts 3, which write the same bytes"
-    )
+    advice = "one process simulates on one CPU core; --devices all starts 3, which write the same bytes"
+    assert advise_processes(config, ["cpu"], 3) == advice
     assert advise_processes(config, ["cpu"], 1) == ""
     assert advise_processes(config, ["cpu", "cpu"], 3) == ""
     monkeypatch.setattr(memory_plan, "pick_devices", lambda names: ("cuda:0",))
