@@ -41,11 +41,20 @@ STRIP_SETTINGS = COMMON | {
 }
 PICK_SETTINGS = COMMON | {
     "bake.mode": "pick",
-    "arrangement.volume": 3e-3,
+    "bake.worlds": 2,
+    "bake.episodes": 2,
+    "arrangement.counts": {"bracket": 40},
     "pick.failures": 1,
+    "gripper.kind": "suction_array",
+    "gripper.cups": [[0.0, -0.013], [0.0, 0.013]],
+    "gripper.cup_width": 0.018,
+    "gripper.finger_width": 0.05,
+    "suction.radius": 0.007,
     # The first camera is the one that perception uses; the second is drawn.
-    "cameras.resolution": [480, 270],
-    "cameras.positions": [[0.0, 0.0, 2.0], [0.9, -1.1, 1.3]],
+    "cameras.resolution": [800, 450],
+    "cameras.fov": 34.0,
+    "cameras.target": [0.0, 0.0, 0.19],
+    "cameras.positions": [[0.0, 0.0, 1.6], [0.42, -0.57, 1.06]],
     "cameras.ups": [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
 }
 TABLE_COLUMNS = 4
@@ -56,7 +65,7 @@ USED_SETTINGS = {"bake.mode": "still", "still.views": 0, "bake.worlds": 8, "bake
 USED_SETTINGS |= {"cameras.resolution": [480, 270], "cameras.positions": [[0.0, -0.8, 1.8]], "cameras.ups": [[0.0, 0.0, 1.0]]}
 BAKES = (
     ("strip", "bracket-bin", STRIP_SETTINGS),
-    ("pick", "smoke", PICK_SETTINGS),
+    ("pick", "bracket-bin", PICK_SETTINGS),
     ("tables", "tabletop-train", TABLE_SETTINGS),
     ("used", "bracket-bin", USED_SETTINGS),
 )
@@ -66,8 +75,8 @@ PANEL = (480, 270)
 CAPTION_SCALE = 0.5
 CELL_WIDTH, STEPS = 1000, 3
 """Width of the picture of the cell [px], and number of code blocks of the page that make it: its files, a mesh, the rendered cell."""
-GIF_WIDTH, GIF_COLORS, GIF_STRIDE, FRAME_RATE = 400, 96, 2, 15
-"""Width [px], palette size, episode frames per GIF frame, and frame rate of episodes [Hz]: the GIF has 7.5 Hz, in real time."""
+GIF_WIDTH, GIF_COLORS, GIF_STRIDE, FRAME_RATE = 400, 128, 1, 15
+"""Width [px], palette size, episode frames per GIF frame, and frame rate of episodes [Hz]: the GIF is in real time."""
 LEAD_OUT = 6
 """Frames after the end of the attempt."""
 
@@ -87,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
                 synpick_warp.bake(preset, Path(folder) / name, settings | device)
             baked = {name: list(synpick_warp.open(Path(folder) / name).values()) for name, _, _ in BAKES}
             print(write_picture(options.out / STRIP, draw_strip(*baked["strip"])))
-            print(write_animation(options.out / PICK, draw_pick(*baked["pick"])))
+            print(write_animation(options.out / PICK, draw_pick(baked["pick"][-1])))
             print(write_picture(options.out / TABLES, draw_training_views(baked["tables"])))
             print(write_picture(options.out / USED, draw_training_views(baked["used"])))
             print(write_picture(options.out / CELL, draw_cell(Path(folder))))
