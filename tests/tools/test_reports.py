@@ -6,6 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.schema import Config
@@ -16,6 +17,7 @@ from tools.bench import peers, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.reports.real.frames import read_frames
+from tools.reports.real.twins import compare_objects, render_twin
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))
@@ -100,3 +102,16 @@ def test_bad_folders_are_one_line(frames, tmp_path):
     assert "has no frames" in refusal(read_frames, tmp_path)
     (frames / "0003_000007-depth.png").unlink()
     assert "0003_000007-depth.png" in refusal(read_frames, frames)
+
+
+def test_a_twin_differs_in_its_objects_alone(frames, tmp_path):
+    """A box of 66 x 66 x 50 mm, whose front is 27.8 px wide: it covers the pixels that the photograph labels."""
+    trimesh.creation.box((66.0, 66.0, 50.0)).export(tmp_path / "obj_000021.ply")
+    (frame,) = read_frames(frames)
+    twin = render_twin(frame, tmp_path, "cpu", {"bake.lights": "", "render.coarse_paths": 1})
+    np.testing.assert_array_equal(twin.label, frame.label)
+    np.testing.assert_array_equal(twin.color[frame.label == 0], frame.color[frame.label == 0])
+    rows = {row.name.removeprefix("obj_id 21: "): row.value for row in compare_objects([frame], [twin])}
+    assert (rows["masks: IoU"], rows["contrast, photograph"]) == (1.0, 0.0)
+    assert rows["brightness, photograph"] == pytest.approx(20 / 255, abs=1e-3) != rows["brightness, twin"]
+    assert rows["saturation, photograph"] == pytest.approx(2 / 3, abs=1e-3)

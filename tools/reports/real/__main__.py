@@ -39,6 +39,7 @@ from synpick_warp.system.hardware.device import pick_device
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, configure, existing_folder, fail, make_parser, number_in, positive_count, print_rows
 from tools.reports.real.frames import RealFrame, read_frames
+from tools.reports.real.twins import render_twins
 
 TRAINING, HELD_OUT = range(1_000_000), range(1_000_000, 1_100_000)
 """Episodes to train on, and to measure on."""
@@ -167,6 +168,8 @@ class TrainingOutcome:
 
     trained: Trained
     real: NetworkScores
+    twins: NetworkScores
+    """Scores on the photographs with rendered objects: what they lack of `real` is due to the objects' appearance."""
     synthetic: NetworkScores
     overlay: list[Labelled]
     """The photographs with their labels."""
@@ -201,12 +204,15 @@ def stream_views(config: Config, episodes: range, views: int) -> Batches:
             return
 
 
-def measure(trained: Trained, frames: list[RealFrame], held: ViewPool, device: torch.device) -> TrainingOutcome:
-    """Scores of a network on real frames, which it sees at the size of the held-out views, and on these."""
+def measure(trained: Trained, frames: list[RealFrame], twins: list[RealFrame], held: ViewPool, device: torch.device) -> TrainingOutcome:
+    """Scores of a network on real frames and their twins, which it sees at the size of the held-out views, and on these."""
     height, width = held.tensors()[0].shape[2:]
-    overlay = [(frame.color, frame.label, predict(trained.network, frame.color, (int(width), int(height)), device)) for frame in frames]
-    real = score([(found, truth) for _, truth, found in overlay], 1 + MODELS)
-    return TrainingOutcome(trained, real, score_pool(trained.network, held, 1 + MODELS), overlay)
+    overlays = [
+        [(frame.color, frame.label, predict(trained.network, frame.color, (int(width), int(height)), device)) for frame in part]
+        for part in (frames, twins)
+    ]
+    real, paired = (score([(found, truth) for _, truth, found in overlay], 1 + MODELS) for overlay in overlays)
+    return TrainingOutcome(trained, real, paired, score_pool(trained.network, held, 1 + MODELS), overlays[0])
 
 
 def interval(values: Sequence[float]) -> str:
@@ -224,7 +230,8 @@ def rows_of(outcomes: list[TrainingOutcome]) -> list[MeasuredRow]:
         return MeasuredRow(name, round(float(np.mean(values)), 4), " ".join(one for one in (unit, interval(values)) if one), part=part)
 
     rows = []
-    for where, scores in (("real frames", [one.real for one in outcomes]), ("synthetic, held out", [one.synthetic for one in outcomes])):
+    for where, kind in (("real frames", "real"), ("twins of these", "twins"), ("synthetic, held out", "synthetic")):
+        scores = [getattr(one, kind) for one in outcomes]
         rows += [
             row(f"{where}: mIoU", [one.mean_iou for one in scores]),
             row(f"{where}: instances with IoU above 0.5", [100 * one.found for one in scores], "%"),
@@ -261,10 +268,11 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
     held.fill(stream_views(few, HELD_OUT, HELD_OUT_VIEWS), HELD_OUT_VIEWS)
     check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])
     recipe = Recipe(**{name: value for name, value in vars(options).items() if name in Recipe.__dataclass_fields__})
+    twins = render_twins(frames, options)
     target, outcomes, rows = torch.device(device.alias), list[TrainingOutcome](), list[MeasuredRow]()
     for seed in range(options.seeds):
         views = stream_views(settings_of(options, seed, device), TRAINING, recipe.views)
-        outcomes.append(measure(train(views, recipe, 1 + MODELS, target, seed), frames, held, target))
+        outcomes.append(measure(train(views, recipe, 1 + MODELS, target, seed), frames, twins, held, target))
         rows, losses = rows_of(outcomes), [one.trained.losses for one in outcomes]
         write_run(options.json, describe_run("tools.reports.real", (), rows, losses=losses))
         print(f"seed {seed}:", *(f"{row.name} {row.value:.4g} {row.unit};" for row in rows_of(outcomes[-1:]) if not row.part), flush=True)
