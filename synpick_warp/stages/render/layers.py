@@ -2,6 +2,7 @@
 
 import math
 import pkgutil
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -10,12 +11,13 @@ from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images import layers
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
-from synpick_warp.kernels.render.images.depth_sensor import render_depth_sensor_kernel
+from synpick_warp.kernels.render.images.depth_sensor import find_nearest_kernel, render_depth_sensor_kernel
 from synpick_warp.kernels.render.images.suction_map import render_suction_seal_kernel, render_suction_wrench_kernel
-from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS
+from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.variants import kernel_for
 from synpick_warp.scenes.types import FIRST_DISTRACTOR
-from synpick_warp.stages.arrays import allocate_struct, struct_arrays
+from synpick_warp.stages.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
@@ -26,6 +28,7 @@ MAX_CLASS = 65535
 """Largest obj_id that fits into the layer `classes`."""
 MOTION_LAYERS = {"flow", "scene_flow"}
 """Layers computed from the motions of bodies."""
+SENSOR = "depth_sensor"
 KERNELS = {
     "normals": layers.render_normals_kernel,
     "albedo": layers.render_albedo_kernel,
@@ -33,12 +36,18 @@ KERNELS = {
     "classes": layers.render_classes_kernel,
     "flow": layers.render_flow_kernel,
     "scene_flow": layers.render_scene_flow_kernel,
-    "depth_sensor": render_depth_sensor_kernel,
     "suction_seal": render_suction_seal_kernel,
     "suction_wrench": render_suction_wrench_kernel,
 }
-"""Kernel of each layer of ours but those of `STEREO_LAYERS`."""
+"""Kernel of each layer of ours but SENSOR and those of `STEREO_LAYERS`."""
 BODY_MOTIONS = struct_arrays(layers.BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
+
+
+@dataclass(frozen=True, eq=False)
+class SensorScratch:
+    """Least depths for the search of shadows."""
+
+    nearest: wp.array = device_array("view", "tile_row", dtype=wp.float32, unit="m")
 
 
 def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> Any:
@@ -83,6 +92,8 @@ class LayerRenderer:
         self.motions = None
         if MOTION_LAYERS.intersection(names):
             self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES) + 1}, scene.device)
+        sizes = {"view": views, "tile_row": -(-scene.height // int(TILE_HEIGHT))}
+        self.scratch = allocate(SensorScratch, sizes, scene.device, {"nearest"} if SENSOR in names else set())
         self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
 
     def render(self, snapshot: Snapshot, shot: Any, out: LayerBuffers, last: Any) -> None:
@@ -98,9 +109,20 @@ class LayerRenderer:
                 kernel_for(layers.compute_motions_kernel, views), dim=dim, inputs=inputs, outputs=[layer.motions], device=scene.device
             )
         for name in self.names:
-            if name not in STEREO_LAYERS:
+            if name == SENSOR:
+                self.measure_depth(layer, shot, out.depth_sensor)
+            elif name not in STEREO_LAYERS:
                 pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
                 kernel = KERNELS.get(name) or pkgutil.resolve_name(LAYER_TABLE[name].kernel)
                 launch_pixels(kernel, pixels, [scene.paths, layer, shot], [getattr(out, name)], scene.device)
         if self.stereo is not None:
             self.stereo.render(shot, out)
+
+    def measure_depth(self, layer: Any, shot: Any, image: wp.array) -> None:
+        """Simulate the depth sensor; arguments as of `render`, and the struct `LayerScene`."""
+        scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
+        layer.nearest = self.scratch.nearest
+        layer.nearest.fill_(FAR)
+        dim, inputs = (shot.views.count, scene.grid.tiles), [scene.grid, shot.gbuffer]
+        wp.launch(find_nearest_kernel, dim=dim, inputs=inputs, outputs=[layer.nearest], device=scene.device)
+        launch_pixels(render_depth_sensor_kernel, pixels, [scene.paths, layer, shot], [image], scene.device)

@@ -227,6 +227,17 @@ def test_a_narrow_body_casts_its_shadow_beside_it(device):
     assert np.abs(holes - 59.5).max() <= 2.0
 
 
+def test_a_body_around_the_camera_and_out_of_its_sight_changes_nothing(device):
+    """Shadows are searched for, and triangles drawn, as if it were not there."""
+    toy, around = step_scene(), box(1.8, 1.8, 2.0)
+    sides = replace(around, faces=around.faces[np.abs(around.normals[around.faces[:, 0], 2]) < 0.5])
+    alone = measure(toy, device)
+    toy.entries, toy.placed = [*toy.entries, entry(sides)], [[*toy.placed[0], (2, (0.0, 0.0, TOP, *UPRIGHT))]]
+    beside = measure(toy, device)
+    np.testing.assert_array_equal(beside.counts, alone.counts)
+    np.testing.assert_array_equal(beside.exact, alone.exact)
+
+
 def test_background_and_depth_out_of_range_are_invalid(device):
     measured = measure(one(box(0.1, 0.1, 0.1), (0.0, 0.0, TOP - 1.0, *UPRIGHT), VIEW), device, **PERFECT)
     np.testing.assert_array_equal(measured.counts > 0, measured.clean > 0)

@@ -6,18 +6,14 @@ from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters, shot_key
 from synpick_warp.kernels.render.images.layers import LayerScene, hit_surface, kernel_of_layer
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray
-from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, AnyShot, GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, ImageGrid, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, MAX_COUNTS, AnyShot, GBuffer
 from synpick_warp.kernels.rng import normal_pair, pixel_key
 
 wp.set_module_options({"enable_backward": False})
 
 SAME_RAY = wp.constant(0.5)
 """Projector columns that differ by at most this [px] count as the same projector ray."""
-FAR_DEPTH = wp.constant(1.0e9)
-"""Depth of the nearest body in a view without bodies [m]."""
-MIN_DEPTH = wp.constant(1.0e-3)
-"""Smallest depth of a body that is used for a search range [m]: bodies may reach behind the camera."""
 
 
 @wp.func
@@ -44,25 +40,34 @@ def near_discontinuity(shot: AnyShot, sensor: SensorParameters, focal_baseline: 
     return False
 
 
-@wp.func
-def min_body_depth(bodies: ViewBodies, view: int) -> float:
-    """Lower bound of the planar depth of all bodies of the view [m]."""
-    nearest = float(FAR_DEPTH)
-    for body in range(bodies.mesh.shape[1]):
-        if bodies.mesh[view, body] >= 0:
-            nearest = wp.min(nearest, bodies.near[view, body])
-    return nearest
+@wp.kernel
+def find_nearest_kernel(
+    # In:
+    grid: ImageGrid,
+    gbuffer: GBuffer,
+    # Out:
+    nearest_inout: wp.array2d[float],  # (view, row of tiles) [m]
+):
+    """Lower `nearest_inout` to the least depth in each row of tiles. Launched over view, tile."""
+    view, tile = wp.tid()
+    nearest = float(FAR)
+    for index in range(TILE_PIXELS):
+        _, row, column = tile_pixel(grid, tile * TILE_PIXELS + index)
+        if in_image(grid, row, column):
+            if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
+                nearest = wp.min(nearest, gbuffer.depth[view, row, column])
+    wp.atomic_min(nearest_inout, view, tile // grid.tile_columns, nearest)
 
 
 @wp.func
-def is_occluded(shot: AnyShot, focal_baseline: float, side: int, view: int, row: int, column: int) -> bool:
+def is_occluded(shot: AnyShot, nearest: wp.array2d[float], focal_baseline: float, side: int, view: int, row: int, column: int) -> bool:
     """Shadow test against a second viewpoint at the camera's right (`side` 1) or left (-1): True if a surface in the same row occludes it.
 
     The column of a pixel in the second view is its own column minus `side` times its disparity. A pixel k columns to that side whose
-    disparity is larger by k lies on the same ray and is nearer. The largest disparity of any body bounds the search.
+    disparity is larger by k lies on the same ray and is nearer. The largest disparity in the row of tiles bounds the search.
     """
     here = disparity_at(shot.gbuffer, focal_baseline, view, row, column)
-    max_difference = focal_baseline / wp.max(min_body_depth(shot.bodies, view), MIN_DEPTH) - here
+    max_difference = focal_baseline / nearest[view, row // TILE_HEIGHT] - here
     space = shot.grid.width - 1 - column
     if side < 0:
         space = column
@@ -75,15 +80,15 @@ def is_occluded(shot: AnyShot, focal_baseline: float, side: int, view: int, row:
 
 
 @wp.func
-def in_shadow(shot: AnyShot, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int) -> bool:
+def in_shadow(layer: LayerScene, shot: AnyShot, focal_baseline: float, view: int, row: int, column: int) -> bool:
     """True if the projector, at the right of the depth image's camera, or the infrared camera, at its left, does not see a pixel's
     surface."""
-    to_projector = focal_baseline * (1.0 - sensor.registration)
-    if is_occluded(shot, to_projector, 1, view, row, column):
+    registration = layer.sensor.registration
+    if is_occluded(shot, layer.nearest, focal_baseline * (1.0 - registration), 1, view, row, column):
         return True
-    if sensor.registration == 0.0:
+    if registration == 0.0:
         return False
-    return is_occluded(shot, focal_baseline * sensor.registration, -1, view, row, column)
+    return is_occluded(shot, layer.nearest, focal_baseline * registration, -1, view, row, column)
 
 
 @wp.func
@@ -110,6 +115,15 @@ def lattice_normals(key: wp.uint64, grid: ImageGrid, width: int, row: int, colum
         total += weight * normal_pair(pixel_key(key, (top + lower) * (grid.width + 1) + left + right), index)
         squares += weight * weight
     return total / wp.sqrt(squares)
+
+
+@wp.func
+def measured_pixel(sensor: SensorParameters, grid: ImageGrid, key: wp.uint64, row: int, column: int) -> tuple[int, int]:
+    """Row and column that a pixel shows by lateral noise; `key` is that of the view."""
+    displacement = sensor.lateral_noise * lattice_normals(key, grid, sensor.noise_width, row, column, 0)
+    at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
+    at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
+    return at_row, at_column
 
 
 @wp.func
@@ -148,9 +162,7 @@ def sensor_depth_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int
     """
     sensor, grid, cameras = layer.sensor, shot.grid, shot.views.cameras
     key = shot_key(sensor.seed, shot, view, Stream.DEPTH_NOISE)
-    displacement = sensor.lateral_noise * lattice_normals(key, grid, sensor.noise_width, row, column, 0)
-    at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
-    at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
+    at_row, at_column = measured_pixel(sensor, grid, key, row, column)
     if int(shot.gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
         return wp.uint16(0)
     focal_baseline = cameras.intrinsics[view][0] * sensor.baseline
@@ -163,7 +175,7 @@ def sensor_depth_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int
     if near_discontinuity(shot, sensor, focal_baseline, view, at_row, at_column):
         return wp.uint16(0)
     if sensor.shadows != 0:
-        if in_shadow(shot, sensor, focal_baseline, view, at_row, at_column):
+        if in_shadow(layer, shot, focal_baseline, view, at_row, at_column):
             return wp.uint16(0)
     noise = lattice_normals(key, grid, sensor.noise_width, row, column, 2)
     noisy = depth + axial_noise(sensor, depth, cosine) * noise[0]

@@ -130,6 +130,8 @@ class LayerScene:
     """(entry): obj_id of the catalog's objects; negative: without label."""
     suction: SuctionScene
     sensor: SensorParameters
+    nearest: wp.array2d[float]
+    """(view, row of tiles): least depth [m]; for the layer depth_sensor."""
     motions: BodyMotions
     follows: wp.array[int]
     """(world): as in `Snapshots`."""

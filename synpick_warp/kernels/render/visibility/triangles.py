@@ -111,6 +111,21 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 
 @wp.func
+def is_out_of_sight(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle, depth: wp.vec3) -> bool:
+    """Frustum culling: True if the corners of a triangle, at these depths, are all behind the camera, or all on the far side of one of the
+    planes through the camera and a side of the image, `MARGIN` px wider."""
+    if wp.max(depth) <= 0.0:
+        return True
+    if lens_of(cameras, view) >= 0:
+        return False
+    x = intrinsics[0] * wp.vec3(triangle.a[0], triangle.b[0], triangle.c[0]) + intrinsics[2] * depth
+    y = intrinsics[1] * wp.vec3(triangle.a[1], triangle.b[1], triangle.c[1]) + intrinsics[3] * depth
+    right, bottom = x - (float(grid.width) + MARGIN) * depth, y - (float(grid.height) + MARGIN) * depth
+    beside = wp.max(x + MARGIN * depth) < 0.0 or wp.min(right) > 0.0
+    return beside or wp.max(y + MARGIN * depth) < 0.0 or wp.min(bottom) > 0.0
+
+
+@wp.func
 def find_footprint(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle) -> Footprint:
     """Project a triangle and compute its conservative footprint, clipped to the image.
 
@@ -121,6 +136,8 @@ def find_footprint(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, vi
     depth = wp.vec3(triangle.near + triangle.a[2], triangle.near + triangle.b[2], triangle.near + triangle.c[2])
     if wp.min(depth) < NEAR_PLANE:
         # A corner so close has no useful projection.
+        if is_out_of_sight(grid, cameras, intrinsics, view, triangle, depth):
+            found.pixels = wp.vec4i(0, 0, -1, -1)
         return found
     focal = wp.vec2(intrinsics[0], intrinsics[1])
     middle = wp.vec2(intrinsics[2] - PIXEL_CENTER, intrinsics[3] - PIXEL_CENTER)
