@@ -198,6 +198,7 @@ class Stream(enum.IntEnum):
     UPRIGHT = 21
     SCATTER = 22
     DOME = 23
+    CLEAR = 24
 
 
 class Look(enum.IntEnum):

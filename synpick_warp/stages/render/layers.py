@@ -11,6 +11,7 @@ from synpick_warp.configs.cell.cameras import DepthSensor
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images import layers
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters
+from synpick_warp.kernels.render.images.clear_bodies import measure_behind_kernel
 from synpick_warp.kernels.render.images.depth_sensor import find_nearest_kernel, render_depth_sensor_kernel
 from synpick_warp.kernels.render.images.suction_map import render_suction_seal_kernel, render_suction_wrench_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS
@@ -45,16 +46,17 @@ BODY_MOTIONS = struct_arrays(layers.BodyMotions, "view", "body", units={"origin"
 
 @dataclass(frozen=True, eq=False)
 class SensorScratch:
-    """Least depths for the search of shadows."""
+    """Least depths for the search of shadows, and the depth image of the scene behind transparent bodies."""
 
     nearest: wp.array = device_array("view", "tile_row", dtype=wp.float32, unit="m")
+    behind: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
 
 
 def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> Any:
     """The struct `SensorParameters`, for a bake's seed and its depth scale [mm per count]."""
     result = SensorParameters()
     same = ("baseline", "disparity_step", "disparity_noise", "max_disparity", "noise", "noise_growth", "noise_distance", "noise_angle")
-    for name in (*same, "lateral_noise", "noise_width", "registration"):
+    for name in (*same, "lateral_noise", "noise_width", "registration", "clear_reach"):
         setattr(result, name, getattr(settings, name))
     result.seed = seed
     result.near, result.far = settings.distances
@@ -92,13 +94,16 @@ class LayerRenderer:
         self.motions = None
         if MOTION_LAYERS.intersection(names):
             self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES) + 1}, scene.device)
-        sizes = {"view": views, "tile_row": -(-scene.height // int(TILE_HEIGHT))}
-        self.scratch = allocate(SensorScratch, sizes, scene.device, {"nearest"} if SENSOR in names else set())
+        sizes = {"view": views, "tile_row": -(-scene.height // int(TILE_HEIGHT)), "row": scene.height, "column": scene.width}
+        wanted = {"nearest": SENSOR in names, "behind": SENSOR in names and scene.is_transparent and sensor.clear_reach > 0.0}
+        self.scratch = allocate(SensorScratch, sizes, scene.device, {name for name in wanted if wanted[name]})
         self.stereo = StereoRenderer(names, sensor, scene, views) if STEREO_LAYERS.intersection(names) else None
+        self.sees_through = wanted["behind"] or (self.stereo is not None and scene.is_transparent)
 
-    def render(self, snapshot: Snapshot, shot: Any, out: LayerBuffers, last: Any) -> None:
+    def render(self, snapshot: Snapshot, shot: Any, out: LayerBuffers, last: Any, behind: Any = None) -> None:
         """Render the layers of a batch of views. `snapshot`: the worlds. `shot`: the struct `ShotData`. `out`: the arrays of the named
-        layers are written. `last`: the cameras of the views in the frame before, as those of the views; the same if they do not move."""
+        layers are written. `last`: the cameras of the views in the frame before, as those of the views; the same if they do not move.
+        `behind`: the struct `ShotData` of what is behind transparent bodies, where layers see through them."""
         scene, layer, views = self.scene, layer_scene(self.scene), shot.views
         layer.sensor, layer.follows = self.sensor, snapshot.follows
         if self.motions is not None:
@@ -110,19 +115,23 @@ class LayerRenderer:
             )
         for name in self.names:
             if name == SENSOR:
-                self.measure_depth(layer, shot, out.depth_sensor)
+                self.measure_depth(layer, shot, out.depth_sensor, behind)
             elif name not in STEREO_LAYERS:
                 pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
                 kernel = KERNELS.get(name) or pkgutil.resolve_name(LAYER_TABLE[name].kernel)
                 launch_pixels(kernel, pixels, [scene.paths, layer, shot], [getattr(out, name)], scene.device)
         if self.stereo is not None:
-            self.stereo.render(shot, out)
+            self.stereo.render(shot, out, behind)
 
-    def measure_depth(self, layer: Any, shot: Any, image: wp.array) -> None:
+    def measure_depth(self, layer: Any, shot: Any, image: wp.array, behind: Any) -> None:
         """Simulate the depth sensor; arguments as of `render`, and the struct `LayerScene`."""
         scene, pixels = self.scene, shot.views.count * self.scene.grid.tiles * int(TILE_PIXELS)
-        layer.nearest = self.scratch.nearest
-        layer.nearest.fill_(FAR)
-        dim, inputs = (shot.views.count, scene.grid.tiles), [scene.grid, shot.gbuffer]
-        wp.launch(find_nearest_kernel, dim=dim, inputs=inputs, outputs=[layer.nearest], device=scene.device)
-        launch_pixels(render_depth_sensor_kernel, pixels, [scene.paths, layer, shot], [image], scene.device)
+        layer.nearest, further = self.scratch.nearest, self.scratch.behind
+        for seen, measured in ((shot, image),) if further is None else ((shot, image), (behind, further)):
+            layer.nearest.fill_(FAR)
+            dim, inputs = (shot.views.count, scene.grid.tiles), [scene.grid, seen.gbuffer]
+            wp.launch(find_nearest_kernel, dim=dim, inputs=inputs, outputs=[layer.nearest], device=scene.device)
+            launch_pixels(render_depth_sensor_kernel, pixels, [scene.paths, layer, seen], [measured], scene.device)
+        if further is not None:
+            inputs = [scene.paths, layer, shot, behind.gbuffer.depth, further]
+            launch_pixels(measure_behind_kernel, pixels, inputs, [image], scene.device)

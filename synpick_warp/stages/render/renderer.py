@@ -90,11 +90,12 @@ class Renderer:
                 kept, kept_row = self.shading.kept_rows, self.shading.flags.kept_row
             self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views, kept_row, kept)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views, instances, kept=kept)
-        self.behind: SceneBehind | None = None
-        if scene.is_transparent and self.shading is not None:
-            self.behind = SceneBehind(scene, self.shading, self.rasterizer, (settings, seed), bodies, views, histories)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, bodies, views)
+        self.behind: SceneBehind | None = None
+        seen = self.layer_renderer.sees_through
+        if seen or (scene.is_transparent and self.shading is not None):
+            self.behind = SceneBehind(scene, self.shading, self.rasterizer, (settings, seed), bodies, views, histories, seen)
         self.annotator = Annotator(scene, instances, views, kept)
         self.damage = self.rasterizer.whole
 
@@ -112,9 +113,10 @@ class Renderer:
         device = self.scene.device
         snapshot, views = self.render_gbuffer(snapshot, views, out, placed)
         shot = make_shot(self.scene, snapshot.frames, self.bodies, self.gbuffer, self.props.widen(views))
+        behind = self.behind.rasterize(snapshot, shot) if self.behind else None
         if layers is not None:
             with scope("layers", device):
-                self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1])
+                self.layer_renderer.render(snapshot, shot, layers, views.cameras if placed is None else placed[1], behind)
         if self.shading is not None:
             with scope("shade", device):
                 if self.behind is None:

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.codes import MAX_DISPARITIES
+from synpick_warp.kernels.render.images.clear_bodies import see_through_kernel
 from synpick_warp.kernels.render.images.infrared import render_infrared_kernel
 from synpick_warp.kernels.render.images.stereo_matching import (
     WARP,
@@ -69,15 +70,15 @@ class StereoRenderer:
         self.images = allocate(InfraredImages, sizes, scene.device, set(self.eyes) - set(names))
         self.scratch: Any = allocate_struct(MATCHING, sizes, scene.device) if self.matches else None
 
-    def render(self, shot: Any, out: LayerBuffers) -> None:
+    def render(self, shot: Any, out: LayerBuffers, behind: Any) -> None:
         """Render the infrared images of a batch of views, and match them; arguments as of `LayerRenderer.render`."""
         scene, views = self.scene, shot.views
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         own = [getattr(self.images, eye) for eye in self.eyes]
         images = {eye: getattr(out, eye) if image is None else image for eye, image in zip(self.eyes, own, strict=True)}
         for eye, image in images.items():
-            inputs = [scene.paths, self.sensor, shot, EYES.index(eye)]
-            launch_pixels(render_infrared_kernel, pixels, inputs, [image], scene.device)
+            kernel, more = (render_infrared_kernel, ()) if behind is None else (see_through_kernel, (behind.bodies, behind.gbuffer))
+            launch_pixels(kernel, pixels, [scene.paths, self.sensor, shot, *more, EYES.index(eye)], [image], scene.device)
         if self.scratch is not None:
             for first in range(0, views.count, self.slots):
                 self.match(first, min(self.slots, views.count - first), views, list(images.values()), out.depth_stereo)

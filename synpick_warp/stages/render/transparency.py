@@ -40,29 +40,32 @@ def allocate_image(sizes: dict[str, int], device: wp.Device) -> Any:
 
 class SceneBehind:
     """The scene without its transparent bodies, rendered by a rasterizer and a denoised renderer of its own, which keeps its own light. The
-    reference renderer needs neither: its paths go on behind. All but the constructor only launches kernels."""
+    reference renderer needs neither: its paths go on behind; layers need the first. All but the constructor only launches kernels."""
 
     def __init__(
         self,
         scene: RenderScene,
-        front: DenoisedRenderer | ReferenceRenderer,
+        front: DenoisedRenderer | ReferenceRenderer | None,
         rasterizer: Rasterizer,
         settings: tuple[Render, int],
         instances: int,
         views: int,
         histories: int,
+        layers: bool,
     ) -> None:
-        """Allocate scratch. `front`, `rasterizer`: those of all bodies. `settings`: those of the renderer, and the seed. Others: as of
-        `Renderer`."""
+        """Allocate scratch. `front`, `rasterizer`: those of all bodies. `settings`: those of the renderer, and the seed. `layers`: whether
+        layers see through bodies. Others: as of `Renderer`."""
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
         self.scene = scene
         self.groups = allocate_struct(BODY_GROUPS, sizes, scene.device)
-        self.rules = front.rules
+        self.rules = None if front is None else front.rules
         self.shading: DenoisedRenderer | None = None
-        if isinstance(front, DenoisedRenderer):
-            self.shading = DenoisedRenderer(*settings, scene, instances, views, histories)
+        self.gbuffer: Any = None
+        if layers or isinstance(front, DenoisedRenderer):
             self.rasterizer = Rasterizer(scene, rasterizer.counts_per_meter, views, instances, rasterizer.background)
             self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
+        if isinstance(front, DenoisedRenderer):
+            self.shading = DenoisedRenderer(*settings, scene, instances, views, histories)
             self.image = allocate_image(sizes, scene.device)
 
     def group(self, views: Any, bodies: Any) -> None:
@@ -83,14 +86,22 @@ class SceneBehind:
         """The struct `ViewBodies` of which camera rays meet opaque bodies alone, and all others those of `present`."""
         return bundle(ViewBodies, SimpleNamespace(present=present, body_mask=self.groups.body_mask), bodies)
 
+    def rasterize(self, snapshot: Snapshot, shot: Any) -> Any:
+        """Render the G-buffer of the scene behind the views of the struct `ShotData`, and return that of the scene behind; None: nothing
+        needs it."""
+        if self.gbuffer is None:
+            return None
+        bodies = self.opaque(shot.bodies, self.groups.opaque)
+        self.rasterizer.rasterize(bodies, shot.views, self.gbuffer)
+        return make_shot(self.scene, snapshot.frames, bodies, self.gbuffer, shot.views)
+
     def render(self, snapshot: Snapshot, shot: Any) -> Any:
-        """Render the scene behind the views of the struct `ShotData`, if it is not traced; returns them as their light is to be found:
+        """Shade the scene behind the views of the struct `ShotData`, if it is not traced; returns them as their light is to be found:
         without bodies that cast no shadows."""
         scene, views = self.scene, shot.views
         if self.shading is not None:
             drawn, lit = (self.opaque(shot.bodies, present) for present in (self.groups.opaque, self.groups.blocking))
             self.shading.find_damage(snapshot, drawn, views)
-            self.rasterizer.rasterize(drawn, views, self.gbuffer)
             self.shading.shade(snapshot, make_shot(scene, snapshot.frames, lit, self.gbuffer, views), self.image)
         lit = bundle(ViewBodies, SimpleNamespace(present=self.groups.blocking), shot.bodies)
         return make_shot(scene, snapshot.frames, lit, shot.gbuffer, views)

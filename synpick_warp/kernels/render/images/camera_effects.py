@@ -73,6 +73,8 @@ class SensorParameters:
     """1: pixels that the projector does not light, or the infrared camera does not see, are invalid."""
     registration: float
     """Place on the baseline of the camera of the depth image: 0 that of the infrared camera, 1 that of the projector."""
+    clear_reach: float
+    """Distance behind a transparent surface at which 1/e of what is there is still measured [m]; 0: the surface counts as opaque."""
     counts_per_meter: float
     """Depth counts in a metre."""
     projector: float

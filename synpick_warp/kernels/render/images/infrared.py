@@ -7,16 +7,17 @@ import warp as wp
 
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.camera_effects import SensorParameters, shot_key
+from synpick_warp.kernels.render.images.layers import seen_surface
 from synpick_warp.kernels.render.lighting.brdf import Brdf, evaluate_brdf, make_brdf, widen_roughness
 from synpick_warp.kernels.render.lighting.color import luminance
 from synpick_warp.kernels.render.lighting.environment import environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, map_table, material_at, wear_at
+from synpick_warp.kernels.render.lighting.materials import material_at, wear_at
 from synpick_warp.kernels.render.lighting.paths.tracing import AnyScene
 from synpick_warp.kernels.render.lighting.surfaces import Surface
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked, trace_ray
-from synpick_warp.kernels.render.visibility.camera import AnyCameras, AnyViews, camera_ray, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, ViewBodies, body_of, read_hit
+from synpick_warp.kernels.render.visibility.camera import AnyViews, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, GBuffer, Hit, ViewBodies, read_hit
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform
 from synpick_warp.kernels.tuning import RAY_REGISTERS
@@ -52,13 +53,17 @@ def dot_pattern(column: float, row: float, spacing: float) -> float:
 
 
 @wp.func
-def right_camera_hit(scene: AnyScene, shot: AnyShot, view: int, ray: wp.vec3, baseline: float) -> Hit:
-    """Closest hit of a ray of the right camera, with planar depth."""
-    cameras = shot.views.cameras
-    origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(baseline, 0.0, 0.0)
-    direction = wp.normalize(cameras.to_world[view] * ray)
-    hit = trace_ray(scene.meshes, scene.table, shot.bodies, view, shot.views.instances, origin, direction)
-    hit.depth = hit.depth / wp.length(ray)
+def eye_hit(
+    scene: AnyScene, shot: AnyShot, bodies: ViewBodies, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, offset: float
+) -> Hit:
+    """Closest hit of a pixel's ray of the left camera, which is in the G-buffer, or of one beside it by `offset` [m]; planar depth."""
+    hit = read_hit(gbuffer, view, row, column)
+    if offset > 0.0:
+        cameras = shot.views.cameras
+        origin = wp.vec3(cameras.center[view]) + cameras.to_world[view] * wp.vec3(offset, 0.0, 0.0)
+        direction = wp.normalize(cameras.to_world[view] * ray)
+        hit = trace_ray(scene.meshes, scene.table, bodies, view, shot.views.instances, origin, direction)
+        hit.depth = hit.depth / wp.length(ray)
     return hit
 
 
@@ -86,17 +91,46 @@ def dot_light(
 
 
 @wp.func
-def seen_surface(
-    scene: AnyScene, bodies: ViewBodies, cameras: AnyCameras, view: int, hit: Hit, point: wp.vec3, outgoing: wp.vec3, instances: int
-) -> Surface:
-    """Surface attributes of a hit at `point` in the camera's axes [m]; the hit must be of a body or the table."""
-    width = hit.depth / cameras.intrinsics[view][0]
-    if hit.segment == Segment.TABLE:
-        position = wp.vec3(cameras.center[view]) + cameras.to_world[view] * point
-        table = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
-        return map_table(scene.surfaces, table, position, outgoing, width)
-    body = body_of(hit.segment, instances)
-    return interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
+def infrared_light(
+    scene: AnyScene,
+    sensor: SensorParameters,
+    shot: AnyShot,
+    bodies: ViewBodies,
+    blockers: ViewBodies,
+    view: int,
+    hit: Hit,
+    ray: wp.vec3,
+    offset: float,
+) -> wp.vec2:
+    """Ambient and projected light of a hit on `bodies` along a ray of the camera that is beside the left one by `offset` [m]; `blockers`
+    cast shadows of dots. Ambient light is the unoccluded environment's luminance, without lamps; surfaces reflect it as visible light."""
+    cameras = shot.views.cameras
+    world = shot.views.world[view]
+    which = shot.snapshot.light[world]
+    yaw = shot.snapshot.light_yaw[world]
+    outgoing = -wp.normalize(cameras.to_world[view] * ray)
+    radiance = float(0.0)
+    dots = float(0.0)
+    if hit.segment == Segment.NOTHING:
+        radiance = luminance(environment_radiance(scene.lights, which, rotate_z(-outgoing, -yaw)))
+    else:
+        point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
+        surface = seen_surface(scene, shot, bodies, view, hit, point, outgoing)
+        material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, False))
+        roughness = widen_roughness(material.roughness, surface.normal_spread)
+        brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
+        ambient = unoccluded_light(scene.lights, which, yaw, brdf)
+        radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
+        dots = dot_light(scene, sensor, blockers, shot.views, view, point, surface, brdf)
+    return wp.vec2(sensor.ambient * scene.lights.exposure[which] * radiance, dots)
+
+
+@wp.func
+def infrared_byte(sensor: SensorParameters, shot: AnyShot, view: int, row: int, column: int, eye: int, light: wp.vec2) -> wp.uint8:
+    """Pixel of an infrared image, with noise of the random number stream (seed, episode, frame, camera, INFRARED_NOISE), eye and pixel."""
+    key = shot_key(sensor.seed, shot, view, Stream.INFRARED_NOISE)
+    noise = normal_pair(pixel_key(key, (eye * shot.grid.height + row) * shot.grid.width + column), 0)[0]
+    return wp.uint8(wp.rint(255.0 * wp.clamp(light[0] + light[1] + sensor.infrared_noise * noise, 0.0, 1.0)))
 
 
 @kernel_of_views(cuda_max_registers=RAY_REGISTERS)
@@ -111,41 +145,13 @@ def render_infrared_kernel(
     # Out:
     image_out: wp.array3d[wp.uint8],  # (view, row, column)
 ):
-    """Infrared image of the left (eye 0) or right (1) camera: 8 bits, linear, with noise, at one ray a pixel.
-
-    Ambient light is the unoccluded environment's luminance, without lamps; surfaces reflect infrared light as visible light. Noise is of
-    the random number stream (seed, episode, frame, camera, INFRARED_NOISE), eye and pixel. Launched over view, pixel (tile order, from flat
-    index `first` on).
-    """
-    grid, cameras = shot.grid, shot.views.cameras
-    view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
+    """Infrared image of the left (eye 0) or right (1) camera: 8 bits, linear, with noise, at one ray a pixel. Launched over view, pixel
+    (tile order, from flat index `first` on)."""
+    view, row, column = tile_pixel(shot.grid, wp.tid() + first)
+    if not in_image(shot.grid, row, column):
         return
-    world = shot.views.world[view]
-    which = shot.snapshot.light[world]
-    yaw = shot.snapshot.light_yaw[world]
-    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(cameras.to_world[view] * ray)
+    ray = camera_ray(shot.views.cameras, view, row, column, wp.vec2(0.0, 0.0))
     offset = wp.where(eye == 0, 0.0, sensor.baseline)
-    hit = Hit()
-    if eye == 0:
-        hit = read_hit(shot.gbuffer, view, row, column)
-    else:
-        hit = right_camera_hit(scene, shot, view, ray, offset)
-    radiance = float(0.0)
-    dots = float(0.0)
-    if hit.segment == Segment.NOTHING:
-        radiance = luminance(environment_radiance(scene.lights, which, rotate_z(-outgoing, -yaw)))
-    else:
-        point = hit.depth * ray + wp.vec3(offset, 0.0, 0.0)
-        surface = seen_surface(scene, shot.bodies, cameras, view, hit, point, outgoing, shot.views.instances)
-        material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, False))
-        roughness = widen_roughness(material.roughness, surface.normal_spread)
-        brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
-        ambient = unoccluded_light(scene.lights, which, yaw, brdf)
-        radiance = luminance(wp.cw_mul(brdf.diffuse, ambient.diffuse) + ambient.specular)
-        dots = dot_light(scene, sensor, shot.bodies, shot.views, view, point, surface, brdf)
-    key = shot_key(sensor.seed, shot, view, Stream.INFRARED_NOISE)
-    noise = normal_pair(pixel_key(key, (eye * grid.height + row) * grid.width + column), 0)[0]
-    value = sensor.ambient * scene.lights.exposure[which] * radiance + dots + sensor.infrared_noise * noise
-    image_out[view, row, column] = wp.uint8(wp.rint(255.0 * wp.clamp(value, 0.0, 1.0)))
+    hit = eye_hit(scene, shot, shot.bodies, shot.gbuffer, view, row, column, ray, offset)
+    light = infrared_light(scene, sensor, shot, shot.bodies, shot.bodies, view, hit, ray, offset)
+    image_out[view, row, column] = infrared_byte(sensor, shot, view, row, column, eye, light)

@@ -23,7 +23,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     lens_of,
     tile_pixel,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import AnyShot, Hit, ViewBodies, body_of, read_hit
 from synpick_warp.kernels.render.visibility.lens import distort
 from synpick_warp.kernels.render.visibility.variants import kernel_of_views
 from synpick_warp.kernels.state import Snapshots
@@ -161,21 +161,24 @@ def kernel_of_layer(value: wp.Function, name: str, dtype: Any) -> Callable[..., 
 
 
 @wp.func
+def seen_surface(scene: AnyScene, shot: AnyShot, bodies: ViewBodies, view: int, hit: Hit, point: wp.vec3, to_camera: wp.vec3) -> Surface:
+    """Surface attributes of a hit at `point` in the camera's axes [m]; the hit must be of a body or the table."""
+    cameras = shot.views.cameras
+    width = hit.depth / cameras.intrinsics[view][0]
+    if hit.segment == Segment.TABLE:
+        table = make_table_surface(scene.meshes, scene.surfaces, bodies, view, to_camera)
+        return map_table(scene.surfaces, table, hit_position(cameras, view, point, 1.0), to_camera, width)
+    body = body_of(hit.segment, shot.views.instances)
+    return interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, to_camera, width)
+
+
+@wp.func
 def hit_surface(scene: AnyScene, shot: AnyShot, view: int, row: int, column: int) -> Surface:
     """Surface attributes of a pixel's primary hit, from the G-buffer; the pixel must show a body or the table."""
-    cameras = shot.views.cameras
-    ray = camera_ray(cameras, view, row, column, wp.vec2(0.0, 0.0))
-    to_camera = -wp.normalize(cameras.to_world[view] * ray)
-    segment = int(shot.gbuffer.segment[view, row, column])
-    depth = shot.gbuffer.depth[view, row, column]
-    width = depth / cameras.intrinsics[view][0]
-    if segment == Segment.TABLE:
-        table = make_table_surface(scene.meshes, scene.surfaces, shot.bodies, view, to_camera)
-        return map_table(scene.surfaces, table, hit_position(cameras, view, ray, depth), to_camera, width)
-    triangle = shot.gbuffer.triangle[view, row, column]
-    barycentric = shot.gbuffer.barycentric[view, row, column]
-    body = body_of(segment, shot.views.instances)
-    return interpolate_surface(scene.meshes, scene.surfaces, shot.bodies, view, body, triangle, barycentric, to_camera, width)
+    ray = camera_ray(shot.views.cameras, view, row, column, wp.vec2(0.0, 0.0))
+    hit = read_hit(shot.gbuffer, view, row, column)
+    to_camera = -wp.normalize(shot.views.cameras.to_world[view] * ray)
+    return seen_surface(scene, shot, shot.bodies, view, hit, hit.depth * ray, to_camera)
 
 
 @wp.func

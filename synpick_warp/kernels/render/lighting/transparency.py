@@ -76,6 +76,8 @@ class PassingLight:
     """Light that passes a surface towards the camera: factor on that from behind, and the ray by which this is seen."""
 
     weight: wp.vec3
+    passing: float
+    """The same without the tint of the surface."""
     direction: wp.vec3
     """Unit direction from the camera to where the light enters the body, in the world."""
     start: wp.vec3
@@ -101,8 +103,8 @@ def passing_light(scene: RandomizedScene, shot: AnyShot, view: int, hit: Hit, ra
     roughness = widen_roughness(material.roughness, surface.normal_spread)
     brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     # Dust covers; what is no metal does not rust.
-    passing = material.transmission * (1.0 - wear.share[3]) * (1.0 - coat_albedo(brdf, brdf.albedo))
-    result.weight = passing * sample_base_color(scene.surfaces, surface)
+    result.passing = material.transmission * (1.0 - wear.share[3]) * (1.0 - coat_albedo(brdf, brdf.albedo))
+    result.weight = result.passing * sample_base_color(scene.surfaces, surface)
     cosine = wp.dot(brdf.normal, outgoing)
     eta = 1.0 / glass[1]
     bent = (eta * cosine - wp.sqrt(1.0 - eta * eta * (1.0 - cosine * cosine))) * brdf.normal - eta * outgoing
