@@ -39,6 +39,7 @@ class Glass:
 
 
 OPAQUE = Glass()
+BLACK = (0.0, 0.0, 0.0)
 
 MAP_CENTER = 128
 """Value of a map that is 0 of a normal's x or y."""
@@ -63,12 +64,17 @@ class Material:
     """Transmission."""
     opacity: np.ndarray | None = field(default=None, hash=False)
     """Part of the transmission that a texel lacks (H, W) uint8, such as a label: 0 none, 255 all. None: nowhere."""
+    emission: tuple[float, float, float] = BLACK
+    """Emitted light, linear; 1 is the white of a picture, under any environment map."""
+    glow: np.ndarray | None = field(default=None, hash=False)
+    """Emission texture of the texture's size (H, W, 3) uint8, sRGB, a factor on `emission`. None: it is the same everywhere."""
 
     @property
     def map_names(self) -> frozenset[str]:
         """Values that vary over the texture beside colour."""
         names = () if self.maps is None else ("normal", "roughness", "metallic")
-        return frozenset(names if self.opacity is None else (*names, "opacity"))
+        more = ("opacity", self.opacity), ("glow", self.glow)
+        return frozenset((*names, *(name for name, image in more if image is not None)))
 
     @property
     def transmission(self) -> float:

@@ -37,13 +37,14 @@ def settings(**overrides: object) -> Config:
 
 
 def textured(catalog: Catalog) -> Catalog:
-    """Copy of a catalog whose second object has texture coordinates, a texture with maps and a base colour."""
+    """Copy of a catalog whose first object shines, and whose second one has texture coordinates, a texture with maps and a base colour."""
     first, second, *others = catalog.entries
     numbers = np.random.default_rng(7)
     mesh = dataclasses.replace(second.mesh, uv=numbers.random((len(second.mesh.vertices), 2), dtype=np.float32))
     material = Material((0.9, 0.8, 0.7), numbers.integers(0, 256, (24, 32, 3), dtype=np.uint8), 0.3, 0.6)
     maps = numbers.integers(64, 192, (24, 32, 4), dtype=np.uint8)
-    material = dataclasses.replace(material, maps=maps)
+    material = dataclasses.replace(material, maps=maps, emission=(0.0, 3.0, 1.0), glow=maps[..., :3])
+    first = dataclasses.replace(first, material=dataclasses.replace(first.material, emission=(0.5, 0.25, 0.0)))
     return Catalog((first, dataclasses.replace(second, mesh=mesh, material=material), *others))
 
 

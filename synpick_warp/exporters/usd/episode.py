@@ -56,7 +56,7 @@ class AssetSurface:
     def of(name: str, material: Material) -> "AssetSurface":
         """That of the asset of this name."""
         texture = None if material.texture is None else texture_file(name)
-        return AssetSurface(replace(material, texture=None, maps=None, opacity=None), texture, material.map_names)
+        return AssetSurface(replace(material, texture=None, maps=None, opacity=None, glow=None), texture, material.map_names)
 
 
 def texture_file(name: str) -> str:

@@ -118,6 +118,8 @@ def add_surface(
     if material.transmission > 0.0:
         shader.CreateInput("opacity", Sdf.ValueTypeNames.Float).Set(1.0 - material.transmission)
         shader.CreateInput("ior", Sdf.ValueTypeNames.Float).Set(material.glass.ior)
+    if any(material.emission):
+        shader.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*material.emission))
     color: UsdShade.Input = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
     linear = (gain * srgb_to_linear(material.color)).tolist()
     if texture is None:
@@ -142,6 +144,9 @@ def add_surface(
         share = material.transmission
         image = _add_image(stage, f"{path}/Opacity", texture.replace(".png", OPACITY), "raw", place, (share,) * 4, (1.0 - share,) * 4)
         shader.GetInput("opacity").ConnectToSource(image.CreateOutput("r", Sdf.ValueTypeNames.Float))
+    if "glow" in maps and any(material.emission):
+        image = _add_image(stage, f"{path}/Glow", texture.replace(".png", GLOW), "sRGB", place, (*material.emission, 1.0))
+        shader.GetInput("emissiveColor").ConnectToSource(image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
     if {"roughness", "metallic"} & set(maps):
         image = _add_image(stage, f"{path}/Values", values, "raw", place, (1.0, 1.0, 1.0, 1.0))
         for channel, name in (("g", "roughness"), ("b", "metallic")):
@@ -167,8 +172,8 @@ def _add_image(
     return image
 
 
-NORMALS, VALUES, OPACITY = "_normal.png", "_values.png", "_opacity.png"
-"""Endings of the files of a material's maps: normals as in glTF, roughness (green) with metallic (blue), and opacity."""
+NORMALS, VALUES, OPACITY, GLOW = "_normal.png", "_values.png", "_opacity.png", "_emission.png"
+"""Endings of the files of a material's maps: normals as in glTF, roughness (green) with metallic (blue), opacity, and emission."""
 
 
 def write_texture(library: Path, name: str, material: Material) -> str | None:
@@ -180,6 +185,8 @@ def write_texture(library: Path, name: str, material: Material) -> str | None:
     write_synced(library / file, encode_png(material.texture))
     if material.opacity is not None:
         write_synced(library / file.replace(".png", OPACITY), encode_png(np.repeat(material.opacity[..., None], 3, axis=2)))
+    if material.glow is not None:
+        write_synced(library / file.replace(".png", GLOW), encode_png(material.glow))
     if material.maps is not None:
         x, y = (material.maps[..., :2].transpose(2, 0, 1).astype(np.float64) - MAP_CENTER) / (MAP_CENTER - 1)
         normal = np.stack([x, y, np.sqrt(np.clip(1.0 - x * x - y * y, 0.0, 1.0))], axis=-1)

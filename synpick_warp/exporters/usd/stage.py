@@ -19,7 +19,7 @@ from synpick_warp.exporters.usd import episode
 from synpick_warp.exporters.usd.parts import add_label, add_property, add_surface, set_units
 from synpick_warp.scenes.assets.appearance import as_color, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.cameras import CAMERA_KEYS, carry
-from synpick_warp.scenes.types import Camera, Material
+from synpick_warp.scenes.types import BLACK, Camera, Material
 from synpick_warp.system.linear_algebra import DECIMALS, dot
 from synpick_warp.views.frames import EpisodeEnd
 
@@ -274,7 +274,9 @@ def _add_look(stage: Usd.Stage, path: str, part: LookPart, look: Mapping[str, An
     elif "hue" in look:
         add_property(stage.GetPrimAtPath(path), "hue", float(look["hue"]))
     glass = replace(given.glass, transmission=look.get("transmission", given.glass.transmission))
-    material = Material(color, None, look.get("metallic", given.metallic), look.get("roughness", given.roughness), glass=glass)
+    emission = BLACK if "texture" in look else given.emission
+    drawn = {"metallic": look.get("metallic", given.metallic), "roughness": look.get("roughness", given.roughness)}
+    material = Material(color, None, **drawn, glass=glass, emission=emission)
     maps = surface.maps - look.keys() if "texture" not in look else ()
     add_surface(stage, f"{path}/Materials/Surface", material, texture and f"assets/{texture}", gain, repeats, maps)
 

@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
-from synpick_warp.scenes.types import MAP_CENTER, OPAQUE, Glass, Material
+from synpick_warp.scenes.types import BLACK, MAP_CENTER, OPAQUE, Glass, Material
 from synpick_warp.system.linear_algebra import DECIMALS
 
 MAX_TEXTURE_FILE = 2**27
@@ -42,11 +42,24 @@ class FileMaterial:
     color: tuple[float, float, float]
     """Base colour factor, sRGB in 0..1; multiplies the texture in linear light."""
     texture: np.ndarray | None
-    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`. A last channel more is
-    `Material.opacity`."""
+    """Base colour texture (H, W, 3) uint8, sRGB, top row first (v = 1); with maps (H, W, 7), see `Material.maps`, and with `Material.glow`
+    behind these (H, W, 10). A last channel more is `Material.opacity`."""
     metallic: float | None
     roughness: float | None
     glass: Glass = OPAQUE
+    emission: tuple[float, float, float] = BLACK
+    has_glow: bool = False
+    """Whether the file has an emission texture, which `texture` has, too, unless its maps were dropped."""
+
+    @property
+    def glow(self) -> np.ndarray | None:
+        """`Material.glow`, if there is one."""
+        return self.texture[..., 7:10] if self.texture is not None and self.texture.shape[2] >= 10 else None
+
+    @property
+    def light(self) -> tuple[float, float, float]:
+        """Emission: none where its texture was dropped."""
+        return BLACK if self.has_glow and self.glow is None else self.emission
 
     @property
     def has_maps(self) -> bool:
@@ -62,10 +75,19 @@ class FileMaterial:
         """Material with these values where the file states none."""
         given = (metallic if self.metallic is None else self.metallic, roughness if self.roughness is None else self.roughness)
         if self.texture is None or self.texture.shape[2] == 3:
-            return Material(self.color, self.texture, *given, glass=self.glass)
+            return Material(self.color, self.texture, *given, glass=self.glass, emission=self.light)
         maps = self.texture[..., 3:7].copy() if self.has_maps else None
-        opacity = self.texture[..., -1].copy() if self.texture.shape[2] in (4, 8) else None
-        return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity)
+        opacity = self.texture[..., -1].copy() if self.texture.shape[2] in (4, 8, 11) else None
+        glow = None if self.glow is None else self.glow.copy()
+        return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity, self.light, glow)
+
+    def add_glow(self, most: float) -> "FileMaterial":
+        """Material of the emission `most` in all channels, whose texture has its own; it must state metallic and roughness."""
+        mapped = self if self.has_maps else self.add_maps()
+        assert mapped.texture is not None
+        own = np.full((*mapped.texture.shape[:2], 3), 255, np.uint8) if self.glow is None else self.glow
+        glow = tint(own, as_color(linear_to_srgb(np.array(self.light) / most)))
+        return replace(mapped, texture=np.concatenate([mapped.texture[..., :7], glow], axis=2), emission=(most,) * 3, has_glow=True)
 
     def add_opacity(self, most: float) -> "FileMaterial":
         """Material of the transmission `most`, whose texture's last channel says by how much less it transmits."""
@@ -75,9 +97,11 @@ class FileMaterial:
 
     def add_maps(self, **maps: np.ndarray) -> "FileMaterial":
         """Material with normal (H, W, 2), roughness and metallic (H, W, 1) maps, uint8 as of `Material.maps`, of any sizes; those that are
-        not given are flat and constant. The material must state metallic and roughness. Raises CatalogError: too large together."""
+        not given are flat and constant. `glow` (H, W, 3) is one more if it is given. The material must state metallic and roughness. Raises
+        CatalogError: too large together."""
         flat = {"color": (255, 255, 255), "normal": (MAP_CENTER, MAP_CENTER)}
         flat |= {"roughness": (round(255 * (self.roughness or 0.0)),), "metallic": (round(255 * (self.metallic or 0.0)),)}
+        flat |= {"glow": (255, 255, 255)} if "glow" in maps else {}
         planes = maps if self.texture is None else {"color": self.texture, **maps}
         height, width = (max([MIN_MAP_SIDE, *(image.shape[axis] for image in planes.values())]) for axis in (0, 1))
         if height * width > MAX_TEXTURE_PIXELS:
@@ -88,7 +112,7 @@ class FileMaterial:
             else np.broadcast_to(np.array(value, np.uint8), (height, width, len(value)))
             for name, value in flat.items()
         ]
-        return replace(self, texture=np.concatenate(layers, axis=2))
+        return replace(self, texture=np.concatenate(layers, axis=2), has_glow="glow" in maps)
 
 
 def resize(image: np.ndarray, size: tuple[int, int], filter: Image.Resampling) -> np.ndarray:

@@ -35,7 +35,7 @@ from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.assets.normals import DEFAULT_CREASE, crease_normals, smooth_normals
 from synpick_warp.scenes.assets.ply import read_ply
 from synpick_warp.scenes.assets.wavefront import read_obj
-from synpick_warp.scenes.types import OPAQUE, TriangleMesh
+from synpick_warp.scenes.types import BLACK, OPAQUE, TriangleMesh
 from synpick_warp.system.inputs.files import read_file
 from synpick_warp.system.processes.isolation import Failure, Limits, run_isolated
 
@@ -331,7 +331,7 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
     all parts state both, they are averaged by area."""
     if len(parts) == 1:
         return parts[0]
-    parts = _share_opacity(_share_maps(parts, notes))
+    parts = _share_opacity(_share_maps(_share_emission(parts, notes), notes))
     first = parts[0].material
     if not all(part.material.texture is first.texture and part.material.color == first.color for part in parts):
         parts = [_unroll(part, notes) for part in parts]
@@ -355,6 +355,23 @@ def _join(parts: list[MeshPart], path: Path, options: MeshOptions, notes: Notes)
         None,
         replace(first, **mean),
     )
+
+
+def _share_emission(parts: list[MeshPart], notes: Notes) -> list[MeshPart]:
+    """Give all parts textures with emission, if they emit different light; beside a part without metallic or roughness, none emits."""
+    given = [part.material for part in parts]
+    if all(each.light == given[0].light for each in given) and all(each.glow is None for each in given):
+        return parts
+    if any(each.metallic is None or each.roughness is None for each in given):
+        notes.ignored.append("emission beside a part without metallic or roughness")
+        return [replace(part, material=replace(part.material, emission=BLACK)) for part in parts]
+    made: dict[Any, appearance.FileMaterial] = {}
+    lit = []
+    for part, each in zip(parts, given, strict=True):
+        key = id(each.texture), each.metallic, each.roughness, each.light
+        new = made[key] = made.get(key) or each.add_glow(max(max(one.light) for one in given))
+        lit.append(replace(part, material=replace(part.material, texture=new.texture, emission=new.emission, has_glow=True)))
+    return lit
 
 
 def _share_maps(parts: list[MeshPart], notes: Notes) -> list[MeshPart]:

@@ -58,7 +58,8 @@ SETTINGS = {
 """Setting of `Randomize` that has a part's distribution of a parameter."""
 _COPIED = ("color", "metallic", "roughness", "texture_size", "first_texel", "texture_levels", "maps")
 """Arrays of `Surfaces` with a row for each material, of every scene ..."""
-_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, "recolor", "repeats", "wear", "pattern", "glass", "label")}
+_DRAWN = ("recolor", "repeats", "wear", "pattern", "glass", "label", "emission")
+_TYPES = {name: RandomizedSurfaces.vars[name].type for name in (*_COPIED, *_DRAWN)}
 _MATERIALS = StructArrays(
     RandomizedSurfaces, {name: ArraySpec(("material", "level")[: kind.ndim], kind.dtype, "") for name, kind in _TYPES.items()}
 )
@@ -162,6 +163,10 @@ class Dresser:
                 setattr(surfaces, name, values)
         if scene.glass is not None:
             wp.copy(surfaces.glass, scene.glass, count=scene.glass.size)
+        surfaces.glow = wp.zeros(1, dtype=wp.uint32, device=scene.device)
+        if scene.emission is not None:
+            wp.copy(surfaces.emission, scene.emission[0], count=scene.emission[0].size)
+            surfaces.glow = scene.emission[1]
         surfaces.row = wp.zeros((views, self._materials), dtype=wp.int32, device=scene.device)
         is_worn = any(getattr(looks.randomize, name).kind != OFF for name in WEAR)
         surfaces.noise = make_noise(scene.device) if is_worn else wp.zeros((1, 1, 1), dtype=wp.uint32, device=scene.device)

@@ -15,6 +15,7 @@ from synpick_warp.kernels.render.lighting.environment import MAX_LAMPS, Lights
 from synpick_warp.kernels.render.lighting.paths.tracing import PathScene
 from synpick_warp.kernels.render.lighting.shadows import LAMP_POINTS
 from synpick_warp.kernels.render.lighting.surfaces import (
+    GLOW_MAP,
     METALLIC_MAP,
     METALLIC_MASK,
     METALLIC_SHIFT,
@@ -91,11 +92,13 @@ class RenderScene:
 
     glass: Any = None
     """(material): transmission, index of refraction, thickness [m]; None: all of them are opaque, and no episode draws another."""
+    emission: tuple[wp.array, wp.array] | None = None
+    """Members `emission` and `glow` of the struct `RandomizedSurfaces`; None: nothing emits light."""
 
     @property
     def has_details(self) -> bool:
-        """Whether a material has normal, roughness or metallic maps, or some are transparent."""
-        return self.surfaces is not None and (self.surfaces.detail.size > 1 or self.is_transparent)
+        """Whether a material has normal, roughness or metallic maps, or some are transparent or emit light."""
+        return self.surfaces is not None and (self.surfaces.detail.size > 1 or self.is_transparent or self.emission is not None)
 
     @property
     def is_transparent(self) -> bool:
@@ -273,7 +276,8 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
-    surfaces.maps = wp.array([0 if m.maps is None else ALL_MAPS for m in materials], dtype=wp.int32, device=device)
+    maps = [(0 if m.maps is None else ALL_MAPS) | (0 if m.glow is None else int(GLOW_MAP)) for m in materials]
+    surfaces.maps = wp.array(maps, dtype=wp.int32, device=device)
     surfaces.detail = wp.array(np.concatenate(details), dtype=wp.uint32, device=device)
     surfaces.albedo = measure_albedo(device)
     return surfaces
@@ -306,6 +310,19 @@ def build_glass(materials: list[Material], objects: int, looks: Looks | None, de
     if not any(row[0] for row in glass) and (looks is None or looks.randomize.object_transmission.kind == OFF):
         return None
     return wp.array(glass + [(0.0, OPAQUE.ior, 0.0)] * (len(materials) - objects), dtype=wp.vec3, device=device)
+
+
+def build_emission(materials: list[Material], surfaces: Any, exposure: float) -> tuple[wp.array, wp.array] | None:
+    """Emission of the materials of the struct `Surfaces` as of `RenderScene.emission`, times the factor `exposure` on the automatic one."""
+    if not any(max(each.emission) for each in materials):
+        return None
+    device, glowing = surfaces.texel.device, [row for row, each in enumerate(materials) if each.glow is not None]
+    glow, first = np.zeros(surfaces.texel.size if glowing else 1, np.uint32), surfaces.first_texel.numpy()
+    for row in glowing:
+        for start, level in zip(first[row], mip_levels(np.asarray(materials[row].glow)), strict=False):
+            glow[start : start + level.size // 3] = pack_texels(level)
+    emission = exposure * np.array([each.emission for each in materials])
+    return wp.array(emission, dtype=wp.vec3, device=device), wp.array(glow, dtype=wp.uint32, device=device)
 
 
 def with_cameras(scene: RenderScene, cameras: tuple[Camera, ...]) -> RenderScene:
@@ -446,10 +463,9 @@ def build_render_scene(
     materials = [each.material for each in (*catalog.bodies, *fixtures)] + [Material(settings.table_color, None, 0.0, TABLE_ROUGHNESS)]
     materials += [Material((1.0, 1.0, 1.0), texture, 0.0, 1.0) for texture in (looks.all_textures if looks else ())]
     meshes, keep = build_meshes(shapes, len(shapes) - len(grip) - 1, device, bins[0].interior if len(bins) == 1 else None)
-    table = build_table(settings, table_height)
     ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
-    paths.meshes, paths.table = meshes, table
+    paths.meshes, paths.table = meshes, build_table(settings, table_height)
     paths.surfaces = build_surfaces(shapes, materials, device)
     paths.lights = build_lights(lights, ground, settings.exposure, device, shadowed_lamps(settings))
     paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
@@ -458,7 +474,7 @@ def build_render_scene(
         surfaces=paths.surfaces,
         cameras=build_cameras(cameras, device),
         lights=paths.lights,
-        table=table,
+        table=paths.table,
         paths=paths,
         plain=paths,
         grid=build_grid(*cameras[0].resolution),
@@ -469,6 +485,7 @@ def build_render_scene(
         looks=looks,
         suction_maps=build_suction_scene(catalog, cup_radius, device),
         glass=build_glass(materials, len(catalog.bodies), looks, device),
+        emission=build_emission(materials, paths.surfaces, settings.exposure),
         props=build_props(catalog, device),
         prop_count=len(catalog.props),
     )

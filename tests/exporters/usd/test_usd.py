@@ -109,7 +109,7 @@ def test_a_writer_has_no_thread_beside_its_own(tmp_path, monkeypatch):
 def test_one_file_per_episode_and_shared_assets(folder):
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assets = {f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")}
-    assets |= {f"assets/textures/obj_000002{ending}" for ending in (".png", "_normal.png", "_values.png")}
+    assets |= {f"assets/textures/obj_000002{ending}" for ending in (".png", "_normal.png", "_values.png", "_emission.png")}
     assets |= {*(f"assets/lights/light_00{index}.exr" for index in range(2))}
     assert names == assets | {"000000.usdc", "000004.usdc"}
     assert (folder / "000000.usdc").stat().st_size < 60_000
@@ -182,6 +182,8 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
     linear, color = srgb_to_linear(entry.material.color), shader.GetInput("diffuseColor")
     if entry.material.texture is None:
         np.testing.assert_allclose(color.Get(), linear, rtol=1e-6)
+        emission = shader.GetInput("emissiveColor")
+        assert tuple(emission.Get() if emission else (0.0, 0.0, 0.0)) == entry.material.emission
         return
     image = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim())
     np.testing.assert_allclose(image.GetInput("scale").Get(), [*linear, 1.0], rtol=1e-6)
@@ -194,6 +196,9 @@ def test_objects_have_their_meshes_and_materials(folder, entry):
     np.testing.assert_allclose(sampled(normal)[..., :2], expected, atol=0.005)
     np.testing.assert_allclose(np.linalg.norm(sampled(normal), axis=2), 1.0, atol=0.01)
     assert [each.GetConnectedSources()[0][0].sourceName for each in (roughness, metallic)] == ["g", "b"]
+    glow = UsdShade.Shader(shader.GetInput("emissiveColor").GetConnectedSources()[0][0].source.GetPrim())
+    assert tuple(glow.GetInput("scale").Get())[:3] == entry.material.emission
+    np.testing.assert_array_equal(cv2.imread(glow.GetInput("file").Get().resolvedPath)[..., ::-1], entry.material.glow)
     np.testing.assert_allclose(sampled(roughness)[..., 1], entry.material.maps[..., 2] / 255.0)
     np.testing.assert_allclose(sampled(metallic)[..., 2], entry.material.maps[..., 3] / 255.0)
 

@@ -16,6 +16,7 @@ from synpick_warp.kernels.render.lighting.paths.tracing import (
     pixel_context,
 )
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point
+from synpick_warp.kernels.render.lighting.surfaces import add_emission
 from synpick_warp.kernels.render.lighting.transparency import passing_light
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, clamp_index, in_image, tile_of, tile_pixel
@@ -89,11 +90,12 @@ def trace_scene_behind_kernel(
                 width = footprint * (front.depth + hit.depth)
                 vertex = make_vertex(scene, shot, view, hit, light.start + hit.depth * direction, -direction, width, 0.0, False)
                 diffuse = vertex.brdf.diffuse
+                emitted = add_emission(scene.surfaces, wp.vec3(), vertex.emission, scene.lights.exposure[context.light])
                 path = init_path(width)
                 while path.bounce != TERMINATED:
                     if path.bounce > 0:
                         vertex = next_vertex(scene, shot, rules, context, path)
                     path = extend_path(scene, shot, rules, context, index, diffuse, path, vertex)
                 radiance = wp.cw_mul(diffuse, path.radiance.diffuse + path.radiance.indirect) + path.radiance.specular
-                total += wp.cw_mul(light.weight, radiance)
+                total += wp.cw_mul(light.weight, radiance + emitted)
     image_inout.radiance[view, row, column] += total / float(rules.samples)

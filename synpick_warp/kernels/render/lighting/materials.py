@@ -4,6 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.lighting.labels import LABEL_ROUGHNESS, label_coordinates, label_reflectance
 from synpick_warp.kernels.render.lighting.surfaces import (
+    GLOW_MAP,
     METALLIC_MAP,
     METALLIC_MASK,
     METALLIC_SHIFT,
@@ -208,7 +209,12 @@ def interpolate_surface(
 @wp.func
 def decode_texel(surfaces: AnySurfaces, index: int) -> wp.vec3:
     """Decode a texel: its linear colour divided by TEXEL_SCALE."""
-    texel = int(surfaces.texel[index])
+    return unpack_texel(int(surfaces.texel[index]))
+
+
+@wp.func
+def unpack_texel(texel: int) -> wp.vec3:
+    """Linear colour of a packed texel, divided by TEXEL_SCALE."""
     red = float(texel & TEXEL_MASK)
     green = float((texel >> TEXEL_BITS) & TEXEL_MASK)
     blue = float((texel >> (2 * TEXEL_BITS)) & TEXEL_MASK)
@@ -358,6 +364,21 @@ def transmission_at(surfaces: RandomizedSurfaces, surface: Surface) -> float:
 
 
 @wp.func
+def emission_at(surfaces: RandomizedSurfaces, surface: Surface) -> wp.vec3:
+    """Emission at a hit: that of its row, times its texture by a bilinear look-up in the nearest mip level."""
+    emission = surfaces.emission[surface.row]
+    if wp.max(emission) == 0.0 or (surfaces.maps[surface.row] & GLOW_MAP) == 0:
+        return emission
+    taps = find_taps(surfaces, surface.row, int(mip_level(surfaces, surface) + 0.5), surface.uv)
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for tap in range(4):
+        right = wp.where(tap % 2 == 0, 1.0 - taps.weight[0], taps.weight[0])
+        down = wp.where(tap < 2, 1.0 - taps.weight[1], taps.weight[1])
+        total += right * down * unpack_texel(int(surfaces.glow[taps.index[tap]]))
+    return TEXEL_SCALE * wp.cw_mul(emission, total)
+
+
+@wp.func
 def wear_at(surfaces: Surfaces, surface: Surface, is_mean: bool) -> Wear:
     """Wear of a surface in a pixel: none."""
     return Wear()
@@ -405,8 +426,10 @@ def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> S
             result.metallic = details[3]
             result.transmission = result.transmission * (1.0 - result.metallic)
     result.color = (1.0 - result.transmission) * sample_base_color(surfaces, surface)
+    result.emission = emission_at(surfaces, surface)
     if surface.label[2] > 0.0:
         result.transmission = 0.0
+        result.emission = wp.vec3(0.0, 0.0, 0.0)
         shade = label_reflectance(surfaces.pattern[surface.row], wp.vec2(surface.label[0], surface.label[1]), surface.label[2])
         result.color = wp.vec3(shade, shade, shade)
         result.metallic = 0.0

@@ -26,7 +26,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadow_filter import LampShadows
 from synpick_warp.kernels.render.lighting.shadow_upsampling import upsample_shadows
 from synpick_warp.kernels.render.lighting.shadows import byte_of
-from synpick_warp.kernels.render.lighting.surfaces import Surface
+from synpick_warp.kernels.render.lighting.surfaces import Surface, add_emission
 from synpick_warp.kernels.render.lighting.tile_flags import needs
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
@@ -135,7 +135,8 @@ def shade_point(scene: AnyScene, sky: Sky, surface: Surface, wear: Wear, outgoin
     material = material_at(scene.surfaces, surface, wear)
     roughness = widen_roughness(material.roughness, surface.normal_spread)
     brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
-    return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
+    lit = shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, surface.face_normal, light.ratios, light.lamps)
+    return add_emission(scene.surfaces, lit, material.emission, scene.lights.exposure[sky.light])
 
 
 @wp.func

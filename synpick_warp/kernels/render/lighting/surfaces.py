@@ -23,7 +23,7 @@ texels has a variance of 1/6 + 1/12 = 1/4 texel²; at this width that is the var
 pixel wide, textures would be blurred."""
 OPACITY_SHIFT, OPACITY_MASK = wp.constant(30), wp.constant(3)
 """Place of a texel's opacity above its colour, read of `RandomizedSurfaces` alone, and its largest value."""
-NORMAL_MAP, ROUGHNESS_MAP, METALLIC_MAP = wp.constant(1), wp.constant(2), wp.constant(4)
+NORMAL_MAP, ROUGHNESS_MAP, METALLIC_MAP, GLOW_MAP = wp.constant(1), wp.constant(2), wp.constant(4), wp.constant(8)
 """Bits of `Surfaces.maps`."""
 NORMAL_ZERO = wp.constant(512)
 """Packed value of 0 of a map's normal."""
@@ -65,7 +65,8 @@ class Surfaces:
     texel: wp.array[wp.uint32]
     """(texel): square roots of linear red, green and blue in TEXEL_BITS bits each, red in the lowest, so that one load reads all."""
     maps: wp.array[int]
-    """(material): NORMAL_MAP, ROUGHNESS_MAP and METALLIC_MAP: which maps `detail` has in place of the values above."""
+    """(material): NORMAL_MAP, ROUGHNESS_MAP and METALLIC_MAP: which maps `detail` has in place of the values above; GLOW_MAP: there is an
+    emission texture."""
     detail: wp.array[wp.uint32]
     """(texel): x and y of the normal in the triangle's tangent frame, roughness and metallic, packed as `stages.render.scene.pack_details`
     does; read by `RandomizedSurfaces` alone."""
@@ -84,6 +85,8 @@ RandomizedSurfaces = variant_of(
     noise=wp.array3d[wp.uint32],
     glass=wp.array[wp.vec3],
     label=wp.array[Label],
+    emission=wp.array[wp.vec3],
+    glow=wp.array[wp.uint32],
 )
 """Surfaces with maps, or whose materials each episode draws at random (`looks`): constant, but for the materials of views.
 
@@ -91,7 +94,8 @@ More rows called material follow: one for each texture that episodes draw from, 
 body's material (view, body, then the table and the floor), `recolor` the matrix on the linear base colour of a material, whose result is
 clamped to 0..1, and `repeats` the factor on its texture coordinates; `wear` are the amounts of `lighting.wear`, whose noise is the
 table `noise`, in a part that the seed `pattern` draws; `glass` is transmission, index of refraction, and thickness [m]; `label` the place
-of the body's label, whose print has the same seed."""
+of the body's label, whose print has the same seed; `emission` is the light that it emits, in units of the white of a picture, and `glow`
+(texel) a factor on it, packed as `texel`."""
 AnySurfaces = Any
 """`Surfaces`, or `RandomizedSurfaces`: functions are compiled for each; see `variants`."""
 VARIANTS["surfaces"] = Surfaces, RandomizedSurfaces
@@ -126,10 +130,23 @@ class Surface:
 @wp.struct
 class SurfaceMaterial:
     """Material of a surface at one hit: linear base colour of what it does not transmit, metallic, perceptual roughness, shading normal
-    towards the viewer, and transmission."""
+    towards the viewer, transmission, and emission."""
 
     color: wp.vec3
     metallic: float
     roughness: float
     normal: wp.vec3
     transmission: float
+    emission: wp.vec3
+
+
+@wp.func
+def add_emission(surfaces: Surfaces, radiance: wp.vec3, emission: wp.vec3, exposure: float) -> wp.vec3:
+    """Radiance of a surface with what it emits, if its material may emit light; `exposure` is that of the environment map."""
+    return radiance
+
+
+@wp.func
+def add_emission(surfaces: RandomizedSurfaces, radiance: wp.vec3, emission: wp.vec3, exposure: float) -> wp.vec3:  # noqa: F811
+    """Radiance of a surface with what it emits: an emission of 1 is the white of a picture."""
+    return radiance + emission / exposure

@@ -26,7 +26,8 @@ TRIANGLES, STRIP, FAN = 4, 5, 6
 QUANTIZATION, TRANSFORM, WEBP = "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp"
 GLOSSINESS = "KHR_materials_pbrSpecularGlossiness"
 TRANSMISSION, IOR, VOLUME = "KHR_materials_transmission", "KHR_materials_ior", "KHR_materials_volume"
-_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS, TRANSMISSION, IOR, VOLUME}
+EMISSION = "KHR_materials_emissive_strength"
+_IMPLEMENTED = {QUANTIZATION, TRANSFORM, WEBP, GLOSSINESS, TRANSMISSION, IOR, VOLUME, EMISSION}
 # Required extensions that change how a surface looks, or what is beside it, but neither its shape nor its base colour: they are ignored.
 _DISPENSABLE = ("KHR_materials_", "KHR_lights_", "EXT_lights_", "KHR_animation_", "KHR_xmp", "KHR_node_visibility")
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -212,6 +213,12 @@ class Volume(msgspec.Struct):
     attenuationDistance: Any = None  # noqa: N815
 
 
+class EmissiveStrength(msgspec.Struct):
+    """Factor on the emission (KHR_materials_emissive_strength)."""
+
+    emissiveStrength: float = 1.0  # noqa: N815
+
+
 class MaterialExtensions(msgspec.Struct):
     """Extensions of a material that are read."""
 
@@ -219,16 +226,16 @@ class MaterialExtensions(msgspec.Struct):
     transmission: Transmission | None = msgspec.field(name=TRANSMISSION, default=None)
     ior: Ior | None = msgspec.field(name=IOR, default=None)
     volume: Volume | None = msgspec.field(name=VOLUME, default=None)
+    strength: EmissiveStrength = msgspec.field(name=EMISSION, default_factory=EmissiveStrength)
 
 
 class GltfMaterial(msgspec.Struct):
-    """glTF material: PBR parameters, normal map, extensions, and textures that are reported but not used."""
+    """glTF material: PBR parameters, normal map, emission, extensions; occlusion is that of the geometry."""
 
     pbrMetallicRoughness: Pbr | None = None  # noqa: N815
     extensions: MaterialExtensions | None = None
     normalTexture: TextureInfo | None = None  # noqa: N815
-    occlusionTexture: Any = None  # noqa: N815
-    emissiveTexture: Any = None  # noqa: N815
+    emissiveTexture: TextureInfo | None = None  # noqa: N815
     emissiveFactor: Three = (0.0, 0.0, 0.0)  # noqa: N815
     alphaMode: str = "OPAQUE"  # noqa: N815
 

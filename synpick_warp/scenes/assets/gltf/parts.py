@@ -14,7 +14,7 @@ from synpick_warp.scenes.assets import appearance
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf import document as schema
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
-from synpick_warp.scenes.types import OPAQUE, Glass
+from synpick_warp.scenes.types import BLACK, OPAQUE, Glass
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
 # Factors may exceed 0..1 by rounding.
@@ -25,6 +25,8 @@ _MAX_IOR = 3.0
 """Largest index of refraction; diamond has 2.4."""
 _MAX_THICKNESS = 1e4
 """Largest thickness, as that of coordinates."""
+_MAX_STRENGTH = 1e4
+"""Largest factor on emission, in units of the white of a picture."""
 _CLAMP, _MIRROR = 33071, 33648
 _RIGID = 1e-6
 """Relative difference up to which the joints of a skin move alike, as they do in the pose of binding."""
@@ -216,22 +218,25 @@ class _Reader:
         """Material of a primitive, and the reference to its base colour texture (None: it has none)."""
         if index not in self.materials:
             material = schema.item_at(self.gltf.materials, index, "material", self.path)
-            self.note_ignored(material)
             gloss = material.extensions.glossiness if material.extensions else None
             pbr = material.pbrMetallicRoughness or schema.Pbr()
             found, info = self.gloss(gloss) if gloss else self.pbr(pbr)
-            found = replace(found, glass=self.glass(material))
-            self.materials[index] = self.mapped(found, info, material.normalTexture, schema.Pbr() if gloss else pbr)
+            found = replace(found, glass=self.glass(material), emission=self.emission(material))
+            self.materials[index] = self.mapped(found, info, material, schema.Pbr() if gloss else pbr)
         return self.materials[index]
 
     def mapped(
-        self, material: appearance.FileMaterial, info: schema.TextureInfo | None, normal: schema.TextureInfo | None, pbr: schema.Pbr
+        self, material: appearance.FileMaterial, info: schema.TextureInfo | None, given: schema.GltfMaterial, pbr: schema.Pbr
     ) -> tuple[appearance.FileMaterial, schema.TextureInfo | None]:
-        """Add the maps of normals, and of roughness and metallic, that have the texture coordinates of the base colour `info`; without one
-        those of the normals. Returns the reference to the texture whose coordinates hold."""
+        """Add the maps of normals, roughness and metallic, and emission that have the coordinates of the base colour `info`; without
+        one, those of the first map. Returns the reference to the texture whose coordinates hold."""
         maps: dict[str, np.ndarray] = {}
         key: list[Any] = [id(material.texture), material.metallic, material.roughness]
-        for name, each in (("normalTexture", normal), ("metallicRoughnessTexture", pbr.metallicRoughnessTexture)):
+        glow, emission = given.emissiveTexture if any(material.emission) else None, material.emission
+        # A texture that cannot be used leaves no emission.
+        material = replace(material, emission=BLACK) if glow else material
+        textures = (("normalTexture", given.normalTexture), ("metallicRoughnessTexture", pbr.metallicRoughnessTexture))
+        for name, each in (*textures, ("emissiveTexture", glow)):
             if each is None or material.metallic is None or material.roughness is None:
                 continue
             if info is not None and self.coordinates(info) != self.coordinates(each):
@@ -246,7 +251,9 @@ class _Reader:
                 continue
             info = info or each
             key += [name, id(image), each.scale, pbr.roughnessFactor, pbr.metallicFactor]
-            if each is normal:
+            if each is glow:
+                maps["glow"], material = image, replace(material, emission=emission)
+            elif each is given.normalTexture:
                 maps["normal"] = appearance.encode_normals(image, each.scale)
             else:
                 # glTF 2.0, section 3.9.2: green is roughness, blue is metalness.
@@ -261,7 +268,7 @@ class _Reader:
                 self.mapped_textures[tuple(key)] = material.add_maps(**maps).texture
             except CatalogError as error:
                 raise CatalogError(f"{self.path}: {error}") from None
-        return replace(material, texture=self.mapped_textures[tuple(key)]), info
+        return replace(material, texture=self.mapped_textures[tuple(key)], has_glow="glow" in maps), info
 
     def coordinates(self, info: schema.TextureInfo) -> tuple[Any, ...]:
         """By what a texture's coordinates follow from a vertex: their set, transform and wrap modes."""
@@ -272,10 +279,15 @@ class _Reader:
         coordinates = info.texCoord if transform.texCoord is None else transform.texCoord
         return coordinates, transform.offset, transform.rotation, transform.scale, sampler.wrapS, sampler.wrapT
 
-    def note_ignored(self, material: schema.GltfMaterial) -> None:
-        """Note the features of a material that are not used. Occlusion is none: it is that of the geometry."""
-        if material.emissiveTexture is not None or any(material.emissiveFactor):
-            self.notes.ignored.append("emission")
+    def emission(self, material: schema.GltfMaterial) -> tuple[float, float, float]:
+        """Emission of a material, but for its texture: emissiveFactor times KHR_materials_emissive_strength."""
+        strength = (material.extensions or schema.MaterialExtensions()).strength.emissiveStrength
+        bounded = [("emissiveFactor", each, 1.0) for each in material.emissiveFactor]
+        for name, value, high in (("emissiveStrength", strength, _MAX_STRENGTH), *bounded):
+            if not -_FACTOR_TOLERANCE <= value <= high + _FACTOR_TOLERANCE:
+                raise CatalogError(f"{self.path}: {name} is {value:g}; allowed: 0 to {high:.0f}; correct the material")
+        red, green, blue = (max(strength * each, 0.0) for each in material.emissiveFactor)
+        return red, green, blue
 
     def glass(self, material: schema.GltfMaterial) -> Glass:
         """Transmission of a material: KHR_materials_transmission, else 1 - alpha in alphaMode BLEND. A transmission texture counts by its

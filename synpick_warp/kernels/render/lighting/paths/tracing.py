@@ -3,8 +3,8 @@
 A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f_l L_l / p_l + w_s f_s L_s / p_s). At surface k, one direction l is sampled by
 the map's radiance (next-event estimation) and one, s, by the BRDF. f: BRDF times cosine in that direction; L: the map's radiance there, 0
 if another surface is hit; p: density of the sampling. T_k, the throughput, is the product of f_s / p_s of the surfaces before. w: weights
-of multiple importance sampling by the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + q²), q the BRDF's density for l. Only the map
-emits light.
+of multiple importance sampling by the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + q²), q the BRDF's density for l. Surfaces that
+emit light are not sampled: paths that come upon them add T_k times their emission.
 
 `trace_paths_kernel` is the path-traced reference; `coarse` uses the same functions with a few paths per pixel of a smaller image.
 """
@@ -24,7 +24,7 @@ from synpick_warp.kernels.render.lighting.sampling import (
     sample_environment,
     scrambled_point,
 )
-from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces
+from synpick_warp.kernels.render.lighting.surfaces import RandomizedSurfaces, Surfaces, add_emission
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, AnyShot, Hit, Meshes, ShadedImage, Table, body_of
@@ -126,6 +126,8 @@ class Vertex:
     face_normal: wp.vec3
     """Geometric normal, in the world, on the side of the incoming ray."""
     brdf: Brdf
+    emission: wp.vec3
+    """As in `SurfaceMaterial`."""
 
 
 @wp.struct
@@ -176,6 +178,7 @@ def make_vertex(
     vertex.origin = at + RAY_OFFSET * surface.face_normal
     vertex.face_normal = surface.face_normal
     material = material_at(scene.surfaces, surface, wear_at(scene.surfaces, surface, is_mean))
+    vertex.emission = material.emission
     roughness = wp.max(material.roughness, min_roughness)
     vertex.brdf = make_brdf(scene.surfaces.albedo, material.color, material.metallic, roughness, material.normal, outgoing)
     return vertex
@@ -216,6 +219,20 @@ def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, b
     else:
         result.indirect += wp.cw_mul(throughput.diffuse, radiance)
     return result
+
+
+@wp.func
+def meet_emission(surfaces: Surfaces, path: Path, emission: wp.vec3, exposure: float) -> SplitRadiance:
+    """Radiance of a path with what the last surface emits, if its material may emit light."""
+    return path.radiance
+
+
+@wp.func
+def meet_emission(surfaces: RandomizedSurfaces, path: Path, emission: wp.vec3, exposure: float) -> SplitRadiance:  # noqa: F811
+    """Radiance of a path with what the last surface emits, as light from other surfaces. What the camera sees is added apart."""
+    if path.bounce == 0 or wp.max(emission) == 0.0:
+        return path.radiance
+    return add_light(path.radiance, path.throughput, emission / exposure, path.bounce)
 
 
 @wp.func
@@ -300,6 +317,7 @@ def extend_path(
     if bounce == 0:
         light = context.first_light
     result = path
+    result.radiance = meet_emission(scene.surfaces, path, vertex.emission, scene.lights.exposure[context.light])
     result.bounce = TERMINATED
     dimension = 1 + DIMENSIONS_PER_BOUNCE * bounce
     direct = sample_direct_light(scene, shot, rules, context, light, vertex, sample_point(context, index, dimension))
@@ -365,6 +383,7 @@ def trace_paths_kernel(scene: AnyScene, shot: AnyShot, rules: PathRules, first: 
             start = hit_position(views.cameras, view, ray, hit.depth)
             width = footprint * hit.depth
             vertex = make_vertex(scene, shot, view, hit, start, -direction, width, 0.0, False)
+            total = add_emission(scene.surfaces, total, vertex.emission, scene.lights.exposure[context.light])
             diffuse = vertex.brdf.diffuse
             path = init_path(width)
             while path.bounce != TERMINATED:
