@@ -360,7 +360,7 @@ def test_what_transmission_leaves_out_is_said(tmp_path):
     assert finish.glass.transmission == pytest.approx(COLORS[..., 0].mean() / 255)
     assert said == ["ignored: the texture of transmission but for its mean, absorption, or the texture of thickness"]
     assert glass(ior={"ior": 1.3}).read(tmp_path)[2] == ["ignored: KHR_materials_ior"]
-    assert glass(0.5, "MASK").read(tmp_path)[2] == ["ignored: transparency"]
+    assert glass(1.0, "BLEND").read(tmp_path)[2] == ["ignored: transparency"]
 
 
 def test_parts_keep_their_transmission(tmp_path):

@@ -238,6 +238,7 @@ class GltfMaterial(msgspec.Struct):
     emissiveTexture: TextureInfo | None = None  # noqa: N815
     emissiveFactor: Three = (0.0, 0.0, 0.0)  # noqa: N815
     alphaMode: str = "OPAQUE"  # noqa: N815
+    alphaCutoff: float = 0.5  # noqa: N815
 
 
 class Gltf(msgspec.Struct):

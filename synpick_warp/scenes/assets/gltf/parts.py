@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets import appearance
+from synpick_warp.scenes.assets.alpha_masks import CLAMP, MIRROR, cut_mask
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf import document as schema
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
@@ -27,7 +28,6 @@ _MAX_THICKNESS = 1e4
 """Largest thickness, as that of coordinates."""
 _MAX_STRENGTH = 1e4
 """Largest factor on emission, in units of the white of a picture."""
-_CLAMP, _MIRROR = 33071, 33648
 _RIGID = 1e-6
 """Relative difference up to which the joints of a skin move alike, as they do in the pose of binding."""
 
@@ -69,7 +69,7 @@ class _Reader:
             for each in () if mesh is None else schema.item_at(self.gltf.meshes, mesh, "mesh", self.path).primitives:
                 if each.mode not in (schema.TRIANGLES, schema.STRIP, schema.FAN):
                     continue
-                part = self.part(each)
+                part = self.part(each, skin is None)
                 rows += max(len(part.vertices), len(part.faces))
                 if rows > MAX_ROWS or len(parts) >= MAX_PARTS:
                     raise CatalogError(f"{self.path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
@@ -123,8 +123,8 @@ class _Reader:
         moved = np.einsum("vab,vb->va", blend[:, :3, :3], part.vertices) + blend[:, :3, 3]
         return replace(part, vertices=moved, normals=None)
 
-    def part(self, primitive: schema.Primitive) -> MeshPart:
-        """Geometry and material of a primitive as a mesh part."""
+    def part(self, primitive: schema.Primitive, rigid: bool) -> MeshPart:
+        """Geometry and material of a primitive as a mesh part; without what its alpha mask removes, if it is `rigid`."""
         attributes = primitive.attributes
         if "POSITION" not in attributes:
             raise CatalogError(f"{self.path}: a mesh has no positions; export it again")
@@ -149,13 +149,33 @@ class _Reader:
             elif uv is None:
                 raise CatalogError(f"{self.path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
             else:
-                material, uv = self.wrapped(material, _transform_uv(uv, info), info)
+                uv = _transform_uv(uv, info)
         if primitive.targets:
             self.notes.ignored.append("morph targets")
         if colors is not None:
             material = replace(material, color=appearance.WHITE) if primitive.material is None else material
             colors = appearance.linear_to_srgb(colors[:, :3])
-        return MeshPart(vertices, _triangles(corners, primitive.mode), normals, uv, colors, material)
+        part = MeshPart(vertices, _triangles(corners, primitive.mode), normals, uv, colors, material)
+        given = schema.GltfMaterial() if primitive.material is None else self.gltf.materials[primitive.material]
+        part = self.masked(part, given, rigid) if given.alphaMode == "MASK" else part
+        if info is None or part.uv is None:
+            return part
+        material, uv = self.wrapped(part.material, part.uv, info)
+        return replace(part, material=material, uv=uv)
+
+    def masked(self, part: MeshPart, material: schema.GltfMaterial, rigid: bool) -> MeshPart:
+        """Part without what the alpha mask of its material removes."""
+        pbr, gloss = material.pbrMetallicRoughness or schema.Pbr(), material.extensions and material.extensions.glossiness
+        factor, info = (gloss.diffuseFactor[3], gloss.diffuseTexture) if gloss else (pbr.baseColorFactor[3], pbr.baseColorTexture)
+        if info is None or part.uv is None or self.texture(info) is None:
+            return part if factor >= material.alphaCutoff else replace(part, faces=part.faces[:0])
+        with PillowImage.open(io.BytesIO(self.files[self.source(info)])) as image:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+        modes = self.coordinates(info)[-2:]
+        threshold = 255.0 * material.alphaCutoff / max(factor, _FACTOR_TOLERANCE)
+        cut = cut_mask(part, alpha, threshold, (modes[0], modes[1])) if rigid and alpha.min() < threshold else None
+        self.notes.ignored += ["transparency"] if cut is None and alpha.min() < threshold else []
+        return cut or part
 
     def attribute(self, index: int | None, name: str, widths: tuple[int, ...], count: int) -> np.ndarray | None:
         """Values of an attribute that may be absent, one row for each of `count` vertices."""
@@ -316,7 +336,7 @@ class _Reader:
             self.notes.ignored += [name for name, extension in unused if extension is not None]
         elif volume.thicknessTexture is not None or volume.attenuationDistance is not None:
             self.notes.ignored.append("absorption, or the texture of thickness")
-        if material.alphaMode != "OPAQUE" and alpha == 1.0:
+        if material.alphaMode == "BLEND" and alpha == 1.0:
             self.notes.ignored.append("transparency")
         return Glass(transmission, ior, volume.thicknessFactor) if transmission > 0.0 else OPAQUE
 
@@ -406,10 +426,10 @@ class _Reader:
         if texture.sampler is None or material.texture is None or not len(uv) or (uv.min() >= -1e-3 and uv.max() <= 1.0 + 1e-3):
             return material, uv
         sampler = schema.item_at(self.gltf.samplers, texture.sampler, "sampler", self.path)
-        mirror = sampler.wrapS == _MIRROR, sampler.wrapT == _MIRROR
+        mirror = sampler.wrapS == MIRROR, sampler.wrapT == MIRROR
         if any(mirror):
             material, uv = self.mirrored(material, uv, (id(material.texture), *mirror))
-        clamp = sampler.wrapS == _CLAMP, sampler.wrapT == _CLAMP
+        clamp = sampler.wrapS == CLAMP, sampler.wrapT == CLAMP
         if any(clamp):
             image, uv = appearance.clamp_texture(material.texture, uv, clamp, self.notes.ignored)
             material = replace(material, texture=image)
