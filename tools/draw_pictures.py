@@ -1,7 +1,7 @@
 """Generator of the documentation's pictures: layers of a view, an animated pick, grids of training views, a robot cell (CELL.md).
 
 Bakes (simulates and renders) four small data sets of embedded objects under embedded environment maps, and runs the first code blocks of
-configs/CELL.md, in a temporary folder; takes more than ten minutes on two CPU cores.
+configs/CELL.md, in a temporary folder; takes some minutes on a GPU, and hours on a CPU.
 
     python -m tools.draw_pictures                     # into tools/pictures/
     python -m tools.draw_pictures --out DIR --device cuda:0
@@ -53,8 +53,7 @@ PICK_SETTINGS = COMMON | {
     # The first camera is the one that perception uses; the second is drawn.
     "cameras.resolution": [800, 450],
     "cameras.fov": 34.0,
-    "cameras.target": [0.0, 0.0, 0.19],
-    "cameras.positions": [[0.0, 0.0, 1.6], [0.42, -0.57, 1.06]],
+    "cameras.positions": [[0.0, 0.0, 1.6], [0.38, -0.52, 0.92]],
     "cameras.ups": [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
 }
 TABLE_COLUMNS = 4
@@ -75,8 +74,8 @@ PANEL = (480, 270)
 CAPTION_SCALE = 0.5
 CELL_WIDTH, STEPS = 1000, 3
 """Width of the picture of the cell [px], and number of code blocks of the page that make it: its files, a mesh, the rendered cell."""
-GIF_WIDTH, GIF_COLORS, GIF_STRIDE, FRAME_RATE = 400, 128, 1, 15
-"""Width [px], palette size, episode frames per GIF frame, and frame rate of episodes [Hz]: the GIF is in real time."""
+GIF_WIDTH, GIF_COLORS, GIF_STRIDE, FRAME_RATE = 400, 96, 2, 15
+"""Width [px], palette size, episode frames per GIF frame, and frame rate of episodes [Hz]: the GIF has 7.5 Hz, in real time."""
 LEAD_OUT = 6
 """Frames after the end of the attempt."""
 
