@@ -199,6 +199,7 @@ class Chunks:
         name = hashlib.sha256(repr([(each.start, each.stop, each.step) for each in ranges]).encode()).hexdigest()[:16]
         self._place = f"{CLAIMS}/{name}"
         self.sizes = self._agree(Sizes(sum(map(len, ranges)), chunk))
+        self._order = list(self._in_order())
 
     def _agree(self, sizes: Sizes) -> Sizes:
         """Agree on the partition by create-if-absent: that of the worker that started first. Raises StoreError: its record is damaged."""
@@ -234,7 +235,7 @@ class Chunks:
     def take(self) -> tuple[Chunk | None, bool]:
         """Claim a free chunk, which may have no episodes left; None: there is none at present. Second: whether all have end marks."""
         over, leased = self._state()
-        open_chunks = [each for each in self._order() if each[0] not in over]
+        open_chunks = [each for each in self._order if each[0] not in over]
         return (self._take_first(open_chunks, leased), False) if open_chunks else (None, True)
 
     def _take_first(self, open_chunks: Sequence[tuple[int, tuple[int, int]]], leased: set[int]) -> Chunk | None:
@@ -280,15 +281,14 @@ class Chunks:
                 (leased if folder == self._place else over).add(int(name))
         return over, leased
 
-    def _order(self) -> Iterator[tuple[int, tuple[int, int]]]:
+    def _in_order(self) -> Iterator[tuple[int, tuple[int, int]]]:
         """Order in which this worker tries the chunks, as (number, bounds): the larger before the smaller; those of a size cyclically from
         a hash of the worker's name, so that few workers collide."""
         first = int(hashlib.sha256(self.claims.owner.encode()).hexdigest(), 16)
         for _, group in itertools.groupby(enumerate(self.sizes.bounds()), lambda each: each[1][1] - each[1][0]):
             chunks = list(group)
             turn = first % len(chunks)
-            yield from chunks[turn:]
-            yield from chunks[:turn]
+            yield from chunks[turn:] + chunks[:turn]
 
     def _left(self, start: int, end: int) -> list[int]:
         """Episodes of a chunk that have no done mark, sorted; arguments: its bounds in the plan."""

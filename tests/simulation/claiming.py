@@ -6,6 +6,7 @@ Workers start together, die and are replaced, freeze, and their requests fail; w
 from __future__ import annotations
 
 import functools
+import itertools
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from synpick_warp.cloud.claims import CLAIMS, Claims, LeaseLostError
 from synpick_warp.cloud.ledger import ENTRY, FINISHED, INDEX, Ledger
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.files.load import config_to_toml
-from synpick_warp.dataset.commit.manifest import encode_manifest, episode_entry, make_manifest
+from synpick_warp.dataset.commit.manifest import encode_manifest, make_manifest
 from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores import store
@@ -82,10 +83,10 @@ def _finalize(log: Ledger, folder: Path) -> int:
     return 0
 
 
-def files_of(episode: int) -> dict[str, bytes]:
-    """Files of an episode."""
-    names = f"train/{episode:06d}/rgb", f"train/{episode:06d}/depth", f"{INDEX}/{episode:06d}.tar.gz"
-    return {name: f"{name} of {episode}".encode() for name in names}
+FILES = "train/{0}/rgb", "train/{0}/depth", f"{INDEX}/{{0}}.tar.gz"
+MARKS = "manifest/{0}.sha256", "manifest/{0}.json"
+OBJECTS = [[name.format(f"{episode:06d}") for name in FILES + MARKS] for episode in range(EPISODES)]
+"""Objects of each episode, in the order in which they may be written; their content is their name."""
 
 
 class Schedule:
@@ -99,8 +100,8 @@ class Schedule:
         self.store = FaultyStore(self.simulation, FAULTS if faults is None else faults)
         self.store.observe = self._check
         self.simulation.at_point = self._at_point
-        self._death = death or (lambda _: self._deaths < self._most and self.simulation.draw.random() < DEATH)
-        self._most = self.simulation.draw.randrange(DEATHS + 1)
+        draw = self.simulation.draw
+        self._death, self._most = death or (lambda _: draw.random() < DEATH), draw.randrange(DEATHS + 1) if death is None else 1
         self._deaths = self._freezes = self._trace = self._workers = 0
         self._marked: dict[str, Process] = {}
         self.made = 0
@@ -111,7 +112,7 @@ class Schedule:
         with self.simulation as simulation:
             simulation.run(*(self._start() for _ in range(WORKERS)))
             points = simulation.points
-            self._death, self.store.faults, self._drawn = (lambda _: False), {}, False
+            self._most, self.store.faults, self._drawn = 0, {}, False
             simulation.run(self._start())
             assert not simulation.errors, simulation.errors
         self._check_end()
@@ -123,7 +124,7 @@ class Schedule:
         return process, functools.partial(self._work, self.store.open(process), process)
 
     def _at_point(self, process: Process) -> None:
-        if process.name.startswith("worker") and self._death(self.simulation.points):
+        if self._deaths < self._most and process.name.startswith("worker") and self._death(self.simulation.points):
             self._deaths += 1
             process.dead = True
 
@@ -152,10 +153,11 @@ class Schedule:
             clock.sleep(0.0)
         try:
             work.permit(episode)
-            for name, data in files_of(episode).items():
-                log.store.put(name, data)
+            *files, checksums, mark = OBJECTS[episode]
+            for name in files:
+                log.store.put(name, name.encode())
             work.permit(episode)
-            log.commit(episode, b"checksums", b"entry")
+            log.commit(episode, checksums.encode(), mark.encode())
             work.delivered(episode)
         except LeaseLostError:
             return
@@ -165,21 +167,18 @@ class Schedule:
         self._trace = hash((self._trace, self.simulation.now, write.key, write.data))
         there = self.store.objects
         if match := ENTRY.fullmatch(write.key):
-            names = [*files_of(int(match[1])), f"{episode_entry(int(match[1]))}.sha256"]
-            assert all(name in there for name in names), f"{write.key} before its files"
+            *before, _ = OBJECTS[int(match[1])]
+            assert all(map(there.__contains__, before)), f"{write.key} before its files"
             assert self._marked.setdefault(write.key, write.process) is write.process, f"{write.key} by two workers"
         elif "/done/" in write.key:
-            first = int(write.key[-6:])  # A chunk has one episode.
-            assert f"{episode_entry(first)}.json" in there, f"{write.key} before its episode"
+            *_, mark = OBJECTS[int(write.key[-6:])]  # A chunk has one episode.
+            assert mark in there, f"{write.key} before its episode"
         elif write.key == FINISHED:
-            assert all(f"{episode_entry(each)}.json" in there for each in range(EPISODES)), "finished before the last episode"
+            assert all(mark in there for *_, mark in OBJECTS), "finished before the last episode"
 
     def _check_end(self) -> None:
         found = {key: data for key, (data, _) in self.store.objects.items() if not key.startswith(CLAIMS)}
-        expected = {name: data for episode in range(EPISODES) for name, data in files_of(episode).items()}
-        for episode in range(EPISODES):
-            expected |= {f"{episode_entry(episode)}.sha256": b"checksums", f"{episode_entry(episode)}.json": b"entry"}
-        lost = sorted(name for name, data in expected.items() if found.get(name) != data)
+        lost = [name for name in itertools.chain.from_iterable(OBJECTS) if found.get(name) != name.encode()]
         assert not lost, f"lost: {lost}"
         assert FINISHED in found, "not finished"
         wasted = self.made - EPISODES

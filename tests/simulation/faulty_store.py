@@ -44,7 +44,8 @@ class FaultyStore:
     def __init__(self, simulation: Simulation, faults: dict[str, float] | None = None) -> None:
         """`faults`: probability of each."""
         self.simulation, self.faults = simulation, faults or {}
-        self.objects: dict[str, tuple[bytes, int]] = {}
+        self.objects: dict[str, tuple[bytes, dict[str, Any]]] = {}
+        """Content and metadata."""
         self.injected = dict.fromkeys((REFUSED, LOST, DELAYED), 0)
         """Number of faults so far."""
         self.observe: Callable[[Write], object] = lambda write: None
@@ -65,11 +66,12 @@ class FaultyStore:
         draw = self.simulation.draw
         late_answer = draw.random() < 0.5  # Not both of its ways take time, since each costs a change of threads.
         if not late_answer:
-            self.simulation.sleep(LATENCY * draw.random())
+            self.simulation.wait(LATENCY * draw.random())
         number, fault = draw.random(), ""
         for name, share in self.faults.items():
-            if 0.0 <= number < share and (may_delay or name != DELAYED):
-                fault = name
+            if number < share:
+                fault = name if may_delay or name != DELAYED else ""
+                break
             number -= share
         if fault:
             self.injected[fault] += 1
@@ -80,63 +82,60 @@ class FaultyStore:
             raise _Error("timed out")
         result = carry_out()
         if late_answer:
-            self.simulation.sleep(LATENCY * draw.random())
+            self.simulation.wait(LATENCY * draw.random())
         if fault == LOST:
             raise _Error("connection reset")
         return result
 
     def _carry_out_late(self, carry_out: Callable[[], Any], seconds: float) -> None:
-        self.simulation.sleep(seconds)
+        self.simulation.wait(seconds)
         with contextlib.suppress(_Error, FileNotFoundError):
             carry_out()
 
     def put(self, process: Process, key: str, data: bytes | Path, *, mode: Any = "overwrite", **_: Any) -> dict[str, Any]:
-        content = data.read_bytes() if isinstance(data, Path) else bytes(data)
+        content = data if isinstance(data, bytes) else data.read_bytes()
 
         def carry_out() -> dict[str, Any]:
             found = self.objects.get(key)
             if mode == "create" and found is not None:
                 raise _AlreadyExistsError(key)
-            if isinstance(mode, dict) and (found is None or str(found[1]) != mode["e_tag"]):
+            if isinstance(mode, dict) and (found is None or found[1]["e_tag"] != mode["e_tag"]):
                 raise _PreconditionError(key)
             self.observe(Write(process, key, content, found and found[0]))
             self._version += 1
-            self.objects[key] = content, self._version
-            return self._meta(key)
+            meta = {"path": key, "size": len(content), "e_tag": str(self._version), "version": None, "last_modified": None}
+            self.objects[key] = content, meta
+            return meta
 
         return self._request(carry_out, may_delay=True)
 
-    def _meta(self, key: str) -> dict[str, Any]:
-        data, version = self.objects[key]
-        return {"path": key, "size": len(data), "e_tag": str(version), "version": None, "last_modified": None}
+    def _find(self, key: str) -> tuple[bytes, dict[str, Any]]:
+        if key not in self.objects:
+            raise FileNotFoundError(f"no object {key}")
+        return self.objects[key]
 
     def head(self, _: Process, key: str) -> dict[str, Any]:
-        return self._request(lambda: self._meta(self._found(key)))
+        return self._request(lambda: self._find(key)[1])
 
     def get(self, _: Process, key: str, options: dict[str, Any] | None = None) -> Any:
         def carry_out() -> Any:
-            data = self.objects[self._found(key)][0]
+            data, meta = self._find(key)
             start, end = (options or {}).get("range", (0, len(data)))
-            return types.SimpleNamespace(meta=self._meta(key), bytes=lambda: data[start:end])
+            return types.SimpleNamespace(meta=meta, bytes=lambda: data[start:end])
 
         return self._request(carry_out)
-
-    def _found(self, key: str) -> str:
-        if key not in self.objects:
-            raise FileNotFoundError(f"no object {key}")
-        return key
 
     def list(self, _: Process, folder: str | None, offset: str | None, chunk_size: int) -> Iterator[list[dict[str, Any]]]:
         def carry_out() -> list[dict[str, Any]]:
             prefix, after = f"{folder}/" if folder else "", offset or ""
-            inside = sorted(key for key in self.objects if key.startswith(prefix) and key > after)
-            return [self._meta(key) for key in inside[:chunk_size]]
+            inside = sorted([key for key in self.objects if key > after and key.startswith(prefix)])
+            return [self.objects[key][1] for key in inside[:chunk_size]]
 
         return iter([self._request(carry_out)])
 
     def delete(self, process: Process, key: str) -> None:
         def carry_out() -> None:
-            self.observe(Write(process, key, None, self.objects[self._found(key)][0]))
+            self.observe(Write(process, key, None, self._find(key)[0]))
             del self.objects[key]
 
         self._request(carry_out, may_delay=True)

@@ -40,13 +40,20 @@ class Process:
         """`frozen`: virtual time up to which it is suspended [s]."""
 
 
-class _Task:
-    """Thread of a process: waits until `ready`, or until `wake`."""
+class _Flag:
+    """What threads wait for: it is up, or not yet."""
 
-    def __init__(self, process: Process, body: greenlet) -> None:
-        self.process, self.body, self.done = process, body, False
-        self.ready: Callable[[], bool] | None = None
-        self.wake = -math.inf
+    up = False
+
+
+class _Task(_Flag):
+    """Thread of a process: waits until `flag` is up, or until `wake`. Up when it has ended."""
+
+    def __init__(self, process: Process, body: greenlet, wake: float) -> None:
+        self.process, self.body, self.flag, self.wake = process, body, _NEVER, wake
+
+
+_NEVER = _Flag()
 
 
 class Simulation:
@@ -60,13 +67,13 @@ class Simulation:
         """Called at each scheduling point: it may kill or freeze processes."""
         self.errors: list[tuple[str, BaseException]] = []
         """Errors that ended a thread, with the name of its process."""
-        self._main = _Task(Process("main"), getcurrent())
+        self._main = _Task(Process("main"), getcurrent(), START)
         self._tasks, self._running = [self._main], self._main
-        self._hung = False
+        self._awaited, self._ended, self._hung = set[_Task](), _Flag(), False
 
     def __enter__(self) -> Simulation:
         self._patch = pytest.MonkeyPatch()
-        seam = {"time": lambda: self.now, "monotonic": lambda: self.now, "sleep": self.sleep}
+        seam = {"time": lambda: self.now, "monotonic": lambda: self.now, "sleep": self.wait}
         seam |= {kind.__name__.removeprefix("_"): functools.partial(kind, self) for kind in (_Event, _Lock, _Thread, _Executor)}
         for name, value in seam.items():
             self._patch.setattr(clock, name, value)
@@ -78,13 +85,17 @@ class Simulation:
             task.process.dead = task is not self._main
         self._hung = False
         with contextlib.suppress(HungError):
-            self.wait(lambda: all(task.done for task in self._tasks if task is not self._main))
+            self._join(self._tasks[1:])
         self._patch.undo()
 
     def run(self, *processes: tuple[Process, Callable[[], object]]) -> None:
         """Run functions as processes until all of them have ended."""
-        tasks = [self.start(process, function) for process, function in processes]
-        self.wait(lambda: all(task.done for task in tasks))
+        self._join([self.start(process, function) for process, function in processes])
+
+    def _join(self, tasks: Iterable[_Task]) -> None:
+        self._awaited = set(tasks)
+        self._ended.up = not self._awaited
+        self.wait(flag=self._ended)
 
     @property
     def process(self) -> Process:
@@ -93,7 +104,7 @@ class Simulation:
 
     def start(self, process: Process, function: Callable[[], object]) -> _Task:
         """Start a thread of a process."""
-        task = _Task(process, greenlet(lambda *_: self._execute(task, function), self._main.body))
+        task = _Task(process, greenlet(lambda *_: self._execute(task, function), self._main.body), self.now)
         self._tasks.append(task)
         return task
 
@@ -106,83 +117,79 @@ class Simulation:
             pass
         except BaseException as error:
             self.errors.append((task.process.name, error))
-        task.done = True
+        task.up = True
         self._tasks.remove(task)
+        self._awaited.discard(task)
+        self._ended.up = not self._awaited
         self._running = self._choose()
         task.body.parent = self._running.body
 
-    def sleep(self, seconds: float) -> None:
-        """Sleep in virtual time."""
-        self.wait(None, seconds)
-
-    def wait(self, ready: Callable[[], bool] | None, seconds: float | None = None) -> bool:
-        """Scheduling point: block the running thread until a condition holds, or for a virtual time; returns the condition."""
+    def wait(self, seconds: float = math.inf, flag: _Flag = _NEVER) -> bool:
+        """Scheduling point: block the running thread for a virtual time, or until a flag is up; returns whether it is up."""
         task = self._running
-        self._check(task)
+        if task.process.dead:
+            raise Dead
         self.points += 1
         self.at_point(task.process)
-        task.ready, task.wake = ready, self.now + seconds if seconds is not None else -math.inf if ready is None else math.inf
+        task.flag, task.wake = flag, self.now + seconds
         chosen = self._choose()
         if chosen is not task:
             self._running = chosen
             chosen.body.switch()
-        task.ready, task.wake = None, -math.inf
         if self._hung and task is self._main:
             raise HungError(f"no thread can go on, or none ends: {self.now - START:.1f} s, {len(self._tasks)} threads")
-        self._check(task)
-        return ready is not None and ready()
-
-    def _check(self, task: _Task) -> None:
         if task.process.dead:
             raise Dead
+        return flag.up
 
     def _choose(self) -> _Task:
-        """Draw the next thread; without one that can run, virtual time goes on to the next event."""
-        while True:
-            now, found = self.now, []
-            for task in self._tasks:  # Most of the time of a simulation goes here.
-                process, ready = task.process, task.ready
-                if process.dead or (process.frozen <= now and (task.wake <= now or (ready is not None and ready()))):
-                    found.append(task)
-            if found:
-                return found[int(self.draw.random() * len(found))]
-            events = [task.wake for task in self._tasks if now < task.wake < math.inf]
-            events += [task.process.frozen for task in self._tasks if task.process.frozen > now]
-            if not events or now > START + LONGEST:
-                self._hung = True
-                return self._main
-            self.now = min(events)
+        """Draw the next thread of those that can run first; virtual time goes on to then."""
+        now, first, found = self.now, math.inf, [self._main]
+        for task in self._tasks:
+            process = task.process
+            at = now if process.dead or task.flag.up else task.wake
+            if at < process.frozen and not process.dead:
+                at = process.frozen
+            if at < first:
+                first, found = at, [task]
+            elif at == first:
+                found.append(task)
+        if first > START + LONGEST:
+            self._hung = True
+            return self._main
+        self.now = first
+        return found[int(self.draw.random() * len(found))]
 
 
-class _Event:
+class _Event(_Flag):
     """`threading.Event` in a simulation."""
 
     def __init__(self, simulation: Simulation) -> None:
-        self._simulation, self._set = simulation, False
+        self._simulation = simulation
 
     def set(self) -> None:
-        self._set = True
+        self.up = True
 
     def is_set(self) -> bool:
-        return self._set
+        return self.up
 
-    def wait(self, timeout: float | None = None) -> bool:
-        return self._simulation.wait(self.is_set, timeout)
+    def wait(self, timeout: float = math.inf) -> bool:
+        return self._simulation.wait(timeout, self)
 
 
-class _Lock:
-    """`threading.Lock` in a simulation."""
+class _Lock(_Flag):
+    """`threading.Lock` in a simulation: up while nobody holds it."""
 
     def __init__(self, simulation: Simulation) -> None:
-        self._simulation, self._held = simulation, False
+        self._simulation, self.up = simulation, True
 
     def __enter__(self) -> None:
-        while self._held or not self._simulation.wait(lambda: not self._held):
+        while not self._simulation.wait(flag=self):
             pass
-        self._held = True
+        self.up = False
 
     def __exit__(self, *_: object) -> None:
-        self._held = False
+        self.up = True
 
 
 class _Thread:
@@ -190,21 +197,20 @@ class _Thread:
 
     def __init__(self, simulation: Simulation, target: Callable[[], object], name: str = "", daemon: bool = False) -> None:
         self._simulation, self._target, self._process = simulation, target, simulation.process
-        self.name, self._task = name, None
+        self.name, self._task = name, _Flag()
 
     def start(self) -> None:
         self._task = self._simulation.start(self._process, self._target)
 
     def join(self) -> None:
-        task = self._task
-        self._simulation.wait(lambda: task is None or task.done)
+        self._simulation.wait(flag=self._task)
 
 
-class _Future:
-    """Result of a task of `_Executor`."""
+class _Future(_Flag):
+    """Result of a task of `_Executor`: up when that has ended."""
 
     def __init__(self, simulation: Simulation) -> None:
-        self._simulation, self._ended, self._result, self._error = simulation, False, None, None
+        self._simulation, self._result, self._error = simulation, None, None
 
     def run(self, function: Callable[[], object]) -> None:
         """Run a function, whose result or error this has then."""
@@ -214,23 +220,27 @@ class _Future:
             raise
         except BaseException as error:
             self._error = error
-        self._ended = True
+        self.up = True
 
     def done(self) -> bool:
-        return self._ended
+        return self.up
 
     def result(self) -> Any:
-        self._simulation.wait(self.done)
+        self._simulation.wait(flag=self)
         if self._error is not None:
             raise self._error
         return self._result
 
 
-class _Executor:
-    """`ThreadPoolExecutor` in a simulation."""
+class _Executor(_Flag):
+    """`ThreadPoolExecutor` in a simulation: up while it has nothing to do."""
 
     def __init__(self, simulation: Simulation, workers: int, name: str = "") -> None:
         self._simulation, self._free, self._waiting, self._open = simulation, workers, [], 0
+
+    @property
+    def up(self) -> bool:
+        return not (self._waiting or self._open)
 
     def __enter__(self) -> _Executor:
         return self
@@ -263,4 +273,4 @@ class _Executor:
         if cancel_futures:
             self._waiting.clear()
         if wait:
-            self._simulation.wait(lambda: not (self._waiting or self._open))
+            self._simulation.wait(flag=self)

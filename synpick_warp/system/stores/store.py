@@ -34,32 +34,25 @@ SMALL = 1 << 20
 _SET_CREDENTIALS = "the store does not accept the credentials; set them, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
 _ADVICE = (
     (
-        ("NoSuchBucket", "bucket does not exist", "NoSuchContainer", "ContainerNotFound"),
+        re.compile("NoSuchBucket|bucket does not exist|NoSuchContainer|ContainerNotFound"),
         "there is no such bucket; make it first, or correct its name",
     ),
-    (("RequestTimeTooSkewed",), "the clock of this machine differs from the store's by more than the store allows; set it (NTP)"),
     (
-        ("InvalidAccessKeyId", "SignatureDoesNotMatch", "InvalidToken", "ExpiredToken", "status code: 401", "Unauthenticated"),
+        re.compile("RequestTimeTooSkewed"),
+        "the clock of this machine differs from the store's by more than the store allows; set it (NTP)",
+    ),
+    (
+        re.compile("InvalidAccessKeyId|SignatureDoesNotMatch|InvalidToken|ExpiredToken|status code: 401|Unauthenticated"),
         _SET_CREDENTIALS,
     ),
     (
-        ("AccessDenied", "status code: 403", "PermissionDenied", "Permission denied"),
+        re.compile("AccessDenied|status code: 403|PermissionDenied|Permission denied"),
         "the credentials may not do that; give them the right to read, list and write there, or set those that have it",
     ),
-    (("credentials", "169.254.169.254"), _SET_CREDENTIALS),
+    (re.compile("credentials|169\\.254\\.169\\.254"), _SET_CREDENTIALS),
 )
-"""Substrings of error messages, and the advice for each; the first match counts. Responses to HEAD requests contain only a status code."""
-_PASSING = (
-    "status code: 5",
-    "status code: 429",
-    "slowdown",
-    "timed out",
-    "timeout",
-    "connection",
-    "error sending request",
-    "incompletebody",
-    "error decoding",
-)
+"""Patterns in error messages, and the advice for each; the first match counts. Responses to HEAD requests contain only a status code."""
+_PASSING = re.compile("status code: (?:5|429)|slowdown|timed out|timeout|connection|error sending request|incompletebody|error decoding")
 """Signs of transient errors in their text, in lower case. They go before advice, whose signs may be in a key or an answer."""
 _LASTING = ("status code: 401", "status code: 403", "status code: 404", "status code: 501", "169.254.169.254")
 """Signs that an error is not transient, whatever else its text has; the last is the metadata service, which only some machines have."""
@@ -127,9 +120,9 @@ class Store:
                 raise
             except (self._errors.BaseError, OSError, NotImplementedError) as error:
                 text, small = str(error), str(error).lower()
-                if any(sign in small for sign in _PASSING) and not any(sign in text for sign in _LASTING):
+                if _PASSING.search(small) and not any(sign in text for sign in _LASTING):
                     raise TransientError(describe_fault(error)) from None
-                advice = next((said for signs, said in _ADVICE if any(sign in text for sign in signs)), "")
+                advice = next((said for signs, said in _ADVICE if signs.search(text)), "")
                 if advice:
                     raise StoreError(f"cannot {what}: {advice}") from None
                 if isinstance(error, FileNotFoundError):
