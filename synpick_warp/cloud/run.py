@@ -314,14 +314,14 @@ class _Work(EpisodeSource):
             return []
         asked, self._asked = self._asked, None
         chunk, _ = asked.result()
-        if chunk is not None and self.lost.isdisjoint(chunk.episodes):
+        if chunk is not None and chunk.number not in self._held and self.lost.isdisjoint(chunk.episodes):
             self._pauses = None
             if chunk.episodes:
                 self._hold(chunk)
             else:
                 self._chunks.done(chunk)
             return chunk.episodes
-        if chunk is not None and chunk.claim is not None:  # Worlds may still run lost episodes, whose files have the same names.
+        if chunk is not None and chunk.claim is not None:  # Worlds may still run episodes whose lease ran out: files have the same names.
             chunk.claim.release()
         self._pauses = self._pauses or self._chunks.claims.pauses()
         self._next = clock.monotonic() + next(self._pauses)

@@ -132,12 +132,3 @@ def stored(url: str) -> dict[str, bytes]:
     """Files of the data set in a store."""
     store = open_store(url)
     return {key: store.get(key, 1 << 30) for key, _ in store.list("") if not key.startswith(f"{CONTROL}/")}
-
-
-def together(*calls: Callable[[], object]) -> None:
-    """Make calls at once, in a thread each, and wait for them."""
-    threads = [threading.Thread(target=call) for call in calls]
-    for each in threads:
-        each.start()
-    for each in threads:
-        each.join()

@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from functools import partial
 
 import msgspec
 import pytest
@@ -22,7 +21,7 @@ from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import EPISODES, files, stored, tiny, together
+from tests.cloud.conftest import EPISODES, files, stored, tiny
 from tests.harness import scripted_bake
 from tests.harness.processes import module_command
 
@@ -114,24 +113,6 @@ def test_an_error_ends_the_heartbeat_of_a_chunk(memory, monkeypatch):
     assert not any(thread.name == "heartbeat" for thread in threading.enumerate())
 
 
-def test_an_overtaken_worker_commits_nothing_more_and_goes_on(memory, local, monkeypatch):
-    """Its lease is stolen in the middle of its first chunk; the thief never does the chunk, so it is claimed again later."""
-    store, stolen, baked = open_store(memory), [], []
-
-    def bake(config, out, progress, episodes, devices=(), deliver=None):
-        baked.extend(episodes)
-        if not stolen:
-            key = next(key for key, _ in store.list(".store/claims") if key[-6:].isdigit() and "done" not in key)
-            found = store.get_tagged(key)
-            stolen.append(store.replace(key, found[0].replace(b'"owner":"', b'"owner":"thief-'), found[1]))
-            time.sleep(0.4)  # Longer than a heartbeat.
-        return scripted_bake.bake_episodes(config, out, progress, episodes, devices, deliver)
-
-    work(memory, bake=bake, lease=0.5)
-    assert len(baked) == EPISODES + 1
-    assert stored(memory) == local
-
-
 @pytest.mark.parametrize("lost", [False, True])
 def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
     """Of four chunks of one episode, in one folder; the second lease is stolen, and its episode made in a second bake."""
@@ -148,7 +129,7 @@ def test_a_bake_takes_further_chunks_and_loses_one_alone(lost, memory, local):
                 key = next(key for key, _ in store.list(".store/claims") if key.endswith(f"/{found[0]:06d}") and "done" not in key)
                 data, tag = store.get_tagged(key)
                 assert store.replace(key, data.replace(b'"owner":"', b'"owner":"thief-'), tag) is not None
-                time.sleep(0.4)  # Longer than a heartbeat.
+                time.sleep(0.6)  # The lease has run out: found, its worker took it again before it knew of the loss, and died of it.
             return found
 
         episodes.more = steal
@@ -180,27 +161,6 @@ def test_a_worker_leaves_chunks_to_others_and_gives_up_what_it_holds(workers, mo
     assert None not in taken
     for claim in taken:
         claim.stop()
-
-
-def test_two_finalizers_at_once_write_one_set(memory, local, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(run, "finalize_store", lambda *_: 0)
-        run.bake_into_store(Job(tiny(), memory, bake=scripted_bake.bake_episodes), SilentProgress())
-    assert "manifest/joined.json" not in stored(memory)
-    ledger = Ledger(open_store(memory), tiny(), Probe(0.0, True))
-    gate, real, places = threading.Barrier(2), run.finalize_data_set, [tmp_path / "one", tmp_path / "two"]
-    alone = threading.Lock()
-
-    def meet(*arguments):
-        with alone:
-            real(*arguments)
-        gate.wait(60)
-
-    monkeypatch.setattr(run, "finalize_data_set", meet)
-    for each in places:
-        each.mkdir()
-    together(*(partial(run.finalize_store, ledger, each) for each in places))
-    assert stored(memory) == local
 
 
 def test_finalizers_of_different_plans_at_once_do_not_both_succeed(memory, local, tmp_path, monkeypatch):
