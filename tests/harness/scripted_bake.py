@@ -1,6 +1,7 @@
 """Bake without simulation: episodes of scripted views and ticks go through output folder, exporters, commit and lists, in this process."""
 
 import dataclasses
+import functools
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -30,7 +31,8 @@ SEEN = {"visible": 5, "centroid": [1.0, 1.5], "midpoint": [1.0, 1.25], "distance
 ATTEMPT = trajectories.ATTEMPT | {
     "observation": {"resolution": [4, 3], "instances": [seen_object(2, 7, (1.0, 1.0), **SEEN)], "votes": [[2, 3, 0.5]]}
 }
-_LENSES = box_views.cameras(16, 12)
+_LENSES, _CATALOG = box_views.cameras(16, 12), box_views.catalog()
+_ticks = functools.cache(lambda episode: tuple(trajectories.ticks((episode,), FRAMES)))
 
 
 def settings(episodes: int = 2, formats: tuple[str, ...] = FORMATS) -> Config:
@@ -42,9 +44,11 @@ def settings(episodes: int = 2, formats: tuple[str, ...] = FORMATS) -> Config:
 
 
 def small_settings() -> Config:
-    """Settings of two episodes as scenes and shards, of few files."""
+    """Settings of two episodes of one camera as scenes and shards, of few files."""
     config = settings(2, ("bop", "shards"))
-    return dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png", masks=False, coco=False))
+    cameras = dataclasses.replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1])
+    bop = dataclasses.replace(config.bop, split="train", color_format="png", masks=False, coco=False)
+    return dataclasses.replace(config, bop=bop, cameras=cameras)
 
 
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None, picks: bool = False) -> BakeSummary:
@@ -92,7 +96,8 @@ def fill(
     """Write the remaining episodes, and those of the source, in place of `factory.pipeline._fill`."""
     settings = ExportSettings.of(output.config)
     with WriterPool(0, needs.slot_bytes, output.lock) as pool:
-        exporters = Exporters(needs.classes, ExportContext(output.out, settings, box_views.catalog(), _LENSES, skies(), pool))
+        lenses = _LENSES[: len(output.config.cameras.positions)]
+        exporters = Exporters(needs.classes, ExportContext(output.out, settings, _CATALOG, lenses, skies(), pool))
         output.prepare(exporters, INPUTS, pool)
         queue = output.remaining[:stop_after]
         while queue:
@@ -113,9 +118,10 @@ def fill(
 
 
 def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int, picks: bool) -> EpisodeOutcome:
-    for batch in trajectories.ticks((episode,), FRAMES):
+    lenses = _LENSES[: len(output.config.cameras.positions)]
+    for batch in _ticks(episode):
         exporters.write_ticks(batch)
-    for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
+    for batch in box_views.batches(len(lenses), (episode,), FRAMES, lenses):
         exporters.write_views(batch)
     if picks:
         exporters.write_picks(pick_batch(episode, (0, 1), own=False))

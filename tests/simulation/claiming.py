@@ -83,9 +83,8 @@ def _finalize(log: Ledger, folder: Path) -> int:
     return 0
 
 
-FILES = "train/{0}/rgb", "train/{0}/depth", f"{INDEX}/{{0}}.tar.gz"
-MARKS = "manifest/{0}.sha256", "manifest/{0}.json"
-OBJECTS = [[name.format(f"{episode:06d}") for name in FILES + MARKS] for episode in range(EPISODES)]
+NAMES = "train/{0}/rgb", "train/{0}/depth", f"{INDEX}/{{0}}.tar.gz", "manifest/{0}.sha256", "manifest/{0}.json"
+OBJECTS = [[name.format(f"{episode:06d}") for name in NAMES] for episode in range(EPISODES)]
 """Objects of each episode, in the order in which they may be written; their content is their name."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import functools
 import os
 import shutil
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import pytest
 
 from synpick_warp.cloud import run
 from synpick_warp.cloud.ledger import Ledger
+from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit import manifest
 from synpick_warp.dataset.commit.manifest import read_entry
 from synpick_warp.dataset.commit.merge import merge
@@ -151,38 +153,51 @@ def test_a_planted_bug_of_a_folder_is_found(tmp_path, expected, monkeypatch, bug
             assert files(out) == expected
 
 
-class Workers:
-    """Workers of a simulation that bake into a store, with real bakes and uploads; the first dies at a scheduling point."""
+class Upload:
+    """Data set of a store into which simulated workers bake; `first` dies at a scheduling point, or with `in_writes` after a write."""
 
-    def __init__(self, seed: object, die_at: int = 0, faults: dict[str, float] | None = None, *, claim: bool = True) -> None:
-        self._simulation, self._claim = Simulation(seed), claim
-        self.store = FaultyStore(self._simulation, faults)
-        self.points, self._die_at = 0, die_at
-        self._simulation.at_point = self._at_point
+    def __init__(self, config: Config, store: FaultyStore, die_at: int = 0, *, in_writes: bool = False) -> None:
+        self.store, self.count, self._die_at, self._in_writes = store, 0, die_at, in_writes
+        self._job = run.Job(config, "s3://simulated", bake=scripted_bake.bake_episodes, lease=LEASE)
 
-    def _at_point(self, process: Process) -> None:
+    def _seen(self, process: Process) -> None:
         if process.name == "first":
-            self.points += 1
-            process.dead = self.points == self._die_at
+            self.count += 1
+            process.dead |= self.count == self._die_at
 
-    def run(self, monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
-        """Run the first worker, then, if it dies, another; returns the files in the store."""
-        with self._simulation as simulation, monkeypatch.context() as patch:
+    def run(self, seed: object, *names: str, shards: int) -> None:
+        """Run workers together, which have one of the first of these shards each; 0 shards: they claim."""
+        simulation = self.store.simulation = Simulation(seed)
+        if self._in_writes:
+            self.store.observe = lambda write: self._seen(write.process)
+        else:
+            simulation.at_point = self._seen
+        with simulation, pytest.MonkeyPatch.context() as patch:
             patch.setattr(run, "open_ledger", lambda job: Ledger(self.store.open(simulation.process), job.config, Probe(0.0, True)))
             patch.setattr(run.gc, "collect", lambda: 0)  # It takes most of the time.
-            job = run.Job(CONFIG, "s3://simulated", bake=scripted_bake.bake_episodes, lease=LEASE)
-            for name in ("first", "second") if self._die_at else ("first",):
-                simulation.run((Process(name), lambda: run.bake_into_store(job, SilentProgress(), claim=self._claim)))
+            bake = functools.partial(run.bake_into_store, self._job, SilentProgress(), claim=not shards)
+            shares = [(number, shards) if shards else (0, 1) for number in range(len(names))]
+            simulation.run(*((Process(name), functools.partial(bake, share)) for name, share in zip(names, shares, strict=True)))
             assert simulation.errors == []
+
+    @property
+    def files(self) -> dict[str, bytes]:
         return {key: data for key, (data, _) in self.store.objects.items() if not key.startswith(f"{CONTROL}/")}
 
 
+def upload(shards: int, die_at: int = 0) -> Upload:
+    """Bake into an empty store by one worker, and, if it dies, by another; to those that claim faults happen then."""
+    seed = 0 if shards else die_at
+    upload = Upload(CONFIG, FaultyStore(Simulation(seed), FAULTS if seed else {}), die_at)
+    for name in ("first", "second")[: 1 + bool(die_at)]:
+        upload.run((seed, name), name, shards=shards)
+    return upload
+
+
 @pytest.mark.parametrize(("case", "turn"), turns("one worker", "claims and faults", all_of="one worker"))
-def test_a_worker_may_die_at_any_point_of_a_bake_into_a_store(monkeypatch, expected, case, turn):
+def test_a_worker_may_die_at_any_point_of_a_bake_into_a_store(expected, case, turn):
     """The next worker ends the set."""
-    claim = case == "claims and faults"
-    undisturbed = Workers("whole", claim=claim)
-    assert undisturbed.run(monkeypatch) == expected
-    for point in range(1 + turn, undisturbed.points + 1, EVERY):
-        workers = Workers(point, point, FAULTS, claim=True) if claim else Workers("whole", point, claim=False)
-        assert workers.run(monkeypatch) == expected, point
+    undisturbed = upload(shards := int(case == "one worker"))
+    assert undisturbed.files == expected
+    for point in range(1 + turn, undisturbed.count + 1, EVERY):
+        assert upload(shards, point).files == expected, point

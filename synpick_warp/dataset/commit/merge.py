@@ -173,8 +173,11 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
 def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: bytes, lock: int) -> None:
     """Fill an empty folder with the files of all entries, the entries, settings, manifest and indices."""
     for entry, part in sources.items():
-        for name in (*read_checksums(part, entry), f"{entry}.sha256", f"{entry}.json"):
-            _link(part / name, work / name)
+        size = sum(_link(part / name, work / name) for name in read_checksums(part, entry))
+        for suffix in (".sha256", ".json"):
+            _link(part / f"{entry}{suffix}", work / f"{entry}{suffix}")
+        if size != (read_entry(work, entry) or {}).get("bytes"):  # A power cut shortens what an unfinished bake has not flushed.
+            raise DatasetError(f"{part} has files of other sizes than {entry}.json says; resume its bake, or see `synpick-warp verify`")
     files.write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
     files.write_atomically(work / files.MANIFEST_FILE, manifest)
     needs = Needs.of(config)
@@ -182,10 +185,10 @@ def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: byte
         finalize_data_set(work, ExportSettings.of(config), needs.classes, pool)
 
 
-def _link(source: Path, target: Path) -> None:
-    """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along. Raises DatasetError
-    if the source is missing, is a symbolic link or no regular file, or cannot be read, and OSError if the target cannot be written, or
-    exists: it may be a hard link, so that it is never written to."""
+def _link(source: Path, target: Path) -> int:
+    """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along; returns its size
+    [B]. Raises DatasetError if the source is missing, is a symbolic link or no regular file, or cannot be read, and OSError if the target
+    cannot be written, or exists: it may be a hard link, so that it is never written to."""
     make_folder(target.parent)
     try:
         handle = files.open_regular(source)
@@ -194,11 +197,13 @@ def _link(source: Path, target: Path) -> None:
     except OSError as error:
         raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
     with open(source, "rb", opener=lambda *_: handle) as file:
-        if not os.fstat(handle).st_mode & _EXECUTE:
+        state = os.fstat(handle)
+        if not state.st_mode & _EXECUTE:
             with contextlib.suppress(OSError):  # Where links are not possible; `_copy` raises if the target exists.
                 os.link(source, target, follow_symlinks=False)
-                return
+                return state.st_size
         _copy(file, target)
+        return state.st_size
 
 
 def _copy(source: BinaryIO, target: Path) -> None:
