@@ -256,7 +256,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def _constants(self) -> trajectory.GroupContext:
-        """Files that the arrays of the store's tables must agree with."""
+        """What the store's tables are checked against: the files that the manifest lists."""
         return trajectory.GroupContext(files=lambda: self.listed_files(CONSTANTS))
 
     def listed_files(self, entry: Path) -> frozenset[Path]:
@@ -305,7 +305,7 @@ class DataSet(Mapping[int, Episode]):
         return None if self.found is not None else self.config.physics.tick_time
 
     def scene_id(self, episode: int, camera: int) -> int:
-        """BOP's scene_id of a camera's images of an episode, as result files have it; of several sensors each counts as a scene."""
+        """BOP scene_id of a camera's images of an episode, as in result files: each (episode, camera) pair has its own id."""
         return self.camera_count * (episode if self.found is None else self.found.scene(episode)) + camera
 
     def split_of(self, episode: int) -> str:
@@ -389,7 +389,7 @@ class DataSet(Mapping[int, Episode]):
 
     @property
     def _parts(self) -> list[PartFiles]:
-        """Files by which episodes are found in formats of which nothing else is read; none of scenes without settings."""
+        """File patterns of formats that the reader lists but does not open; without settings, only those with one file per episode."""
         return [] if self.found is not None else part_files(None if self._scenes is None else self.camera_count)
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:

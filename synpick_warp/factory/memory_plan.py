@@ -3,9 +3,9 @@
 The plan is a lower bound: what it refuses cannot run on this machine, what it accepts may still run out. Counted are all arrays that a
 bake declares, Newton's by measured factors, the pinned copies of images, shared memory of writers, and the lists of episodes.
 
-Sizes that the settings leave open (0) follow from it, and no output depends on them. Worlds follow from the number of episodes; where
-memory is short, pictures are no longer kept over frames, then batches are halved, and worlds reduced by a quarter, until plan and headroom
-fit.
+Automatic sizes (0) are chosen to fit; outputs do not depend on them. Worlds follow from the number of episodes. While plan and headroom
+exceed the free memory, first the pictures of fewer worlds are kept over frames, then the automatic size behind the largest part shrinks:
+`bake.worlds` by a quarter, others by half.
 """
 
 import contextlib
@@ -219,8 +219,8 @@ def _term(
 
 
 def _simulation(sizes: dict[str, int], stores_steps: bool | None, supports: bool, device: wp.Device) -> Iterator[Term]:
-    """State and record of the worlds, with extents by `record_sizes`, and the queue of ticks as `TickLoop` chooses it. `stores_steps`:
-    whether each step is recorded, not only each tick; None: no physics is."""
+    """State and record of the worlds (extents: `record_sizes`), and the queue of ticks as `TickLoop` sizes it. `stores_steps`: True records
+    each physics step, False each tick, None neither."""
     with dry_run() as state:
         *_, record = allocate_worlds(sizes, device)
     yield _term(f"the state of {sizes['world']:,} worlds", state, _WORLDS)
@@ -310,7 +310,7 @@ def _is_list(value: object) -> bool:
 
 
 def _gib(size: int) -> str:
-    """Size in GiB, with commas and one decimal place; whole numbers, since sizes may exceed a float's range."""
+    """Size in GiB with one decimal place, rounded up; integer arithmetic, as sizes may exceed a float's range."""
     tenths = -(-size * 10 // 1024**3) if size else 0
     return f"{tenths // 10:,}.{tenths % 10} GiB"
 
@@ -343,9 +343,9 @@ def newton_rows(
 ) -> Iterator[tuple[Row, tuple[str, ...]]]:
     """Rows of Newton's arrays, each with the full keys of the settings by which it grows.
 
-    Where `arrangement.counts` sets the number of bodies, they are counted, and rows are within 10 % of what is allocated. A volume budget
-    may need few of them, and rows are a lower bound. `own_bins`: whether bins are the user's own, which have shapes of their own;
-    `is_cuda`: whether the arrays lie in a GPU's memory; `pieces`: as of `plan_memory`; `solid`: collision shapes of props."""
+    With `arrangement.counts` the number of bodies is known, and rows are within 10 % of what is allocated; with a fill volume it is not,
+    and they are lower bounds. `own_bins`: whether bins are the user's own, which have shapes of their own; `is_cuda`: whether the arrays
+    lie in a GPU's memory; `pieces`: as of `plan_memory`; `solid`: collision shapes of props."""
     bodies = most_objects(arrangement.counts)
     # The capacities of many objects follow from their number.
     many = ("bake.worlds", "arrangement.max_objects") if arrangement.max_objects > FEW else ()
@@ -450,13 +450,13 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
 
 
 def _short_memory(memories: Iterable[tuple[list[Term], int]]) -> tuple[Sequence[Term], int]:
-    """Terms in the first memory that is too small for them with HEADROOM, of those by `split_memories`, and its size; no terms: all fit."""
+    """Terms and free size of the first memory of `split_memories` that `with_headroom` exceeds; ((), 0): everything fits."""
     return next(((terms, free) for terms, free in memories if with_headroom(terms) > free), ((), 0))
 
 
 def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Config:
-    """Settings that keep the tiles of so many worlds less that `excess` of the `kept` [bytes] are free, or of none. If not all worlds are
-    kept, a batch of views needs as many rows again."""
+    """Settings that free `excess` bytes by keeping the pictures (unchanged tiles, `render.reuse`) of fewer worlds, or of none. `kept`
+    [bytes]: all kept pictures now; with only part of the worlds kept, a batch of views also needs scratch rows."""
     rig, worlds, objects, is_partial = config.rig, config.bake.worlds, config.arrangement.max_objects, config.render.reuse_worlds > 0
     batches = (views_per_batch(config.render, rig, worlds, objects, device, group) for group in range(len(rig.groups)))
     scratch = max(-(-views // len(group)) for views, group in zip(batches, rig.groups, strict=True))
@@ -466,7 +466,7 @@ def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Con
 
 
 def with_headroom(terms: Sequence[Term]) -> int:
-    """Memory that terms of a plan take with HEADROOM [bytes]."""
+    """Memory to reserve for terms [bytes]: sizes times HEADROOM (kept pictures: as they are), plus RUNTIME_BYTES."""
     factors = (1.0 if term.name == KEPT_PICTURES else HEADROOM for term in terms)
     return sum(int(factor * term.size) for factor, term in zip(factors, terms, strict=True)) + RUNTIME_BYTES
 
@@ -477,6 +477,6 @@ def _least(key: str, device: wp.Device) -> int:
 
 
 def _reduce(key: str, amount: int, device: wp.Device) -> int:
-    """Smaller value of a setting: a half of the views of a batch, three quarters of the worlds, never below `_least`."""
+    """Next smaller value of an automatic size: three quarters for bake.worlds, half for all others, never below `_least`."""
     kept = amount - max(1, amount // 4) if key == "bake.worlds" else -(-amount // 2)
     return max(_least(key, device), kept)

@@ -229,7 +229,7 @@ def bin_record(name: str, pose: np.ndarray) -> dict[str, Any]:
 
 
 def name_bin(sentence: str, record: Mapping[str, Any] | None) -> str:
-    """Sentence on an episode's tote, said of the bin that it has; None: a tote that is always in its place."""
+    """Replace "tote" in a sentence by what the episode's bin is, such as "table" or "bin"; record None (a fixed tote): unchanged."""
     if record is None:
         return sentence
     name = record["name"]
@@ -239,7 +239,7 @@ def name_bin(sentence: str, record: Mapping[str, Any] | None) -> str:
 
 
 def most_words(width: int, height: int) -> int:
-    """Words of a mask as large as an image [px]."""
+    """Number of 32-bit words of a mask of the whole image [px]: one for each column and band of MASK_ROWS rows."""
     return width * -(-height // MASK_ROWS)
 
 
@@ -252,8 +252,8 @@ def paint_masks(words: np.ndarray, first: np.ndarray, box: np.ndarray, width: in
 
 
 def unpack_mask(words: np.ndarray, first: int, box: np.ndarray) -> np.ndarray:
-    """Mask of an instance within its box, x_min, y_min, x_max, y_max, inclusive [px], x_max < x_min: empty, (rows, columns) bool, from the
-    words of the view (W) uint32 and the index of its first."""
+    """Unpack an instance's mask to bool (rows, columns) of its box (inclusive; x_max < x_min: empty). `words`: of the view (W) uint32, from
+    index `first` on one for each column of a band of MASK_ROWS rows, band by band, the top row in the lowest bit."""
     columns, rows = (max(0, int(past) - int(start) + 1) for start, past in zip(box[:2], box[2:], strict=True))
     bands = -(-rows // MASK_ROWS)
     own = words[first : first + bands * columns].astype("<u4", copy=False).reshape(bands, columns, 1)

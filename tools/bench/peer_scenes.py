@@ -1,5 +1,5 @@
-"""Scenes of other renderers, with the bins, objects and cameras of our worlds: newton.sensors.SensorCamera, and MuJoCo Warp's ray renderer,
-where all are geoms without bodies; agreement of another renderer with ours."""
+"""Our bins, objects and cameras as scenes of other renderers, Newton's SensorCamera and MuJoCo Warp's ray tracer (where all objects are geoms
+of the world body), and comparison of their pixels with ours."""
 
 import importlib
 from collections.abc import Callable
@@ -257,7 +257,7 @@ class RayScene:
 
 @wp.func
 def _find_root(bvh: wp.uint64, world: wp.int32):
-    """Root of a world's group in a grouped BVH."""
+    """`wp.bvh_get_group_root` as a function that `wp.map` can call: root of a world's group after the BVH was rebuilt."""
     return wp.bvh_get_group_root(bvh, world)
 
 

@@ -380,9 +380,9 @@ class Pairs:
 
 
 def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: int = PER_INSTANCE) -> Pairs:
-    """Pair the best estimates with the instances of the same image and object; equal scores keep the order of the file, as in the toolkit.
+    """Pair the best estimates with the instances of the same image and object; ties in score keep file order, as in the BOP toolkit.
 
-    `target`: whether an instance is to be found (N,) bool; others are no partners, yet images without targets have no estimates to count.
+    `target` (N,) bool: instances to be found; others are never paired, and estimates of an image and object without targets are dropped.
     `top`: maximum number of estimates per image and object; PER_INSTANCE: as many as targets; ALL."""
     truth_rows = np.flatnonzero(target)
     keys = [np.concatenate((getattr(truth, name)[truth_rows], getattr(estimates, name))) for name in ("scene", "image", "object_id")]

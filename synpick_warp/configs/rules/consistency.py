@@ -141,7 +141,7 @@ def _props(rows: Sequence[PropRow], objects: int) -> Iterator[Conflict]:
 
 
 def _times(settle: Settle, physics: Physics) -> Iterator[Conflict]:
-    """Yield conflicts of the times of settling."""
+    """Yield conflicts of settling times: max_time is at least min_time, and at least rest_ticks long."""
     rest = settle.rest_ticks * physics.steps_per_tick * physics.step
     if settle.max_time < settle.min_time:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
@@ -163,7 +163,7 @@ def _pick(pick: Pick, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
 
 
 def _move(move: Move, gripper: Gripper, bins: Sequence[BinSizes]) -> Iterator[Conflict]:
-    """Yield a height to which the gripper does not come down, as the walls lean."""
+    """Yield a conflict if the gripper at `move.height` does not fit between the leaning walls of a bin."""
     radius = max((math.hypot(*place) for place in gripper.cups), default=0.0) + gripper.cup_width / 2
     for sizes in bins:
         for floor, opening in zip(sizes.floors, sizes.openings, strict=True) if sizes.measured else ():

@@ -27,8 +27,8 @@ _TURNS = np.array([(0, 1, 2), (1, 2, 0), (2, 0, 1)])
 
 
 def cut_mask(part: MeshPart, alpha: np.ndarray, threshold: float, modes: tuple[int, int]) -> MeshPart | None:
-    """Part of a mesh without what is below a threshold; None: its texture repeats too often. `part`: with texture coordinates. `alpha`:
-    alpha of its texture (H, W) uint8. `threshold`: least alpha that is kept [0 to 255]. `modes`: wrap modes of columns and rows."""
+    """Cut away what the alpha test discards (alpha < `threshold`, 0 to 255); None: the texture repeats too often. `part`: with texture
+    coordinates. `alpha`: alpha channel of its texture (H, W) uint8. `modes`: glTF wrap modes along columns and rows."""
     assert part.uv is not None
     given = {name: values for name in ("vertices", "normals", "colors", "uv") if (values := getattr(part, name)) is not None}
     table, cut = np.concatenate(list(given.values()), axis=1).astype(np.float64), None
@@ -51,7 +51,7 @@ def cut_mask(part: MeshPart, alpha: np.ndarray, threshold: float, modes: tuple[i
 
 
 def _cut(rows: np.ndarray, faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (V, N), whose last two values are column and row, and triangles (F, 3) where `field` is not negative; None: too many."""
+    """Cut off what lies where `field` is negative; the last two columns of `rows` are texel column and row. None: too many triangles."""
     sums = np.pad((field < 0.0).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     kept, most = [np.zeros((0, 3), np.int64)], MAX_TRIANGLES + len(faces)
     while len(faces):
@@ -80,7 +80,7 @@ def _bisect(rows: np.ndarray, faces: np.ndarray, longest: np.ndarray) -> tuple[n
 
 
 def _points(rows: np.ndarray, a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices with those on the edges from `a` to `b` added, and their indices. `weight`: of each vertex, by its distance."""
+    """Add a vertex on each edge (a, b), one for all triangles that share it, and return its indices; equal `weight`s: the midpoint."""
     edges, index = np.unique(np.minimum(a, b) * np.int64(len(rows)) + np.maximum(a, b), return_inverse=True)
     first, second = np.divmod(edges, len(rows))
     share = weight[first] / (weight[first] + weight[second])

@@ -53,12 +53,12 @@ class FileMaterial:
 
     @property
     def glow(self) -> np.ndarray | None:
-        """`Material.glow`, if there is one."""
+        """Emission texture (H, W, 3) uint8, sRGB: channels 7 to 9 of `texture`; None: it has none."""
         return self.texture[..., 7:10] if self.texture is not None and self.texture.shape[2] >= 10 else None
 
     @property
     def light(self) -> tuple[float, float, float]:
-        """Emission: none where its texture was dropped."""
+        """Emission factor; zero if the file's emission texture was dropped."""
         return BLACK if self.has_glow and self.glow is None else self.emission
 
     @property
@@ -68,7 +68,7 @@ class FileMaterial:
 
     @property
     def is_white_with_maps(self) -> bool:
-        """Whether the texture has maps, and its colours are white, as of files with maps alone."""
+        """Whether the material has maps (normal, roughness, ...) but no colour texture: its colours are all white."""
         return self.texture is not None and self.has_maps and bool((self.texture[..., :3] == 255).all())
 
     def complete(self, metallic: float, roughness: float) -> Material:
@@ -82,7 +82,7 @@ class FileMaterial:
         return Material(self.color, self.texture[..., :3].copy(), *given, maps, self.glass, opacity, self.light, glow)
 
     def add_glow(self, most: float) -> "FileMaterial":
-        """Material of the emission `most` in all channels, whose texture has its own; it must state metallic and roughness."""
+        """Same emission as `most` (a factor that several parts share) times an emission texture; metallic and roughness must be stated."""
         mapped = self if self.has_maps else self.add_maps()
         assert mapped.texture is not None
         own = np.full((*mapped.texture.shape[:2], 3), 255, np.uint8) if self.glow is None else self.glow
@@ -90,7 +90,7 @@ class FileMaterial:
         return replace(mapped, texture=np.concatenate([mapped.texture[..., :7], glow], axis=2), emission=(most,) * 3, has_glow=True)
 
     def add_opacity(self, most: float) -> "FileMaterial":
-        """Material of the transmission `most`, whose texture's last channel says by how much less it transmits."""
+        """Same transmission as `most` (shared by several parts), with a constant opacity channel that lowers it to the material's own."""
         texture = np.full((MIN_MAP_SIDE, MIN_MAP_SIDE, 3), 255, np.uint8) if self.texture is None else self.texture
         opacity = np.full((*texture.shape[:2], 1), round(255.0 * (1.0 - self.glass.transmission / most)), np.uint8)
         return replace(self, texture=np.concatenate([texture, opacity], axis=2), glass=replace(self.glass, transmission=most))
@@ -133,8 +133,8 @@ _ROUNDING = 1e-6
 
 
 def plain_color(color: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """Colour of a material whose image is not there: its own, unless it has none, or white or black, which exporters write beside an
-    image; then light grey."""
+    """Colour for a material whose texture is missing: its own base colour, or light grey if there is none or it is pure white or black
+    (placeholders that exporters write beside a texture)."""
     return GREY if color is None or all(value < _ROUNDING for value in color) or all(value > 1.0 - _ROUNDING for value in color) else color
 
 
@@ -181,9 +181,9 @@ def rgb8(image: Image.Image) -> np.ndarray:
 
 
 def decode_texture(data: bytes, source: str, linear: bool = False) -> np.ndarray:
-    """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded. `linear`: whether the
-    image has numbers such as roughness, which OpenEXR stores as they are, as colours of other formats are. Raises CatalogError: the image
-    is too large, of another format, or damaged."""
+    """Decode an image as (H, W, 3) uint8; its size is checked in the header before any pixel is decoded. `linear`: keep the values of an
+    OpenEXR image (roughness and the like) instead of encoding them as sRGB; other formats are never converted. Raises CatalogError: the
+    image is too large, of another format, or damaged."""
     if data.startswith(EXR_MAGIC):
         light = decode_exr(data, source, MAX_TEXTURE_PIXELS)
         return np.rint(255.0 * (np.clip(light, 0.0, 1.0) if linear else linear_to_srgb(light))).astype(np.uint8)
@@ -255,7 +255,7 @@ def bake_vertex_colors(
 
 
 def _texels_per_triangle(faces: np.ndarray, uv: np.ndarray, texture: np.ndarray) -> int:
-    """Texels along a triangle's edge: as many as most triangles have in the texture, as far as the atlas stays within half the limit."""
+    """Texels along a triangle's edge, enough for 95 % of the triangles in the texture; the atlas stays within a quarter of the limit."""
     edges = np.diff(uv[faces][:, (0, 1, 2, 0)] * (texture.shape[1], texture.shape[0]), axis=1)
     wanted = np.ceil(np.percentile(np.linalg.norm(edges, axis=2).max(axis=1), 95)) + 1.0
     return int(np.clip(wanted, 2, max(np.sqrt(MAX_TEXTURE_PIXELS / 8 / len(faces)), 2)))

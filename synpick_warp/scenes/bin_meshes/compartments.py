@@ -57,10 +57,9 @@ class Compartment(NamedTuple):
 
 
 def find_compartments(surface: BinSurface) -> list[Compartment]:
-    """Compartments of a surface, by x and y; empty: none is of MIN_SIDE.
+    """Compartments of a surface, sorted by x and y; empty: none is as wide as MIN_SIDE.
 
-    They are the components of the inside below a level, the one with most of them, or else the highest.
-    """
+    Connected components of the inside below a height, at the height with most of them (the highest one if several have as many)."""
     depth = surface.rim - surface.floor
     best: list[tuple[np.ndarray, np.ndarray, float]] = []
     for level in np.linspace(surface.rim, surface.floor, LEVELS, endpoint=False):
@@ -139,7 +138,7 @@ def _find_floor(surface: BinSurface, cells: np.ndarray, level: float) -> tuple[n
 
 
 def _stretch(surface: BinSurface, floor: np.ndarray, flat: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Rectangle (2, 2) from wall to wall through the middle of a floor, along its cells (nx, ny) and up to points (N, 3) of walls."""
+    """Floor (2, 2) extended from wall to wall in a narrow band through its middle: larger than `floor` where corners are rounded."""
     center, half, result = floor.mean(axis=0), (floor[1] - floor[0]) / 2.0, floor.copy()
     for end, axis in np.ndindex(2, 2):
         step = (2 * end - 1) * surface.cell
@@ -160,7 +159,7 @@ def find_holes(surface: BinSurface) -> np.ndarray:
 
 
 def _widen(corners: np.ndarray, points: np.ndarray, cell: float, share: float = 1.0) -> np.ndarray:
-    """Rectangle (2, 2) whose sides, known to a cell, move to the innermost of the points (N, 3) beside them, or beside a share of them."""
+    """Refine a rectangle (2, 2) known to a cell: move each side to the innermost wall point (N, 3) near it, within the middle `share`."""
     result, center, reach = corners.copy(), corners.mean(axis=0), share * ((corners[1] - corners[0]) / 2.0 - cell)
     for end, axis in np.ndindex(2, 2):
         along, sign = points[:, 1 - axis], 2 * end - 1
@@ -201,10 +200,9 @@ def _largest_rectangle(surface: BinSurface, cells: np.ndarray) -> np.ndarray:
 
 
 def _fit_plane(surface: BinSurface, rectangle: Rectangle) -> tuple[float, float, float]:
-    """Plane z = a x + b y + c over the floor in a rectangle: a fit by least squares, raised so that none of it lies below the floor.
+    """Plane z = a x + b y + c of a compartment's floor: least squares, then raised until at most 5 % of the cells rise above it.
 
-    The floor is what is nearer to the lowest point than to the rim, in the inner part of the rectangle.
-    """
+    Fitted to the cells of the rectangle's inner part that are closer to the lowest point than to the rim."""
     x, y, length, width = rectangle
     cells = np.argwhere(surface.inside)
     near = (np.abs(surface.centers(cells) - (x, y)) <= 0.4 * np.array((length, width))).all(axis=1)

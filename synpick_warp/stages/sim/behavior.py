@@ -1,4 +1,4 @@
-"""What the simulation asks of a kind of gripper: what binds objects to its head, the path of its setpoint, and its choice of grasps."""
+"""Interface of a kind of gripper: how it holds objects, moves its setpoint, and chooses grasps."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -51,7 +51,7 @@ class SuctionHold:
         launch(cup_rays.engage_seals_kernel, state.catalog_index.shape, *sources, seals)
 
     def _evacuate(self, *sources: Any, seals: SealState) -> None:
-        """Measure leaks below the cups, and attach what the vacuum that is left holds."""
+        """Cast rays across the cups' mouths, sum up the leaks, and attach what lies below, with break forces by the vacuum left."""
         cups, device = seals.break_force.shape, seals.break_force.device
         if self._scratch is None:
             sizes = {"world": cups[0], "cup": cups[1], "ray": self.ray_count}
@@ -75,7 +75,7 @@ class SuctionHold:
 
 
 class ArrayHold(SuctionHold):
-    """Hold of a head of several cups, or of one beside the middle."""
+    """Hold by several cups, or one off-centre: all cups on an object act as one spring-damper, whose wrench is shared out to them."""
 
     seal_kernel = seal_array.apply_array_forces_kernel
 
@@ -116,7 +116,7 @@ def _mouth_data(settings: Suction, device: wp.Device) -> Any:
 
 
 class Hold(Protocol):
-    """Hold of all worlds' grippers. `SealState.attached` says what is held: tasks and outcomes, snapshots and records read no more."""
+    """How grippers hold objects, in all worlds. All other code reads only its result, `SealState.attached`: which objects are held."""
 
     def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Attach objects where task PRESS is complete. Runs at the end of a tick."""
@@ -130,7 +130,7 @@ class Hold(Protocol):
 
 @dataclass(frozen=True)
 class Behavior:
-    """Behaviour of a kind of gripper: class of its hold, law of its setpoint, and its choice among the candidates of a grasp."""
+    """Behaviour of a kind of gripper: how it holds, how its setpoint moves, and how it chooses among grasps of the target."""
 
     hold: Callable[[Suction, Catalog, RenderScene, wp.Device], Hold]
     law: SetpointLaw = TWO_SPEEDS

@@ -92,7 +92,7 @@ def usable_kernel_cache(version: str) -> Path | None:
 
 
 def find_fault(folder: Path) -> str | None:
-    """Find out why a folder cannot be written, by writing into it; it is created if missing. None: it can."""
+    """Why a folder, created if missing, cannot serve as a cache: not writable, or less than MIN_FREE is free. None: it can."""
     try:
         make_folder(folder)
         with tempfile.TemporaryFile(dir=folder) as probe:
@@ -139,8 +139,8 @@ class ModuleBuild(NamedTuple):
     block: int
 
     def names(self, architecture: int | None = None) -> tuple[str, str]:
-        """Names of its binary and, which Warp writes after that, its metadata. `architecture`: GPUs of this compute capability, times ten,
-        in place of its device."""
+        """File names of its binary and of its metadata, which Warp writes last. `architecture`: compute capability times ten of the GPUs to
+        build for; None: its own device."""
         device = wp.get_device(self.device) if architecture is None else None
         binary = self.module._get_compile_output_name(device, architecture, block_dim=self.block)
         return binary, self.module._get_meta_name(block_dim=self.block)
@@ -318,7 +318,7 @@ class Compiler:
             self._load(build.module, build.device, build.block)
 
     def _await(self, build: ModuleBuild) -> None:
-        """Wait for a module that a launch needs, which is compiled if nothing else asked for it."""
+        """Wait until the module of a launch is compiled; start that, ahead of the queue, if nothing has asked for it yet."""
         if build not in self._tasks and build not in self._seen:
             self._seen.add(build)
             if not build.is_cached():

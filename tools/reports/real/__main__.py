@@ -205,7 +205,7 @@ def stream_views(config: Config, episodes: range, views: int) -> Batches:
 
 
 def measure(trained: Trained, frames: list[RealFrame], twins: list[RealFrame], held: ViewPool, device: torch.device) -> TrainingOutcome:
-    """Scores of a network on real frames and their twins, which it sees at the size of the held-out views, and on these."""
+    """Score a network on real frames and their twins, resized for it to the size of the held-out views, and on those views."""
     height, width = held.tensors()[0].shape[2:]
     overlays = [
         [(frame.color, frame.label, predict(trained.network, frame.color, (int(width), int(height)), device)) for frame in part]

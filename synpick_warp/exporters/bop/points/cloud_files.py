@@ -31,7 +31,7 @@ _BAND = 64
 
 
 def cloud_list(scene: int) -> Path:
-    """List of a scene's clouds."""
+    """Path, in the data set, of the text file that lists a scene's clouds."""
     return FOLDER / f"{scene:06d}.txt"
 
 

@@ -1,6 +1,6 @@
 """Depth sensors on transparent bodies: holes, and what is measured and seen behind them.
 
-Apart from `images.transparency`, which scenes without these layers need, too.
+A module of its own, since scenes without these layers need `images.transparency` alone.
 """
 
 import warp as wp
@@ -28,8 +28,8 @@ ClearGrasp (Sajjan et al., ICRA 2020) correlate by 0.68 at 6 mm and by 0.47 at 1
 
 @wp.func
 def patch_shares(key: wp.uint64, place: wp.vec3) -> wp.vec2:
-    """Two independent samples, uniform in 0..1, of a place in cells of noise, correlated with those of its neighbours: quantiles of value
-    noise as in `depth_sensor.lattice_normals`, but in space."""
+    """Two independent noise values, each uniform in 0..1, at a point: 3D value noise (`depth_sensor.lattice_normals` in space), with cells
+    of unit size, mapped to uniform by the normal distribution's CDF."""
     x, y, z = int(wp.floor(place[0])), int(wp.floor(place[1])), int(wp.floor(place[2]))
     part = place - wp.vec3(float(x), float(y), float(z))
     total, squares = wp.vec2(0.0, 0.0), float(0.0)
@@ -56,13 +56,12 @@ def measure_behind_kernel(
     # Out:
     image_inout: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """Replace what a depth sensor measures on transparent bodies, as if they were opaque, by holes or by what it measures `behind`.
+    """Depth sensor on transparent bodies: replace depth measured on them as if opaque by that of what is `behind`, or by holes (0).
 
-    The surface itself is measured on a share s / (s + p²) of it: of the light, p passes, twice if it comes from behind, and s does not. On
-    the rest what is behind by g is measured with probability exp(-g / clear_reach), less what a body of thickness t and index n lifts it,
-    t (1 - 1 / n). Patches are of the stream (seed, episode, camera, CLEAR), and move with the body. Launched over view, pixel (tile order,
-    from flat index `first` on).
-    """
+    For each patch of the surface (value noise, fixed to the body), the surface itself is measured with probability s / (s + p²): p is the
+    tinted transmission of one pass, s = 1 - untinted transmission. Else the background, at a distance g behind the surface, is measured
+    with probability exp(-g / clear_reach), closer by the refraction shift t (1 - 1 / n) of a pane of thickness t, index n; else a hole.
+    Random stream: (seed, episode, camera, CLEAR). Launched over view, pixel (tile order, from flat index `first` on)."""
     grid, sensor, cameras = shot.grid, layer.sensor, shot.views.cameras
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -104,8 +103,8 @@ def see_through_kernel(
     # Out:
     image_out: wp.array3d[wp.uint8],  # (view, row, column)
 ):
-    """Infrared image, as of `render_infrared_kernel`, with what is behind transparent bodies, which neither bend light nor cast shadows of
-    dots: these pass the body twice. Launched over view, pixel (tile order, from flat index `first` on)."""
+    """Infrared image (`render_infrared_kernel`) with what is behind transparent bodies: dimmed once for ambient light, twice for projected
+    dots. No refraction, no shadows of dots. Launched over view, pixel (tile order, from flat index `first` on)."""
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
     if not in_image(shot.grid, row, column):
         return

@@ -274,7 +274,7 @@ def match_left_kernel(
 
 @wp.func
 def median_disparity(disparity: wp.array3d[int], grid: ImageGrid, slot: int, row: int, column: int) -> int:
-    """Median of 3 x 3 pixels, of which those without a match count as the least; windows end at the border."""
+    """3 x 3 median filter; pixels without a match count as the smallest disparity, and border pixels are repeated."""
     for at in range(9):
         value = disparity[slot, clamp_index(row + at // 3 - 1, grid.height), clamp_index(column + at % 3 - 1, grid.width)]
         less = int(0)

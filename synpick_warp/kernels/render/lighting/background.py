@@ -37,11 +37,10 @@ def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int
 
 @kernel_of_views
 def shade_floor_kernel(scene: RandomizedScene, drop: float, shot: AnyShot, first: int, image_inout: ShadedImage):
-    """Show the floor where a pixel shows nothing and its ray points down. It is seen only: it has no depth, and reflects no light.
+    """Draw the floor in pixels without a surface whose ray points down. The camera alone sees it: it has no depth and lights nothing.
 
     The last material of each view is that of the floor, which is `drop` [m] below the table. Launched over view, pixel (tile order, from
-    flat index `first` on).
-    """
+    flat index `first` on)."""
     view, row, column = tile_pixel(shot.grid, wp.tid() + first)
     cameras, world = shot.views.cameras, shot.views.world[view]
     if not in_image(shot.grid, row, column) or world < 0:

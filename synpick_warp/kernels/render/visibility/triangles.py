@@ -22,7 +22,7 @@ CANCELLATION = wp.constant(1.0e-3)
 
 @wp.struct
 class Triangle:
-    """Corners of a triangle in the camera's axes [m]; depth is near + z, so that float32 keeps its precision far from the camera."""
+    """Triangle in camera axes [m], with z relative to its body's depth `near` (depth = near + z), which keeps float32 precise far away."""
 
     a: wp.vec3
     b: wp.vec3
@@ -69,7 +69,7 @@ def beside_ray(point: wp.vec3, near: float, ray: wp.vec3) -> wp.vec2:
 
 @wp.func
 def cross(a: wp.vec2, b: wp.vec2) -> float:
-    """2D cross product a_x b_y - a_y b_x with an exact sign, so that no ray slips between two triangles that share an edge."""
+    """2D cross product a_x b_y - a_y b_x, in float64 where float32 cancels: its sign is exact, so no ray slips through a shared edge."""
     forward = a[0] * b[1]
     backward = a[1] * b[0]
     difference = forward - backward
@@ -112,8 +112,8 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 @wp.func
 def is_out_of_sight(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle, depth: wp.vec3) -> bool:
-    """Frustum culling: True if the corners of a triangle, at these depths, are all behind the camera, or all on the far side of one of the
-    planes through the camera and a side of the image, `MARGIN` px wider."""
+    """Frustum culling by the corners' depths: True if all are behind the camera, or (pinholes only) all outside of the same side of the
+    image, widened by `MARGIN` px."""
     if wp.max(depth) <= 0.0:
         return True
     if lens_of(cameras, view) >= 0:
@@ -129,7 +129,7 @@ def is_out_of_sight(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, v
 def find_footprint(grid: ImageGrid, cameras: AnyCameras, intrinsics: wp.vec4, view: int, triangle: Triangle) -> Footprint:
     """Project a triangle and compute its conservative footprint, clipped to the image.
 
-    A lens bends the edges: the image lies within bend D² / 6 of that of the corners, D the longest edge in the normalised plane.
+    Lens distortion bends edges: they stay within BEND D² / 6 of straight ones (D: longest edge in the normalised plane), added as a margin.
     """
     found = Footprint()
     found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)

@@ -161,9 +161,8 @@ def make_vertex(
     min_roughness: float,
     is_mean: bool,
 ) -> Vertex:
-    """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray; `is_mean`: with
-    the mean wear of the surface, as after the first bounce, in the reference, too: its noise costs more than the ray.
-    """
+    """Build the path vertex at a hit. `outgoing`: direction back along the ray. `width`: footprint across the ray [m]. `is_mean`: use the
+    surface's mean wear instead of its noise pattern, which costs more than tracing the ray; set after the first bounce."""
     bodies = shot.bodies
     surface = make_table_surface(scene.meshes, scene.surfaces, bodies, view, outgoing)
     at = position
@@ -211,7 +210,7 @@ def extend_throughput(throughput: Throughput, value: BrdfValue, color: wp.vec3, 
 
 @wp.func
 def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, bounce: int) -> SplitRadiance:
-    """Add light that arrives at the end of a path of `bounce` + 1 surfaces; diffuse light by way of others is `indirect`."""
+    """Add light that arrives after `bounce` + 1 surfaces. Light of the diffuse lobe after the first bounce is `indirect`."""
     result = total
     result.specular += wp.cw_mul(throughput.specular, radiance)
     if bounce == 0:
@@ -223,7 +222,7 @@ def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, b
 
 @wp.func
 def meet_emission(surfaces: Surfaces, path: Path, emission: wp.vec3, exposure: float) -> SplitRadiance:
-    """Radiance of a path with what the last surface emits, if its material may emit light."""
+    """Radiance of a path at a surface of a scene without emissive materials: unchanged."""
     return path.radiance
 
 
@@ -277,7 +276,7 @@ def escaped_radiance(scene: AnyScene, rules: PathRules, context: PathContext, li
 
 @wp.func
 def pixel_context(shot: AnyShot, rules: PathRules, view: int, row: int, column: int) -> PathContext:
-    """Constants of the paths of a pixel of the reference, all in the light of the whole map."""
+    """Path constants of a pixel of the reference renderer: one environment map, lamps included, for all bounces."""
     snapshot, views = shot.snapshot, shot.views
     world = views.world[view]
     context = PathContext()
