@@ -217,7 +217,7 @@ class Render:
         True,
         "With `history`: keep the tiles of a picture, and the masks, in which nothing changed since the frame before; files are the same.",
     )
-    reuse_worlds: Annotated[int, f"[0, {INT32_MAX}]"] = setting(0, "Worlds of which `reuse` keeps tiles; 0: as many as memory holds.")
+    reuse_worlds: Annotated[int, f"[0, {INT32_MAX}]"] = setting(0, "Worlds of which `reuse` keeps tiles; 0: as many as memory permits.")
     lamps: Annotated[int, "[0, 8]"] = setting(
         8, "Maximum lamps of a map, small bright lights with shadow rays of their own; mode unoccluded: at most 1."
     )

@@ -388,7 +388,7 @@ def without_pictures(config: Config) -> Config:
 
 def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int = 1, processes: int = 1) -> Config:
     """Choose worlds and batches that the settings leave open, for a device that simulates `episodes` and has `writers`; `processes` share
-    the host's memory. What settings name stays, whether it fits or not."""
+    the host's memory. What settings name stays, whether it fits or not, but for kept pictures."""
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
     while terms := (short := _short_memory(split_memories(plan_memory(config, device, writers), device, processes)))[0]:

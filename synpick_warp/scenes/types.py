@@ -64,7 +64,7 @@ class Material:
     """Transmission."""
     opacity: np.ndarray | None = field(default=None, hash=False)
     """Part of the transmission that a texel lacks (H, W) uint8, such as a label: 0 none, 255 all. None: nowhere."""
-    emission: tuple[float, float, float] = BLACK
+    emission: tuple[float, float, float] = field(default=BLACK, hash=False)
     """Emitted light, linear; 1 is the white of a picture, under any environment map."""
     glow: np.ndarray | None = field(default=None, hash=False)
     """Emission texture of the texture's size (H, W, 3) uint8, sRGB, a factor on `emission`. None: it is the same everywhere."""

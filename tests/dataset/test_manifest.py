@@ -114,6 +114,10 @@ def test_inputs_are_known_by_their_content():
     brighter = digest_inputs(catalog(), (dataclasses.replace(sky, radiance=sky.radiance * np.float32(2)), *rest))
     changes = [(digests["objects"] != known["objects"], digests["lights"] != known["lights"]) for digests in (heavier, brighter)]
     assert changes == [(True, False), (False, True)]
+    materials = [dataclasses.replace(entry.material, emission=(1.0, 0.5, 0.0), glow=glow) for glow in (None, np.zeros((2, 2, 3), np.uint8))]
+    lit = [dataclasses.replace(catalog(), entries=(first, dataclasses.replace(entry, material=each), *others)) for each in materials]
+    shining, textured = (digest_inputs(each, skies()) for each in lit)
+    assert [manifest.describe_inputs(known, shining), manifest.describe_inputs(shining, textured)] == ["emission (2: boxes_2)"] * 2
 
 
 def test_inputs_that_differ_are_named_with_their_objects():

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from synpick_warp.scenes.assets import alpha_masks
-from synpick_warp.scenes.assets.alpha_masks import CLAMP, MIRROR, cut_mask
+from synpick_warp.scenes.assets.alpha_masks import CLAMP, MAX_TRIANGLES, MIRROR, cut_mask
 from synpick_warp.scenes.assets.appearance import NO_MATERIAL
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
 from tests.scenes.test_gltf import UV, Builder
@@ -74,12 +74,26 @@ def test_wrap_modes_hold(modes, share):
 
 def test_too_many_triangles_halve_the_mask(monkeypatch):
     fine = cut(QUAD, disc(256, 0.35))
-    monkeypatch.setattr(alpha_masks, "MAX_TRIANGLES", 1500)
-    coarse = cut(QUAD, disc(256, 0.35))
+    coarse = cut_mask(QUAD, disc(256, 0.35), 127.5, (REPEAT, REPEAT), 1500)
+    assert coarse is not None
     assert len(coarse.faces) <= 1500 + len(QUAD.faces) < len(fine.faces)
     assert areas(coarse).sum() == pytest.approx(areas(fine).sum(), rel=0.03)
     monkeypatch.setattr(alpha_masks, "MAX_TEXELS", 100)
     assert cut_mask(QUAD, disc(256, 0.35), 127.5, (REPEAT, REPEAT)) is None
+
+
+@pytest.mark.parametrize("far", [1e4, np.nan])
+def test_vertices_that_no_triangle_uses_count_for_nothing(far):
+    more = replace(
+        QUAD,
+        **{
+            name: np.vstack([getattr(QUAD, name), np.full(3, far)[: getattr(QUAD, name).shape[1]]])
+            for name in ("vertices", "normals", "uv")
+        },
+    )
+    assert areas(cut(more, disc(64, 0.35))).sum() == areas(cut(QUAD, disc(64, 0.35))).sum()
+    empty = replace(more, faces=more.faces[:0])
+    assert cut(empty, disc(64, 0.35)) is empty
 
 
 def masked(alpha: np.ndarray | None, factor: float = 1.0, cutoff: float = 0.5) -> Builder:
@@ -110,3 +124,21 @@ def test_the_factor_counts_and_the_cutoff_decides(tmp_path):
     alpha = np.full((8, 8), 200, np.uint8)
     assert len(masked(alpha, 0.5, 0.39).read(tmp_path)[0].faces) == 4
     assert len(masked(None, 0.5).read(tmp_path)[0].faces) == 4
+
+
+def test_nodes_share_what_is_cut_once(tmp_path, monkeypatch):
+    alpha = disc(256, 0.35)
+    twice = masked(alpha).with_(nodes=[{"mesh": 0}, {"mesh": 0, "translation": [3.0, 0.0, 0.0]}], scenes=[{"nodes": [0, 1]}])
+    cuts = []
+    monkeypatch.setattr(alpha_masks, "cut_mask", lambda *given: cuts.append(given[-1]) or cut_mask(*given))
+    assert len(twice.read(tmp_path)[0].faces) == 2 * len(masked(alpha).read(tmp_path)[0].faces)
+    assert cuts == [MAX_TRIANGLES // 2, MAX_TRIANGLES]
+
+
+def test_vertex_colors_of_a_cut_part_are_named(tmp_path):
+    """They would be baked with the few texels of its small triangles."""
+    colors = np.array([[255, 0, 0, 255], [0, 255, 0, 255], [0, 0, 255, 255], [255, 255, 0, 255]], np.uint8)
+    mesh, finish, said = masked(disc(32, 0.2)).attribute("COLOR_0", colors, normalized=True).read(tmp_path)
+    assert ["vertex colours" in line for line in said] == [True]
+    assert len(mesh.faces) > 4
+    assert finish.texture.shape == (32, 32, 3)

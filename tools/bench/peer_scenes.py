@@ -1,5 +1,5 @@
-"""Our bins, objects and cameras as scenes of other renderers, Newton's SensorCamera and MuJoCo Warp's ray tracer (where all objects are geoms
-of the world body), and comparison of their pixels with ours."""
+"""Our bins, objects and cameras as scenes of other renderers, Newton's SensorCamera and MuJoCo Warp's ray tracer (all objects are geoms of
+the world body), and comparison of their pixels with ours."""
 
 import importlib
 from collections.abc import Callable

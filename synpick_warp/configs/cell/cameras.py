@@ -246,7 +246,7 @@ class DepthSensor:
     clear_reach: Annotated[float, "[0, 1e3] m"] = setting(
         0.1,
         "Distance behind a transparent surface at which 1/e of what is there is still measured, the rest being holes (fitted to four "
-        "frames of a D435 that ClearGrasp published: Sajjan et al., 2020); 0: transparent surfaces are measured as opaque ones.",
+        "frames of a D435 that ClearGrasp published: Sajjan et al., 2020); 0: as if they were opaque (layer depth_sensor).",
     )
     registration: Fraction = setting(
         0.0,

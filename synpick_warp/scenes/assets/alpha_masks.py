@@ -1,20 +1,23 @@
 """Alpha masks: what a texture's alpha channel removes is cut out of the triangles, so that every stage sees the holes.
 
 Longest edges are bisected until a triangle lies in texels of one kind or is about as small as a texel; then it is clipped along the line
-where the bilinear alpha is the threshold (marching triangles). Vertices that triangles share stay shared.
+where the bilinear alpha is the threshold (marching triangles). Vertices that triangles share stay shared; a whole triangle may have middles
+of its neighbours on its edges.
 """
 
+import io
 from dataclasses import replace
 
 import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
-from synpick_warp.scenes.assets.appearance import resize
+from synpick_warp.scenes.assets.appearance import EXR_MAGIC, resize
+from synpick_warp.scenes.assets.asset_files import Notes
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
 
 MAX_TRIANGLES = 2**17
-"""Largest number of triangles that cutting adds to a part; where there would be more, the mask is halved in size."""
+"""Largest number of triangles that cutting adds to the parts of a model; where there would be more, masks are halved in size."""
 MAX_TEXELS = 2**25
 """Largest number of texels of a mask, in all the repetitions that a part shows."""
 CLIP_EDGE = 1.5
@@ -26,34 +29,56 @@ CLAMP, MIRROR = 33071, 33648
 _TURNS = np.array([(0, 1, 2), (1, 2, 0), (2, 0, 1)])
 
 
-def cut_mask(part: MeshPart, alpha: np.ndarray, threshold: float, modes: tuple[int, int]) -> MeshPart | None:
+def mask_part(part: MeshPart, data: bytes, threshold: float, modes: tuple[int, int], most: int, notes: Notes) -> MeshPart:
+    """Apply the alpha mask of an image file to a part, by `cut_mask`, and note what is ignored. `most`: 0: the part cannot be cut."""
+    if not data.startswith(EXR_MAGIC):  # Of OpenEXR, no alpha is read.
+        with Image.open(io.BytesIO(data)) as image:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+        if alpha.min() >= threshold:
+            return part
+        if most and (cut := cut_mask(part, alpha, threshold, modes, most)) is not None:
+            if cut.colors is None or (cut.colors == cut.colors[:1]).all():
+                return cut
+            # They would be baked with the few texels of small triangles.
+            notes.ignored.append("vertex colours of a part with an alpha mask")
+            return replace(cut, colors=None)
+    notes.ignored.append("transparency")
+    return part
+
+
+def cut_mask(part: MeshPart, alpha: np.ndarray, threshold: float, modes: tuple[int, int], most: int = MAX_TRIANGLES) -> MeshPart | None:
     """Cut away what the alpha test discards (alpha < `threshold`, 0 to 255); None: the texture repeats too often. `part`: with texture
-    coordinates. `alpha`: alpha channel of its texture (H, W) uint8. `modes`: glTF wrap modes along columns and rows."""
+    coordinates. `alpha`: alpha channel of its texture (H, W) uint8. `modes`: glTF wrap modes along columns and rows. `most`: largest number
+    of triangles to add."""
     assert part.uv is not None
+    used = np.unique(part.faces)
+    if len(used) == 0:
+        return part
     given = {name: values for name in ("vertices", "normals", "colors", "uv") if (values := getattr(part, name)) is not None}
     table, cut = np.concatenate(list(given.values()), axis=1).astype(np.float64), None
     while cut is None:
         height, width = alpha.shape
         # Columns and rows from the centre of the upper left texel.
         at = part.uv * (width, -height) + (-0.5, height - 0.5)
-        low, high = np.floor(at.min(axis=0)) - 1.0, np.floor(at.max(axis=0)) + 3.0
-        if (high - low).prod() > MAX_TEXELS:
+        low, high = np.floor(at[used].min(axis=0)) - 1.0, np.floor(at[used].max(axis=0)) + 3.0
+        if not (high - low).prod() <= MAX_TEXELS:  # Or not a number, which the check of all parts names.
             return None
         plane = alpha
         for axis, (first, last, mode) in enumerate(zip(low[::-1], high[::-1], modes[::-1], strict=True)):
             plane = np.concatenate([plane, np.flip(plane, axis)], axis=axis) if mode == MIRROR else plane
             plane = plane.take(np.arange(first, last, dtype=int), axis=axis, mode="clip" if mode == CLAMP else "wrap")
-        cut = _cut(np.concatenate([table, at - low], axis=1), part.faces, plane.astype(np.float64) - threshold)
+        cut = _cut(np.concatenate([table, at - low], axis=1), part.faces, plane.astype(np.float64) - threshold, most + len(part.faces))
         alpha = resize(alpha[..., None], (max(width // 2, 1), max(height // 2, 1)), Image.Resampling.BOX)[..., 0]
     ends = np.cumsum([values.shape[1] for values in given.values()])
     pieces = dict(zip(given, np.split(cut[0], ends, axis=1), strict=False))
     return replace(part, faces=cut[1], **pieces)
 
 
-def _cut(rows: np.ndarray, faces: np.ndarray, field: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Cut off what lies where `field` is negative; the last two columns of `rows` are texel column and row. None: too many triangles."""
+def _cut(rows: np.ndarray, faces: np.ndarray, field: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Cut off what lies where `field` is negative; the last two columns of `rows` are texel column and row. None: more triangles
+    than `most`."""
     sums = np.pad((field < 0.0).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    kept, most = [np.zeros((0, 3), np.int64)], MAX_TRIANGLES + len(faces)
+    kept = [np.zeros((0, 3), np.int64)]
     while len(faces):
         at = rows[faces][..., -2:]
         # Texels that bilinear look-ups in the triangle's box read.

@@ -169,7 +169,7 @@ def rgb8(image: Image.Image) -> np.ndarray:
     """Convert an image of any mode to 8-bit RGB (H, W, 3).
 
     Grey becomes three equal channels; palettes and CMYK are converted. 16-bit grey is rounded to 8 bits, 16-bit colour is truncated.
-    Alpha is dropped: objects are opaque, and texture bakers pad transparent texels with colour for filtering.
+    Alpha is dropped, since masks are cut out and texture bakers pad transparent texels with colour for filtering.
     """
     if image.mode == "F":
         grey = np.clip(np.nan_to_num(np.asarray(image)), 0.0, 1.0) * 255.0

@@ -189,4 +189,15 @@ def test_structs_of_the_arguments_choose_the_kernel(surfaces, views, rows, devic
 
 def test_plain_structs_have_nothing_of_looks():
     """Known: a cell without looks has neither the rows nor the code that reads them."""
-    assert set(RandomizedSurfaces.vars) - set(Surfaces.vars) == {"row", "recolor", "repeats", "wear", "pattern", "noise", "glass", "label"}
+    assert set(RandomizedSurfaces.vars) - set(Surfaces.vars) == {
+        "row",
+        "recolor",
+        "repeats",
+        "wear",
+        "pattern",
+        "noise",
+        "glass",
+        "label",
+        "emission",
+        "glow",
+    }

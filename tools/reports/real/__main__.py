@@ -263,12 +263,11 @@ def main(arguments: list[str] | None = None) -> int:
 def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> None:
     """Train and score with all seeds of a command line; results are written after each, and printed. Raises SynpickError: a setting is
     wrong, models or lights cannot be used, or files cannot be written."""
-    config = settings_of(options, 0, device)
+    config, twins = settings_of(options, 0, device), render_twins(frames, options)
     few, held = replace(config, bake=replace(config.bake, worlds=min(options.worlds, FEW_WORLDS))), ViewPool(HELD_OUT_VIEWS, 0)
     held.fill(stream_views(few, HELD_OUT, HELD_OUT_VIEWS), HELD_OUT_VIEWS)
     check_ids([*(frame.label for frame in frames), held.tensors()[1].cpu().numpy()])
     recipe = Recipe(**{name: value for name, value in vars(options).items() if name in Recipe.__dataclass_fields__})
-    twins = render_twins(frames, options)
     target, outcomes, rows = torch.device(device.alias), list[TrainingOutcome](), list[MeasuredRow]()
     for seed in range(options.seeds):
         views = stream_views(settings_of(options, seed, device), TRAINING, recipe.views)

@@ -19,7 +19,7 @@ from rich.console import Console
 
 import synpick_warp
 from synpick_warp.configs.files.load import parse_assignment
-from synpick_warp.errors import SynpickError
+from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.scenes.types import Camera
 from tools.figures import describe_run, write_run
 from tools.options import MeasuredRow, existing_folder, fail, make_parser, print_rows
@@ -32,13 +32,17 @@ LEVELS = 255.0
 
 def render_twins(frames: Sequence[RealFrame], options: argparse.Namespace) -> list[RealFrame]:
     """Twins of frames by a command line's `models`, `lights`, `device` and `set`. Raises SynpickError: one of these cannot be used."""
-    settings = dict(parse_assignment(text) for text in options.set) | {"bake.lights": options.lights}
+    if not options.models:
+        raise ConfigError("twins need --models, the folder of the photographs' BOP models")
+    settings = dict(parse_assignment(text) for text in options.set) | {"bake.lights": options.lights, "render.table": False}
     return [render_twin(frame, Path(options.models), options.device, settings) for frame in frames]
 
 
 def render_twin(frame: RealFrame, models: Path, device: str, settings: Mapping[str, object]) -> RealFrame:
     """The frame with its objects rendered, and their labels; all else is the photograph. `models`: folder of BOP models. `device` and
     `settings`: as of `synpick_warp.render`. Raises SynpickError: a model or a setting cannot be used."""
+    if not frame.object_ids:
+        return frame
     view = np.linalg.inv(np.vstack([frame.world_to_camera, [0.0, 0.0, 0.0, 1.0]]))
     poses = np.tile(np.eye(4), (len(frame.object_ids), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = frame.rotations, UNIT * frame.translations

@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import unquote, unquote_to_bytes
 
 import msgspec
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, Notes, read_referred
@@ -339,3 +341,12 @@ def read_uri(uri: str, limit: int, path: Path) -> bytes:
         return base64.b64decode(content) if kind.endswith(";base64") else unquote_to_bytes(content)
     except (binascii.Error, ValueError):
         raise CatalogError(f"{path}: data that are not base64; export it again") from None
+
+
+def node_matrix(node: Node) -> np.ndarray:
+    """Local transform of a node (4, 4): its matrix, or translation, rotation and scale."""
+    if node.matrix is not None:
+        return np.asarray(node.matrix).reshape(4, 4).T
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale, node.translation
+    return matrix

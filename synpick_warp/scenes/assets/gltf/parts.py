@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from PIL import Image as PillowImage
-from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.assets import appearance
-from synpick_warp.scenes.assets.alpha_masks import CLAMP, MIRROR, cut_mask
+from synpick_warp.scenes.assets.alpha_masks import CLAMP, MAX_TRIANGLES, MIRROR, mask_part
 from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, Notes, reading_as
 from synpick_warp.scenes.assets.gltf import document as schema
-from synpick_warp.scenes.assets.mesh_parts import MeshPart
+from synpick_warp.scenes.assets.mesh_parts import MeshPart, check_indices
 from synpick_warp.scenes.types import BLACK, OPAQUE, Glass
 from synpick_warp.system.linear_algebra import DECIMALS, cofactors, det, dot, matmul
 
@@ -63,20 +62,27 @@ class _Reader:
         # Joints may lie outside of the scene.
         placed = self.placed(roots) if self.gltf.skins else drawn
         parts: list[MeshPart] = []
-        rows = 0
-        for number, transform in drawn.items():
-            skin, mesh = nodes[number].skin, nodes[number].mesh
-            for each in () if mesh is None else schema.item_at(self.gltf.meshes, mesh, "mesh", self.path).primitives:
-                if each.mode not in (schema.TRIANGLES, schema.STRIP, schema.FAN):
-                    continue
-                part = self.part(each, skin is None)
-                rows += max(len(part.vertices), len(part.faces))
-                if rows > MAX_ROWS or len(parts) >= MAX_PARTS:
-                    raise CatalogError(f"{self.path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
-                if skin is not None:
-                    part = self.skinned(part, each, schema.item_at(self.gltf.skins, skin, "skin", self.path), placed)
-                parts.append(part if skin is not None else _transform(part, transform))
+        rows, made, filled = 0, dict[tuple[int, bool], MeshPart](), (schema.TRIANGLES, schema.STRIP, schema.FAN)
+        meshes = ((number, nodes[number].mesh) for number in drawn)
+        given = [(number, schema.item_at(self.gltf.meshes, mesh, "mesh", self.path)) for number, mesh in meshes if mesh is not None]
+        found = [(number, each) for number, mesh in given for each in mesh.primitives if each.mode in filled]
+        self.room = MAX_TRIANGLES // max(1, sum(self.stated(each).alphaMode == "MASK" for _, each in found))
+        for number, each in found:
+            skin = nodes[number].skin
+            key = id(each), skin is None
+            part = made[key] = made.get(key) or self.part(each, skin is None)
+            rows += max(len(part.vertices), len(part.faces))
+            if rows > MAX_ROWS or len(parts) >= MAX_PARTS:
+                raise CatalogError(f"{self.path}: more than {MAX_ROWS} vertices or {MAX_PARTS} parts; decimate the mesh")
+            if skin is not None:
+                part = self.skinned(part, each, schema.item_at(self.gltf.skins, skin, "skin", self.path), placed)
+            parts.append(part if skin is not None else _transform(part, drawn[number]))
         return parts
+
+    def stated(self, primitive: schema.Primitive) -> schema.GltfMaterial:
+        """Material of a primitive as the document has it; the default one where it has none, or none of that number."""
+        index, materials = primitive.material, self.gltf.materials
+        return materials[index] if index is not None and index < len(materials) else schema.GltfMaterial()
 
     def placed(self, roots: list[int]) -> dict[int, np.ndarray]:
         """Transforms (4, 4) of nodes and all below them to the scene, by number, depth first."""
@@ -89,7 +95,7 @@ class _Reader:
             if len(placed) == MAX_PARTS:
                 raise CatalogError(f"{self.path}: more than {MAX_PARTS} nodes; merge the meshes' parts")
             node = schema.item_at(self.gltf.nodes, number, "node", self.path)
-            placed[number] = matmul(parent, _node_matrix(node))
+            placed[number] = matmul(parent, schema.node_matrix(node))
             stack += [(child, placed[number]) for child in reversed(dict.fromkeys(node.children))]
         return placed
 
@@ -156,7 +162,7 @@ class _Reader:
             material = replace(material, color=appearance.WHITE) if primitive.material is None else material
             colors = appearance.linear_to_srgb(colors[:, :3])
         part = MeshPart(vertices, _triangles(corners, primitive.mode), normals, uv, colors, material)
-        given = schema.GltfMaterial() if primitive.material is None else self.gltf.materials[primitive.material]
+        given = self.stated(primitive)
         part = self.masked(part, given, rigid) if given.alphaMode == "MASK" else part
         if info is None or part.uv is None:
             return part
@@ -169,13 +175,10 @@ class _Reader:
         factor, info = (gloss.diffuseFactor[3], gloss.diffuseTexture) if gloss else (pbr.baseColorFactor[3], pbr.baseColorTexture)
         if info is None or part.uv is None or self.texture(info) is None:
             return part if factor >= material.alphaCutoff else replace(part, faces=part.faces[:0])
-        with PillowImage.open(io.BytesIO(self.files[self.source(info)])) as image:
-            alpha = np.asarray(image.convert("RGBA"))[..., 3]
-        modes = self.coordinates(info)[-2:]
-        threshold = 255.0 * material.alphaCutoff / max(factor, _FACTOR_TOLERANCE)
-        cut = cut_mask(part, alpha, threshold, (modes[0], modes[1])) if rigid and alpha.min() < threshold else None
-        self.notes.ignored += ["transparency"] if cut is None and alpha.min() < threshold else []
-        return cut or part
+        check_indices(part.faces, len(part.vertices), self.path)
+        data, modes, threshold = self.files[self.source(info)], self.coordinates(info)[-2:], 255.0 * material.alphaCutoff
+        threshold /= max(factor, _FACTOR_TOLERANCE)
+        return mask_part(part, data, threshold, (modes[0], modes[1]), self.room if rigid else 0, self.notes)
 
     def attribute(self, index: int | None, name: str, widths: tuple[int, ...], count: int) -> np.ndarray | None:
         """Values of an attribute that may be absent, one row for each of `count` vertices."""
@@ -257,7 +260,10 @@ class _Reader:
         material = replace(material, emission=BLACK) if glow else material
         textures = (("normalTexture", given.normalTexture), ("metallicRoughnessTexture", pbr.metallicRoughnessTexture))
         for name, each in (*textures, ("emissiveTexture", glow)):
-            if each is None or material.metallic is None or material.roughness is None:
+            if each is None:
+                continue
+            if material.metallic is None or material.roughness is None:
+                self.notes.ignored += [f"{name} beside a missing metallicRoughnessTexture"] if each is glow else []
                 continue
             if info is not None and self.coordinates(info) != self.coordinates(each):
                 self.notes.ignored.append(f"{name} with other texture coordinates")
@@ -476,15 +482,6 @@ def _transform_uv(uv: np.ndarray, info: schema.TextureInfo) -> np.ndarray:
         cosine, sine = np.round([np.cos(transform.rotation), np.sin(transform.rotation)], DECIMALS)
         uv = matmul(uv * transform.scale, np.array([[cosine, -sine], [sine, cosine]])) + transform.offset
     return np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-
-
-def _node_matrix(node: schema.Node) -> np.ndarray:
-    """Local transform of a node (4, 4): its matrix, or translation, rotation and scale."""
-    if node.matrix is not None:
-        return np.asarray(node.matrix).reshape(4, 4).T
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(node.rotation).as_matrix() * node.scale, node.translation
-    return matrix
 
 
 def _transform(part: MeshPart, transform: np.ndarray) -> MeshPart:
