@@ -53,6 +53,13 @@ def test_parts_keep_their_emission(tmp_path):
     assert not said
 
 
+def test_a_part_too_faint_beside_another_is_named(tmp_path):
+    mixed = shining(1e4).with_(nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
+    mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
+    mixed.content["materials"].append({"emissiveFactor": [1.0, 1.0, 1.0]})
+    assert mixed.read(tmp_path)[2] == ["ignored: emission of less than 1/6,500 of an object's brightest part"]
+
+
 @pytest.mark.parametrize(
     ("builder", "said"),
     [

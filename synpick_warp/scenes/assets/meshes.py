@@ -111,6 +111,8 @@ MAX_CELL_FACES = 200_000
 """Triangles of the mesh of a bin or a tool: more take minutes, and slow every picture."""
 CELL_LIMITS = Limits(600.0, 2**33)
 """Limits of reading it."""
+_FAINT = 0.5 / 255.0 / 12.92
+"""Emission, as a fraction of the largest of an object, that 8-bit sRGB rounds to 0."""
 # Maximum texture coordinate: larger ones are mistakes, with a resolution of a thousandth of the image in 32-bit floats.
 _MAX_UV = 1e4
 
@@ -366,10 +368,12 @@ def _share_emission(parts: list[MeshPart], notes: Notes) -> list[MeshPart]:
         notes.ignored.append("emission beside a part without metallic or roughness")
         return [replace(part, material=replace(part.material, emission=BLACK)) for part in parts]
     made: dict[Any, appearance.FileMaterial] = {}
-    lit = []
+    most, lit = max(max(each.light) for each in given), []
+    if any(0.0 < value < _FAINT * most for each in given for value in each.light):
+        notes.ignored.append("emission of less than 1/6,500 of an object's brightest part")
     for part, each in zip(parts, given, strict=True):
         key = id(each.texture), each.metallic, each.roughness, each.light
-        new = made[key] = made.get(key) or each.add_glow(max(max(one.light) for one in given))
+        new = made[key] = made.get(key) or each.add_glow(most)
         lit.append(replace(part, material=replace(part.material, texture=new.texture, emission=new.emission, has_glow=True)))
     return lit
 
