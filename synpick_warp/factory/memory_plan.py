@@ -391,9 +391,10 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
     the host's memory. What settings name stays, whether it fits or not, but for kept pictures."""
     is_open = {key: config.value(key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
-    while terms := (short := _short_memory(split_memories(plan_memory(config, device, writers), device, processes)))[0]:
+    while short := _short_memory(split_memories(plan_memory(config, device, writers), device, processes)):
+        terms, free = short
         if kept := sum(term.size for term in terms if term.name == KEPT_PICTURES):
-            config = _keep_less(config, kept, with_headroom(terms) - short[1], device)
+            config = _keep_less(config, kept, with_headroom(terms) - free, device)
             continue
         worlds, objects = config.bake.worlds, config.arrangement.max_objects
         amounts = {
@@ -449,9 +450,9 @@ def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str
     return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
 
 
-def _short_memory(memories: Iterable[tuple[list[Term], int]]) -> tuple[Sequence[Term], int]:
-    """Terms and free size of the first memory of `split_memories` that `with_headroom` exceeds; ((), 0): everything fits."""
-    return next(((terms, free) for terms, free in memories if with_headroom(terms) > free), ((), 0))
+def _short_memory(memories: Iterable[tuple[list[Term], int]]) -> tuple[list[Term], int] | None:
+    """Terms and free size of the first memory of `split_memories` that `with_headroom` exceeds; None: everything fits."""
+    return next(((terms, free) for terms, free in memories if with_headroom(terms) > free), None)
 
 
 def _keep_less(config: Config, kept: int, excess: int, device: wp.Device) -> Config:

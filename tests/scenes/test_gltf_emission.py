@@ -38,7 +38,7 @@ def test_an_emission_texture_that_is_not_used_leaves_no_emission(tmp_path):
 
 
 def test_parts_keep_their_emission(tmp_path):
-    """A lamp beside a part that does not shine: a texture says where the light comes from."""
+    """A lamp beside a part that emits nothing: an emission texture tells them apart."""
     mixed = shining(2.0).with_(nodes=[{"mesh": 0}, {"mesh": 1}], scenes=[{"nodes": [0, 1]}])
     mixed.content["meshes"].append({"primitives": [{**mixed.primitive, "material": 1}]})
     mixed.content["materials"].append({})

@@ -85,7 +85,7 @@ def _finalize(log: Ledger, folder: Path) -> int:
 
 NAMES = "train/{0}/rgb", "train/{0}/depth", f"{INDEX}/{{0}}.tar.gz", "manifest/{0}.sha256", "manifest/{0}.json"
 OBJECTS = [[name.format(f"{episode:06d}") for name in NAMES] for episode in range(EPISODES)]
-"""Objects of each episode, in the order in which they may be written; their content is their name."""
+"""Keys of the objects of each episode, in upload order; the content of an object is its key."""
 
 
 class Schedule:

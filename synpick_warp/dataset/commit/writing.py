@@ -382,7 +382,7 @@ def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...], looks: L
 
 
 def _emission(material: Material) -> tuple[Any, ...]:
-    """Emission of a material with its texture; empty: it emits nothing."""
+    """Emission factor and texture of a material, for its digest; empty if it emits nothing."""
     return () if material.emission == BLACK else (material.emission, material.glow)
 
 

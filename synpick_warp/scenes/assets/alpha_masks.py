@@ -17,7 +17,7 @@ from synpick_warp.scenes.assets.asset_files import Notes
 from synpick_warp.scenes.assets.mesh_parts import MeshPart
 
 MAX_TRIANGLES = 2**17
-"""Largest number of triangles that cutting adds to the parts of a model; where there would be more, masks are halved in size."""
+"""Maximum number of triangles that cutting adds to a model; beyond it, masks are halved in resolution."""
 MAX_TEXELS = 2**25
 """Largest number of texels of a mask, in all the repetitions that a part shows."""
 CLIP_EDGE = 1.5
@@ -121,7 +121,7 @@ def _clip(rows: np.ndarray, faces: np.ndarray, field: np.ndarray) -> tuple[np.nd
     inside = value[faces] >= 0.0
     whole, mixed = faces[inside.all(axis=1)], np.isin(inside.sum(axis=1), (1, 2))
     faces, inside = faces[mixed], inside[mixed]
-    # The corner that differs from the other two comes first.
+    # Rotate the corners so that the one on the other side of the threshold comes first.
     alone = inside.sum(axis=1) == 1
     odd = np.where(alone, inside.argmax(axis=1), inside.argmin(axis=1))
     a, b, c = np.take_along_axis(faces, _TURNS[odd], axis=1).T

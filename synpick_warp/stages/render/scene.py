@@ -93,7 +93,7 @@ class RenderScene:
     glass: Any = None
     """(material): transmission, index of refraction, thickness [m]; None: all of them are opaque, and no episode draws another."""
     emission: tuple[wp.array, wp.array] | None = None
-    """Members `emission` and `glow` of the struct `RandomizedSurfaces`; None: nothing emits light."""
+    """Arrays `emission` and `glow` of the struct `RandomizedSurfaces`; None if no material emits light."""
 
     @property
     def has_details(self) -> bool:

@@ -24,7 +24,7 @@ CAMERAS = (camera(90, 61, 200.0, (0.0, 0.0, 1.2)), camera(90, 61, 240.0, (0.05, 
 ENTRIES = [entry(sheet(0.5, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.03, 3)), entry(box(0.08, 0.01, 0.03))]
 ROOM = 6
 KEPT = ((True, 0), (True, 1), (False, 0))
-"""`render.reuse` and `reuse_worlds`: tiles of both worlds are kept, of the first, of none."""
+"""`render.reuse` and `render.reuse_worlds`: tiles are kept in both worlds, in the first only, in none."""
 
 
 def scripts(seed: int) -> list[ToyScene]:

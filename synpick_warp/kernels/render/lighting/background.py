@@ -37,7 +37,7 @@ def floor_radiance(scene: RandomizedScene, drop: float, shot: AnyShot, view: int
 
 @kernel_of_views
 def shade_floor_kernel(scene: RandomizedScene, drop: float, shot: AnyShot, first: int, image_inout: ShadedImage):
-    """Draw the floor in pixels without a surface whose ray points down. The camera alone sees it: it has no depth and lights nothing.
+    """Shade the floor, a ground plane, where a camera ray points down and hits nothing else. It has no depth and lights nothing.
 
     The last material of each view is that of the floor, which is `drop` [m] below the table. Launched over view, pixel (tile order, from
     flat index `first` on)."""

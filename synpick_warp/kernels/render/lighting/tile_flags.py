@@ -23,7 +23,7 @@ class TileFlags:
     kept_row: wp.array[int]
     """(view): row of everything else that is kept from frame to frame."""
     holds: wp.array[int]
-    """(view): 1: what is kept there is the previous frame of the same episode; 0: all tiles are dirty."""
+    """(view): 1 if `kept_row` contains the previous frame of the same episode; 0: all tiles are dirty."""
     stages: wp.array2d[wp.uint8]
     """(view, cell_tile): stages of the denoiser that the tile needs, bits as RATIO_STAGE."""
     due: wp.array2d[wp.uint8]

@@ -47,7 +47,7 @@ def group_of(surfaces: RandomizedSurfaces, view: int, body: int) -> int:
 
 @wp.kernel
 def group_bodies_kernel(surfaces: RandomizedSurfaces, bodies: ViewBodies, groups_out: BodyGroups):
-    """Sort the bodies of each view by `group_of`, stably: opaque ones first. Launched over view, rank."""
+    """Stable sort of each view's bodies by `group_of`, opaque ones first. Launched over view, rank."""
     view, rank = wp.tid()
     present = bodies.present[view]
     own = int(-1)

@@ -46,6 +46,7 @@ class _Reader:
         self.path, self.gltf, self.buffers, self.notes = path, gltf, buffers, notes
         self.images = appearance.ImageCache(self.path)
         self.files: dict[int, bytes] = {}
+        self.room = MAX_TRIANGLES
         self.tiles: dict[tuple[int, bool, bool], np.ndarray] = {}
         self.mapped_textures: dict[tuple[Any, ...], np.ndarray | None] = {}
         self.materials: dict[int, tuple[appearance.FileMaterial, schema.TextureInfo | None]] = {}
