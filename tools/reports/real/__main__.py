@@ -271,7 +271,7 @@ def run(options: argparse.Namespace, frames: list[RealFrame], device: Any) -> No
     target, outcomes, rows = torch.device(device.alias), list[TrainingOutcome](), list[MeasuredRow]()
     for seed in range(options.seeds):
         views = stream_views(settings_of(options, seed, device), TRAINING, recipe.views)
-        outcomes.append(measure(train(views, recipe, 1 + MODELS, target, seed), frames, twins, held, target))
+        outcomes.append(measure(train(views, recipe, 1 + MODELS, target, options.seed + seed), frames, twins, held, target))
         rows, losses = rows_of(outcomes), [one.trained.losses for one in outcomes]
         write_run(options.json, describe_run("tools.reports.real", (), rows, losses=losses))
         print(f"seed {seed}:", *(f"{row.name} {row.value:.4g} {row.unit};" for row in rows_of(outcomes[-1:]) if not row.part), flush=True)
