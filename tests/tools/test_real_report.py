@@ -106,7 +106,7 @@ def test_the_loss_of_known_logits():
 
 
 def test_the_network_has_logits_of_the_images_size():
-    assert training.ResidualNetwork(5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 24, 40)
+    assert training.ResidualNetwork(5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 12, 20)
 
 
 def test_a_pool_replaces_views_once_it_is_full():

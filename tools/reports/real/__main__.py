@@ -22,9 +22,8 @@ import numpy as np
 try:
     import torch  # pyright: ignore[reportMissingImports]
     from torch import nn  # pyright: ignore[reportMissingImports]
-    from torch.nn import functional  # pyright: ignore[reportMissingImports]
 
-    from tools.reports.real.training import BLOCK, Recipe, Trained, ViewPool, train
+    from tools.reports.real.training import BLOCK, Recipe, Trained, ViewPool, train, upsample
 except ModuleNotFoundError as missing:
     raise SystemExit(f"reports.real: {missing.name} is not installed; pip install torch") from None
 
@@ -66,7 +65,7 @@ COUNTS = {
     "seeds": (3, "trainings, each with piles of its own"),
     "worlds": (512, "worlds simulated in parallel"),
     "capacity": (24_000, "views in the pool, at most"),
-    "batch": (16, "views of a batch"),
+    "batch": (128, "views of a batch"),
 }
 """Options that are integers above 0: default and meaning."""
 OWN = {
@@ -112,7 +111,7 @@ def predict(network: nn.Module, color: np.ndarray, size: tuple[int, int], device
     small = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     image = torch.from_numpy(np.ascontiguousarray(small.transpose(2, 0, 1)))[None]
     with torch.no_grad():
-        logits = functional.interpolate(network(image.to(device)).float(), size=color.shape[:2], mode="bilinear", align_corners=False)
+        logits = upsample(network(image.to(device)).float(), color.shape[:2])
     return logits[0].argmax(0).to(torch.uint8).cpu().numpy()
 
 
@@ -140,7 +139,7 @@ def score_pool(network: nn.Module, pool: ViewPool, classes: int) -> NetworkScore
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for images, truth in zip(*(values[: pool.count].split(SCORED) for values in pool.tensors()), strict=True):
             with torch.no_grad():
-                found = network(images).argmax(1)
+                found = upsample(network(images), truth.shape[1:]).argmax(1)
             yield from zip(found.to(torch.uint8).cpu().numpy(), truth.cpu().numpy(), strict=True)
 
     return score(pairs(), classes, MIN_PIXELS)

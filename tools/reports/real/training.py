@@ -11,7 +11,7 @@ gamma, blur, noise, JPEG), each image by its own draw.
 import itertools
 import math
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -159,7 +159,7 @@ class Trained:
 
 class ResidualNetwork(nn.Module):
     """Residual U-Net: a stem of 1/2 of the image's size with half of `width` channels, levels of 1/4 to 1/32 with `width` to 8 x `width`
-    channels, logits of 1/2. Its blocks begin at 1/4, as in a ResNet: at 1/2 they would take four times the operations.
+    channels. Its blocks begin at 1/4, as in a ResNet: at 1/2 they would take four times the operations.
 
     A pixel of its coarsest level sees about 420 pixels of the image to each side.
     """
@@ -176,15 +176,15 @@ class ResidualNetwork(nn.Module):
         self.head = nn.Conv2d(widths[0], classes, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Logits (B, classes, H, W) of an image (B, 3, H, W): uint8, or float32 as it is."""
+        """Logits (B, classes, H / 2, W / 2) of an image (B, 3, H, W): uint8, or float32 as it is."""
         x = self.stem(image.float().div(255).sub(0.5) if image.dtype == torch.uint8 else image)
         skips = [x]
         for level in self.down:
             x = level(x)
             skips.append(x)
         for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
-            x = level(torch.cat((_upsample(x, skip.shape[2:]), skip), dim=1))
-        return _upsample(self.head(x), image.shape[2:])
+            x = level(torch.cat((upsample(x, skip.shape[2:]), skip), dim=1))
+        return self.head(x)
 
 
 class _Block(nn.Module):
@@ -204,7 +204,7 @@ def _convolution(before: int, after: int, size: int = 3, stride: int = 1) -> nn.
     return nn.Sequential(nn.Conv2d(before, after, size, stride, size // 2, bias=False), nn.BatchNorm2d(after), nn.ReLU())
 
 
-def _upsample(x: torch.Tensor, size: torch.Size) -> torch.Tensor:
+def upsample(x: torch.Tensor, size: Sequence[int]) -> torch.Tensor:
     """Bilinear interpolation of features (B, C, H, W) to a height and width of `size`."""
     return functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
 
@@ -340,7 +340,7 @@ class _Trainer:
         images, classes = prepare_batch(*pool.draw(self.recipe.batch), self.recipe, done)
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             logits = self.network(images.contiguous(memory_format=torch.channels_last))
-        loss = segmentation_loss(logits, classes, self.recipe.dice)
+        loss = segmentation_loss(logits, classes[..., ::2, ::2], self.recipe.dice)
         self.optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.network.parameters(), MAX_NORM)
