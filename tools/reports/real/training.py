@@ -5,7 +5,7 @@ few piles; batches from a pool mix many, and each view is trained on several tim
 
 The network is a residual U-Net (Zhang et al., GRSL 2018), from scratch. AdamW with a warm-up and a cosine schedule, mixed precision
 (bfloat16) on a GPU. Augmentation is geometric (scale, rotation, shift, crop, mirrored borders) and photometric (gain, contrast, saturation,
-gamma, blur, noise, JPEG), each image by its own draw.
+gamma, blur and sharpening, noise, JPEG), each image by its own draw.
 """
 
 import itertools
@@ -36,6 +36,9 @@ DEPTHS = (2, 3, 4, 3)
 """Residual blocks of each level of the network."""
 MAX_NORM = 5.0
 """Norm to which gradients are clipped."""
+SHARPENING = 1.5
+"""Largest weight of unsharp masking. Fine detail (luma less its blur by 1 px) of the unlabelled photographs has a standard deviation of
+0.053, that of rendered views 0.041: cameras sharpen."""
 FIRST = 0.125
 """Fraction of the pool that is filled before training starts."""
 FILLING = 0.5
@@ -226,8 +229,8 @@ def warp_views(images: torch.Tensor, classes: torch.Tensor, recipe: Recipe, crop
 
 
 def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
-    """Photometric augmentation of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, noise, and blur of half of
-    them."""
+    """Photometric augmentation of images (B, 3, H, W) in 0..1: gain and balance, contrast, saturation, gamma, blur or unsharp masking,
+    noise."""
 
     def spread(channels: int, width: float) -> torch.Tensor:
         return torch.exp(width * strength * (torch.rand(len(images), channels, 1, 1, device=images.device) * 2 - 1))
@@ -240,7 +243,7 @@ def jitter_views(images: torch.Tensor, strength: float) -> torch.Tensor:
     images = (grey + spread(1, 1.5) * (images - grey)).clamp(1e-4, 1.0) ** spread(1, 1.0)
     blurred = functional.avg_pool2d(functional.pad(images, (1, 1, 1, 1), "replicate"), 3, 1)
     share = torch.rand(len(images), 1, 1, 1, device=images.device)
-    images = images + torch.clamp(2 * share - 1, 0) * (blurred - images)
+    images = images + (share - SHARPENING * (1 - share)) * (blurred - images)
     level = 0.2 * strength * torch.rand(len(images), 1, 1, 1, device=images.device) ** 2
     return (images + level * torch.randn_like(images)).clamp(0, 1)
 
