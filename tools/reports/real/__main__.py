@@ -70,7 +70,7 @@ COUNTS = {
 """Options that are integers above 0: default and meaning."""
 OWN = {
     **{name: {"type": positive_count, "default": value, "help": f"{text} (default: {value})"} for name, (value, text) in COUNTS.items()},
-    "passes": {"type": number_in(0.0), "default": 4.0, "help": "number of epochs (default: 4)"},
+    "passes": {"type": number_in(0.0), "default": 40.0, "help": "number of epochs, if time allows (default: 40)"},
     "seconds": {"type": number_in(0.0), "default": 280.0, "help": "time limit of a training with its stream [s] (default: 280)"},
     "pictures": {"type": existing_folder, "metavar": "DIR", "help": "write overlays of all frames to this folder"},
 }
