@@ -249,6 +249,26 @@ def warmup(
     return 0
 
 
+@app.command
+def gap(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set in BOP's folders, ours or not: images with poses and models.")],
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="Folder of the twins: new or empty.")],
+    config: ConfigOption = None,
+    device: DeviceOption = None,
+    lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
+    set_: SetOption = None,
+) -> int:
+    """Render the annotated objects of real images in front of these (twins), as a BOP data set: score a network on both.
+
+    A table compares brightness, contrast, saturation and detail of the objects in both. All but colour images is linked or copied.
+    """
+    from synpick_warp.cli.commands.evaluate import write_gap
+
+    return write_gap(folder, out, _resolve(config, {"bake.device": device, "bake.lights": lights, "render.table": False}, None, set_))
+
+
 @app.command(name="config")
 def show_config(
     *,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+import synpick_warp
 from synpick_warp.configs.cell.bins import BinSizes
 from synpick_warp.configs.schema import Config
 from tests.builders import FEW_STEPS, PICKING, assignments, refusal
@@ -17,7 +18,7 @@ from tools.bench import peers, worlds
 from tools.compare import __main__ as compare
 from tools.compare import pictures
 from tools.reports.real.frames import read_frames
-from tools.reports.real.twins import compare_objects, render_twin
+from tools.reports.real.twins import compare_objects, render_frame
 
 PICKS = {key: value for key, value in PICKING.items() if key.startswith(("perception.", "pick."))}
 SHORT_PICKS = (*FEW_STEPS, *assignments(PICKS | {"pick.speed": 4.0, "pick.lift_speed": 2.0, "settle.rest_displacement": 1e-3}))
@@ -108,7 +109,8 @@ def test_a_twin_differs_in_its_objects_alone(frames, tmp_path):
     """A box of 66 x 66 x 50 mm, whose front is 27.8 px wide: it covers the pixels that the photograph labels."""
     trimesh.creation.box((66.0, 66.0, 50.0)).export(tmp_path / "obj_000021.ply")
     (frame,) = read_frames(frames)
-    twin = render_twin(frame, tmp_path, "cpu", {"bake.lights": "", "render.coarse_paths": 1})
+    settings = synpick_warp.load_config(None, {"bake.device": "cpu", "render.table": False, "render.coarse_paths": 1})
+    twin = render_frame(frame, tmp_path, settings)
     np.testing.assert_array_equal(twin.label, frame.label)
     np.testing.assert_array_equal(twin.color[frame.label == 0], frame.color[frame.label == 0])
     rows = {row.name.removeprefix("obj_id 21: "): row.value for row in compare_objects([frame], [twin])}

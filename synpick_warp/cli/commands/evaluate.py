@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from synpick_warp.apps.estimation.scenes import ImageSelection
     from synpick_warp.apps.evaluation.figures import Settings
     from synpick_warp.apps.evaluation.results import Evaluation
+    from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
 
 
@@ -318,6 +319,24 @@ def estimate(
     print(f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({rate})", f"results: {escape(str(out))}", sep="\n")
     if listed is not None:
         print(f"targets: {escape(str(listed))}; eval --targets {escape(str(listed))}")
+    return 0
+
+
+def write_gap(data: Path, out: Path, settings: Config) -> int:
+    """Write twins of a data set, and print how its objects look in both; returns the exit code."""
+    from synpick_warp.apps.evaluation.twins import Appearance, write_twins
+    from synpick_warp.cli.display import count_on_stderr
+    from synpick_warp.dataset.reading import open_data_set
+
+    data = find_data_set(data, "synpick-warp gap DIR")
+    check_new_folder(out, "--out")
+    check_output_file(out, "--out", data, is_folder=True)
+    with count_on_stderr() as counter:
+        found = write_twins(open_data_set(data), out, settings, counter.report)
+    print("obj_id", *(f"{name:>16}" for name in Appearance._fields), "   (image, twin)")
+    for index, pair in found.items():
+        print(f"{index:>6}", *(f"{real:>9.3f} {twin:>6.3f}" for real, twin in zip(*pair, strict=True)))
+    print(f"twins: {escape(str(out))}; the scores of one network on both differ by what the objects' appearance costs")
     return 0
 
 

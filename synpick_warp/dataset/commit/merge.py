@@ -173,9 +173,9 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
 def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: bytes, lock: int) -> None:
     """Fill an empty folder with the files of all entries, the entries, settings, manifest and indices."""
     for entry, part in sources.items():
-        size = sum(_link(part / name, work / name) for name in read_checksums(part, entry))
+        size = sum(link_file(part / name, work / name) for name in read_checksums(part, entry))
         for suffix in (".sha256", ".json"):
-            _link(part / f"{entry}{suffix}", work / f"{entry}{suffix}")
+            link_file(part / f"{entry}{suffix}", work / f"{entry}{suffix}")
         if size != (read_entry(work, entry) or {}).get("bytes"):  # A power cut shortens what an unfinished bake has not flushed.
             raise DatasetError(f"{part} has files of other sizes than {entry}.json says; resume its bake, or see `synpick-warp verify`")
     files.write_atomically(work / CONFIG_FILE, config_to_toml(config).encode())
@@ -185,7 +185,7 @@ def _stage(work: Path, sources: dict[Path, Path], config: Config, manifest: byte
         finalize_data_set(work, ExportSettings.of(config), needs.classes, pool)
 
 
-def _link(source: Path, target: Path) -> int:
+def link_file(source: Path, target: Path) -> int:
     """Hard-link a regular file, or copy it where links are not possible, or would bring the right to execute it along; returns its size
     [B]. Raises DatasetError if the source is missing, is a symbolic link or no regular file, or cannot be read, and OSError if the target
     cannot be written, or exists: it may be a hard link, so that it is never written to."""
