@@ -11,9 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.calibration.tables import SENSORS
 from synpick_warp.configs.check import describe_allowed, is_table
-from synpick_warp.configs.episodes.randomize import Distribution
+from synpick_warp.configs.episodes.randomize import OFF, Distribution
 from synpick_warp.configs.fields import Setting, settings_of
 from synpick_warp.configs.files.load import format_toml, sections, table_lists
 from synpick_warp.configs.files.table_lists import SPLITS
@@ -30,10 +29,9 @@ _SETTINGS_HEAD = """# Reference of the settings
 
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
 
-What they are for: the [guide](README.md). Ranges are intervals, of each number of a list; a parenthesis leaves the bound out. Paths in
-a file are relative to it. Choices stand in the meaning.
+What they are for: the [guide](README.md). Intervals hold for each number of a list; a parenthesis leaves the bound out. Where the meaning
+names the choices, or any text is allowed, nothing else is shown. A setting that allows a distribution is off unless a default is shown.
 """
-_SENSORS_HEAD = "P: published, M: measured, A: assumed, D: defined. Sources: `calibration/sensors.toml`."
 _MEASURED = "measured"
 """Table of a bin that users do not set."""
 _RESULTS = re.compile(r"(<!-- results: (\w+) -->\n).*?(<!-- end of results -->)", re.DOTALL)
@@ -45,34 +43,36 @@ def settings_reference() -> str:
     parts |= {f"[[{name}]]": (kind, "") for name, kind in table_lists().items()} | {f"[{SPLITS}.NAME]": (Split, "")}
     links = " · ".join(f"[{title.strip('[]')}](#{_anchor(title)})" for title in parts)
     lines = ["key | default; allowed | meaning", "---|---|---"]
-    lines += [line for title, (kind, prefix) in parts.items() for line in _section(title, kind, prefix)]
-    return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, "", *_sensors(), ""])
-
-
-def _sensors() -> list[str]:
-    """Heading and table of the presets of depth sensors: a row a figure, with the trust in each value."""
-    keys = dict.fromkeys(key for figures in SENSORS.values() for key in figures)
-    lines = ["## Sensor presets", "", _SENSORS_HEAD, "", " | ".join(["figure", *SENSORS]), "|".join(["---"] * (len(SENSORS) + 1))]
-    cells = {key: [figures.get(key) for figures in SENSORS.values()] for key in keys}
-    shown = {key: ["" if one is None else f"{format_toml(one.value)} {one.trust[0].upper()}" for one in row] for key, row in cells.items()}
-    return [*lines, *(" | ".join([key, *row]) for key, row in shown.items())]
+    shown: dict[type[Any], str] = {}
+    for title, (kind, prefix) in parts.items():
+        lines += _section(title, kind, prefix, shown)
+    return f"{_SETTINGS_HEAD}\n{links}\n\n" + "\n".join([*lines, ""])
 
 
 def _anchor(title: str) -> str:
     return f"section-{title.strip('[]').partition('.')[0].replace('_', '-')}"
 
 
-def _section(title: str, kind: type[Any], prefix: str) -> list[str]:
+def _section(title: str, kind: type[Any], prefix: str, shown: dict[type[Any], str]) -> list[str]:
+    """Rows of a table of settings. `shown`: tables that have rows, by type; what a table has in common with one of them has one row."""
     lines = [f'<a id="{_anchor(title)}"></a>**`{title}`** | | **{" ".join((kind.__doc__ or "").split())}**']
-    for name, item in settings_of(kind).items():
+    settings = settings_of(kind)
+    if inherited := [(settings_of(base), name) for base, name in shown.items() if issubclass(kind, base)]:
+        [(common, name)] = inherited
+        lines.append(f"{', '.join(f'`{key}`' for key in common)} | | As in {name}.")
+        settings = {key: item for key, item in settings.items() if key not in common}
+    shown[kind] = f"`{title}`"
+    for name, item in settings.items():
         if name == _MEASURED:
             lines.append(f"`{name}` | | What the program measures of the mesh, and writes.")
-            continue
-        if is_table(item.kind):
-            lines += _section(f"{prefix}{name}", item.kind, f"{prefix}{name}.")[1:]
-            continue
-        default = "" if item.default is None else f"`{format_toml(item.default)}`"
-        lines.append(f"`{prefix}{name}` | {'; '.join(filter(None, (default, _allowed(item))))} | {item.doc}")
+        elif item.kind in shown:
+            lines.append(f"`{prefix}{name}` | as in {shown[item.kind]} | {item.doc}")
+        elif is_table(item.kind):
+            lines += _section(title, item.kind, f"{prefix}{name}.", shown)[1:]
+        else:
+            off = item.default is None or (isinstance(item.default, Distribution) and item.default.kind == OFF)
+            default = "" if off else f"`{format_toml(item.default)}`"
+            lines.append(f"`{prefix}{name}` | {'; '.join(filter(None, (default, _allowed(item))))} | {item.doc}")
     return lines
 
 

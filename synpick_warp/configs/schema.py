@@ -77,7 +77,7 @@ class Bake:
     formats: tuple[str, ...] = setting(
         ("bop",),
         "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), picks (grasp trials), "
-        "lerobot, coco, yolo.",
+        "lerobot, coco, yolo, points (PLY clouds).",
         choices=FORMATS,
     )
     writers: Annotated[int, "[0, 1024]"] = setting(
@@ -158,8 +158,7 @@ class Physics:
     iterations: Annotated[int, "[1, 1000]"] = setting(16, "Projected Gauss-Seidel iterations per solver substep.")
     match_all: bool = setting(
         False,
-        "Warm start every contact. Newton leaves one of two coincident contacts out, as edges on a face have: boxes that lie ten deep "
-        "then move five times as fast.",
+        "Warm start every contact. Newton leaves one of two coincident contacts out: boxes that lie ten deep then move five times as fast.",
     )
     sleep: Annotated[float, "[0, 0.01] m"] = setting(
         0.0,
@@ -202,8 +201,8 @@ class Render:
     exposure_spread: Annotated[float, "[0, 5] EV"] = setting(0.3, "Half width of each episode's random exposure offset.")
     coarse_pixel: Annotated[int, "[0, 64] px"] = setting(
         0,
-        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history` (4 px at "
-        "full HD; 5 px take 6 % less time and cost 0.2 to 0.7 dB). Shadow rays are spaced as wide, at most 32 px.",
+        "Mode fast: width of a coarse pixel, at whose centre paths start, and spacing of shadow rays, at most 32 px; 0: the widest with "
+        "384 per row, 480 with `history`.",
     )
     coarse_paths: Annotated[int, "[0, 1024]"] = setting(
         0,

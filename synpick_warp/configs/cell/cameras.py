@@ -109,10 +109,8 @@ class CameraRow:
         "distortion, resolution.",
         path=True,
     )
-    scale: Annotated[float | None, "(0, 1]"] = setting(
-        None, "Factor on image size and camera matrix, such as 0.25 for a quarter; not given: 1."
-    )
-    sensor: str | None = setting(None, "Depth sensor whose resolution and matrix the camera has, [as listed](#sensor-presets).")
+    scale: Annotated[float | None, "(0, 1]"] = setting(None, "Factor on image size and camera matrix, such as 0.25; not given: 1.")
+    sensor: str | None = setting(None, "Depth sensor whose resolution and matrix the camera has, as in depth_sensor.preset.")
     pixel_center: Annotated[float | None, "px"] = setting(
         None, "Centre of the first pixel in the given matrix or file, 0 or 0.5; not given: 0.5, of a file its format's."
     )
@@ -215,7 +213,9 @@ class DepthSensor:
     angle of incidence; noise of disparity adds z² disparity_noise / (f · baseline). Not in the paper.
     """
 
-    preset: str = setting("", "Sensor that sets what is not set beside it, [as listed](#sensor-presets).", choices=("", *SENSORS))
+    preset: str = setting(
+        "", "Sensor of [configs/calibration/sensors.toml](calibration/sensors.toml): sets what is not set here.", choices=("", *SENSORS)
+    )
     baseline: Annotated[float, "(0, 1] m"] = setting(
         0.075, "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012), or to the right camera."
     )
@@ -245,8 +245,8 @@ class DepthSensor:
     shadows: bool = setting(True, "No depth where the projector is occluded, or the infrared camera that registration names.")
     clear_reach: Annotated[float, "[0, 1e3] m"] = setting(
         0.1,
-        "Distance behind a transparent surface at which 1/e of what is there is still measured, the rest being holes (fitted to four "
-        "frames of a D435 that ClearGrasp published: Sajjan et al., 2020); 0: as if they were opaque (layer depth_sensor).",
+        "Distance behind a transparent surface at which 1/e of what is there is still measured, the rest being holes (layer "
+        "depth_sensor); 0: as if they were opaque.",
     )
     registration: Fraction = setting(
         0.0,

@@ -84,13 +84,12 @@ class Suction:
     )
     flow: Annotated[float | None, "[0.1, 1e5] l/min"] = setting(
         None,
-        "Suction rate of the ejector with an open cup, 40 unless given; small ejectors have 10 to 80. Linear characteristic, orifices "
-        "with a discharge coefficient of 0.62.",
+        "Suction rate of the ejector, of a linear characteristic, with an open cup, 40 unless given; small ejectors have 10 to 80.",
     )
     compliance: Annotated[float | None, "[0, 1]"] = setting(
         None,
         "Height that bellows and lip follow, as a fraction of gripper.cup_width, 0.1 unless given: balls from a radius of 1.3 cups seal; "
-        "with 0.05, as of a flat cup, of 2.5.",
+        "a flat cup has 0.05.",
     )
     radius: Annotated[float, "(0, 0.25] m"] = setting(0.01, "Radius of that circle (released).")
     reach: Annotated[float, "(0, 1] m"] = setting(0.03, "Length of the rays (paper).")

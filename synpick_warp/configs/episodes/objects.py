@@ -179,7 +179,7 @@ class ObjectRow:
     )
     symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], "m"] = setting(
         (),
-        f"Continuous symmetries in the frame of the mesh file, replacing those of models_info.json; each {_CONTINUOUS}.",
+        f"Continuous symmetries, likewise; each {_CONTINUOUS}.",
         parse=partial(_parse_each, flatten=_flatten_continuous, rule=_CONTINUOUS),
     )
 
