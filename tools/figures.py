@@ -1,7 +1,7 @@
 """Figures: a run of a tool as JSON, and the table of current figures, those of the newest run of each stage in tools/results.
 
-`--json FILE` of a tool writes a run. To publish it, copy the file to tools/results, fill in `stage`, `limit`, `conditions` and `shown`, and
-run `python -m tools.docs`.
+`--json FILE` of a tool writes a run. To publish it, copy the file to tools/results as TABLE_NAME.json, fill in `stage`, `limit` (one
+clause), `conditions` and `shown` (names of the values in the table), and run `python -m tools.docs`.
 """
 
 import datetime
@@ -104,8 +104,7 @@ def _table(runs: Mapping[str, Run]) -> str:
     notes: dict[str, int] = {}
     for name, run in runs.items():
         numbers = sorted(notes.setdefault(part, len(notes) + 1) for part in run.conditions.split("; ") if part)
-        day = datetime.date.fromisoformat(run.date).strftime("%-d %b %Y") if run.date else "no date"
-        where = f"[{run.card or '?'}, {day}](results/{name})" + (f" ({', '.join(map(str, numbers))})" if numbers else "")
+        where = f"[{run.card or '?'}, {run.date or 'no date'}](results/{name})" + (f" ({', '.join(map(str, numbers))})" if numbers else "")
         figures = "; ".join(_show(row) for row in run.rows if not run.shown or row.name in run.shown)
         lines.append(f"| {run.stage} | {figures} | {where} | {run.limit} |")
     return "\n".join([*lines, *([f"\n{'; '.join(f'({number}) {note}' for note, number in notes.items())}."] if notes else [])])

@@ -316,9 +316,9 @@ def test_a_table_has_values_with_units_and_numbered_conditions():
     )
     assert set(tables) == {"speed", "peers"}
     _, _, first, second, _, notes = tables["speed"].split("\n")
-    assert first.startswith("| pictures | views **1,234.5/s**; share **50 %** | [H100, 2 Jan 2030](results/speed_a.json) (1, 2) |")
+    assert first.startswith("| pictures | views **1,234.5/s**; share **50 %** | [H100, 2030-01-02](results/speed_a.json) (1, 2) |")
     assert first.endswith("| rays |")
-    assert second.startswith("| other | views **1,234.5/s** | [H100, 2 Jan 2030](results/speed_b.json) (2) |")
+    assert second.startswith("| other | views **1,234.5/s** | [H100, 2030-01-02](results/speed_b.json) (2) |")
     assert notes == "(1) cold; (2) alone."
 
 
