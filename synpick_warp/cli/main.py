@@ -389,8 +389,7 @@ def _forecast(config: Config, out: Path | None, episodes: Sequence[int]) -> int:
 
 
 def _check_inputs(models: str, lights: str) -> None:
-    """Check that the folders of models and lights exist; raises CatalogError if there are no models, and LightError if there are no
-    lights."""
+    """Check that the folders of models and lights exist; raises CatalogError without models, LightError without lights."""
     if models and not os.path.isdir(models):
         raise CatalogError(
             f"there is no models folder {models}; --models takes a folder of BOP models or of PLY, OBJ, glTF, STL or STEP files; "

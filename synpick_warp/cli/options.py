@@ -40,8 +40,7 @@ _RESOLUTION = re.compile(r"([0-9]{1,9})[xX]([0-9]{1,9})")
 
 
 def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
-    """Parse an integer option, written in decimal digits; raises ConfigError for any other form, such as 1e3 or 0x10, instead of
-    converting it."""
+    """Parse an integer option of decimal digits; raises ConfigError for any other form, such as 1e3 or 0x10, instead of converting it."""
     text = tokens[0].value
     if _WHOLE.fullmatch(text) is None:
         option = tokens[0].keyword or "the number"

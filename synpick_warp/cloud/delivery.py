@@ -132,9 +132,8 @@ class Delivery:
         permit: Callable[[int], None] = lambda _: None,
         delivered: Callable[[int], None] = lambda _: None,
     ) -> None:
-        """`ledger`: commit log of the data set. `folder`: local data set that a bake fills. `permit`: called with an episode before its
-        upload and before its mark; raises LeaseLostError to drop it. `delivered`: called with an episode after its mark. Both are called by
-        several threads."""
+        """`ledger`: commit log of the data set. `folder`: local data set that a bake fills. `permit`: called with an episode before upload
+        and mark; raises LeaseLostError to drop it. `delivered`: called with an episode after its mark. Several threads call both."""
         self._ledger, self._folder, self._permit, self._delivered = ledger, folder, permit, delivered
         self._settings, self._kinds = ExportSettings.of(ledger.config), load_exporter_classes(ledger.layout.formats)
         self._shared = shared_files(self._kinds, ledger.layout).folders

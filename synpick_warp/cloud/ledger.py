@@ -106,9 +106,8 @@ class Ledger:
     # ---- what is written once ----
 
     def put_manifest(self, data: bytes) -> None:
-        """Create the manifest if absent, and compare it with the one that is there. Without conditional writes, two workers that create it
-        within the same second may both pass. Raises ConfigError: another worker has started the data set with other settings, objects or
-        lights."""
+        """Create the manifest if absent, and compare it with the one that is there. Without conditional writes, two workers at the same
+        time may both pass. Raises ConfigError: another worker has started the data set with other settings, objects or lights."""
         if self.manifest is None:
             if self.probe.conditional:
                 self.store.create(MANIFEST_FILE, data)

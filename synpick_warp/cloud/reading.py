@@ -243,8 +243,7 @@ def _remove_own(place: str, process: int) -> None:
 
 
 class StoreDataSet(DataSet):
-    """Data set in a store: indexing downloads an episode into the cache. An `Episode` object loses its files when it is evicted; index the
-    data set again."""
+    """Data set in a store: indexing downloads an episode into the cache. An evicted `Episode` loses its files; index the data set again."""
 
     def __init__(self, cache: StoreCache, episodes: range | None = None) -> None:
         super().__init__(cache.folder, episodes)

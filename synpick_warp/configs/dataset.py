@@ -60,8 +60,7 @@ def episode_range(split: Split) -> range:
 
 
 def choose_splits(splits: tuple[Split, ...], names: Sequence[str]) -> tuple[Split, ...]:
-    """Return the splits with the given names, in the order of the settings, or all splits if `names` is empty. Raises ConfigError: an
-    unknown split."""
+    """Return the named splits in the order of the settings, or all without names. Raises ConfigError: an unknown split."""
     if isinstance(names, str) or not isinstance(names, Sequence):
         raise ConfigError(f'splits are {format_value(names)}; allowed: a list of names, such as ["train"]')
     if not names:

@@ -45,8 +45,7 @@ MAX_SYMMETRIES = 1024
 
 def camera_schema(*required: str, **types: Any) -> Any:
     """Schema of a view's entry in scene_camera.json: K [px], depth scale, world-to-camera rotation and translation [mm], lens. Keys that
-    are not `required` may be missing, as files of other programs lack any; `types` are those of further keys, or of these, in place of the
-    usual ones."""
+    are not `required` may be missing, as in files of others; `types` are those of further keys, or of these, in place of the usual ones."""
     fields = [(key, kind) if key in required else (key, kind | UnsetType, UNSET) for key, kind in (_CAMERA | types).items()]
     return msgspec.defstruct("CameraEntry", fields, kw_only=True, gc=False)
 
@@ -156,8 +155,7 @@ MASK_SCHEMA = dict[Key, RunLengths]
 
 def check_json(data: bytes, schema: Any, source: object) -> Any:
     """Check JSON against a schema; returns its content as dictionaries, lists and numbers, with keys that the schema does not name. Keys of
-    the outermost object become integers if the schema has them so. Raises DatasetError, of one line, if it is no JSON, or not of this
-    schema."""
+    the outermost object become integers if the schema has them so. Raises DatasetError, of one line, if it is not JSON of this schema."""
     decode_json(data, schema, source, DatasetError, ADVICE)
     by_index = getattr(schema, "__origin__", None) is dict and schema.__args__[0] is Key
     return decode_json(data, dict[int, Any] if by_index else Any, source, DatasetError, ADVICE)

@@ -52,8 +52,7 @@ class PickTables:
     @property
     def picks(self) -> np.recarray:
         """Grasp trials, a record array with the columns of `views.picks.COLUMNS`, sorted by state, candidate and repeat. Raises
-        DatasetError if the data set has no picks, a table is damaged or has a value that its columns do not allow, or pyarrow is not
-        installed."""
+        DatasetError if the data set has no picks, a table is damaged or has a value that is not allowed, or pyarrow is not installed."""
         return self._pick_tables[0]
 
     @property

@@ -242,8 +242,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """Attributes of the trajectory store: seed, step, steps per tick, names of light maps, ... Raises DatasetError if the data set has
-        no trajectories."""
+        """Attributes of the trajectory store: seed, step, names of light maps. Raises DatasetError if the data set has no trajectories."""
         self.require_store()
         return trajectory.read_attributes(self._store)
 
@@ -260,8 +259,7 @@ class DataSet(Mapping[int, Episode]):
         return trajectory.GroupContext(files=lambda: self.listed_files(CONSTANTS))
 
     def listed_files(self, entry: Path) -> frozenset[Path]:
-        """Files of the trajectory store that a manifest entry lists; none if the data set has no such entry. Raises DatasetError if the
-        list is damaged."""
+        """Files of the trajectory store that a manifest entry lists; none without it. Raises DatasetError if the list is damaged."""
         if not (self.folder / f"{entry}.json").exists():
             return frozenset()
         return frozenset(self.folder / name for name in read_checksums(self.folder, entry) if name.startswith(f"{STORE}/"))
@@ -393,8 +391,7 @@ class DataSet(Mapping[int, Episode]):
         return [] if self.found is not None else part_files(None if self._scenes is None else self.camera_count)
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
-        """Files of the scene that a camera recorded in an episode: its folder, or else its shards. Raises DatasetError if the data set has
-        no images."""
+        """Files of the scene of a camera and episode: a folder, or else shards. Raises DatasetError if the data set has no images."""
         return self._index().files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
 
     def _has_files(self, index: int) -> bool:

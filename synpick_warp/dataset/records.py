@@ -144,8 +144,7 @@ class AttemptKey(msgspec.Struct):
 
 
 class Attempt(AttemptKey, omit_defaults=True):
-    """Attempt to pick, a line of attempts.jsonl: frames, outcome, target and grasp in the world (None: nothing was visible), rays, seals,
-    and what perception saw."""
+    """A line of attempts.jsonl: frames, outcome, target and grasp in the world (None: nothing was visible), rays, seals, perception."""
 
     mode: Literal["pick", "target"]
     frame: Index

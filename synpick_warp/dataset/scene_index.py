@@ -30,8 +30,7 @@ class SceneIndex:
         return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
 
     def files(self, episode: int, camera: int) -> SceneFiles:
-        """Files of the scene that a camera recorded in an episode: its folder, or else its shards. Raises DatasetError if the data set has
-        no images of it."""
+        """Files of the scene of a camera and episode: a folder, or else shards. Raises DatasetError if the data set has no images of it."""
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
         from synpick_warp.exporters.bop.shards.tar_files import find_shards
 

@@ -79,8 +79,7 @@ class GroupContext:
 
 
 class Arrays(Mapping[str, "zarr.Array"]):
-    """Arrays of one zarr group by name, each opened on access: `arrays["pose"][10:20]` reads these rows only; empty if there is no such
-    folder."""
+    """Arrays of one zarr group by name, each opened on access: `arrays["pose"][10:20]` reads these rows only; empty without the folder."""
 
     def __init__(self, folder: Path, schema: GroupSpec, context: GroupContext | None = None) -> None:
         self._folder, self._schema, self._context = folder, schema, context or GroupContext()

@@ -118,8 +118,7 @@ class View:
         return tuple(name for name in LAYERS if name in present)
 
     def layer(self, name: str) -> np.ndarray:
-        """Decode a layer; units and shapes as in `synpick_warp.views.layer_codec.decode_layer`. Raises DatasetError if the data set has no
-        such layer."""
+        """Decode a layer, as `views.layer_codec.decode_layer`. Raises DatasetError if the data set has no such layer."""
         return read_layer(self._files, name, self.image_id)
 
     @cached_property
@@ -265,8 +264,7 @@ class View:
         return image[..., :2] / image[..., 2:]
 
     def unproject(self, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """Back-projection: points (..., 3) in the camera frame [m] at image positions (..., 2) [px], as `project` has them, and of planar
-        depth (...) [m]."""
+        """Back-projection: points (..., 3) in the camera frame [m] at pixels (..., 2) as of `project`, with planar depth (...) [m]."""
         pixels = np.asarray(pixels, np.float64)
         if self.lens is not None:
             rays = self.lens.unproject(pixels)
@@ -399,8 +397,7 @@ class Track:
 
 
 class Tracks(Mapping[int, Track]):
-    """Tracks of an episode by instance id. All are made at once from the annotations of all its views, which may come in any order, in one
-    pass."""
+    """Tracks of an episode by instance id. All are made at once from the annotations of all its views, in any order, in one pass."""
 
     def __init__(self, views: Iterable[View], cameras: int, frames: int) -> None:
         self._size = cameras, frames

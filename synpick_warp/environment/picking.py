@@ -149,8 +149,7 @@ class PickingEnvironment:
         return EnvironmentState(self.worlds.simulation.states.from_host(arrays), Episodes(**counters))
 
     def check_actions(self, actions: Any, active: np.ndarray) -> np.ndarray:
-        """Check actions and copy them to the host (environment, value); those of inactive environments are replaced by 0. Errors as of
-        `step`."""
+        """Check actions and copy them to the host (environment, value); those of inactive environments become 0. Errors as of `step`."""
         given, action = to_host(actions), self.choice.action
         shape = (self.count, ACTION_SIZES.get(action, COMMAND))
         if given.shape != shape:

@@ -45,8 +45,7 @@ POINT_BYTES = 23.0
 
 
 class PartFiles(NamedTuple):
-    """Files that a format has once an episode or once a scene, by which the reader finds the episodes of formats that it reads no
-    further."""
+    """Files that a format has once an episode or scene, by which the reader finds the episodes of formats that it reads no further."""
 
     folder: str
     """Folder of the files, relative to the data set."""

@@ -23,8 +23,7 @@ _OBSERVED = [name for name in InstanceObservation.__struct_fields__ if name not 
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Attempts and object counts (first and last frame) of an episode; empty if it is not part of the data set. Distractors count as no
-    objects."""
+    """Attempts and object counts (first and last frame) of an episode; empty if it was not baked. Distractors count as no objects."""
 
     mode: str
     objects: int = 0
@@ -74,8 +73,7 @@ class AttemptLog:
         cups: int = 1,
     ) -> None:
         """Start with no episode running: `resolution` is width and height of the perception image [px], `object_ids` has the obj_id of each
-        body of the catalog (body) int32, `distractors` the name of each distractor by its obj_id, and `cups` is the number of the gripper's
-        cups."""
+        body of the catalog (body) int32, `distractors` the name of each distractor by its obj_id, and `cups` the number of cups."""
         self.object_ids = np.append(object_ids, -1)
         self.distractors = distractors or {}
         self.resolution = resolution
@@ -85,8 +83,7 @@ class AttemptLog:
 
     def update(self, report: TickReport) -> dict[int, EpisodeRecord]:
         """Process the report of one tick; reports must come in the order of ticks. Returns the records of all episodes that ended in this
-        tick by episode index, with or without delivery; raises ValueError if an attempt ends that is not the one that began last: reports
-        are missing."""
+        tick by episode index, with or without delivery; raises ValueError if an ended attempt did not begin last: reports are missing."""
         ended = {}
         phase = report.column("phase")
         for world in self._eventful_worlds(report).tolist():

@@ -85,8 +85,7 @@ class DeviceProcesses:
 
     def __init__(self, names: Sequence[str], program: str, lock: int) -> None:
         """Start the processes, which load their libraries while this one prepares the folder. `program` is Python code that calls
-        `worker.main`, `lock` the handle that holds the folder's lock; all processes keep it open. Raises DeviceError if processes cannot be
-        started."""
+        `worker.main`, `lock` the handle of the folder's lock; all keep it open. Raises DeviceError if processes cannot be started."""
         open_standard_descriptors()
         self._devices: list[_Device] = []
         self._reported: set[tuple[str, str]] = set()
@@ -259,8 +258,7 @@ def bake_on_devices(
     progress: Progress,
 ) -> None:
     """Generate the remaining episodes of a data set by one process per device, among which `bake.writers` are shared out; `program` is
-    Python code that calls `worker.main`. Raises SynpickError if a device was lost, or for what the user can correct. Committed episodes
-    stay."""
+    Python code that calls `worker.main`. Raises SynpickError if a device was lost, or by a user's mistake. Committed episodes stay."""
     differ = describe_kinds(names)
     if differ:
         progress.note(f"{differ}: devices of different kinds compute other last bits, so an episode depends on its device")

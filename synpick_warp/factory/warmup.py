@@ -30,8 +30,7 @@ class WarmUp:
 
 
 def check_caches() -> None:
-    """Raise CacheError unless kernels and collision shapes can be kept: a warm-up into a temporary cache, as a bake may have one, is lost
-    at its end."""
+    """Raise CacheError unless kernels and collision shapes can be kept: a warm-up into a temporary cache is lost at its end."""
     caches = (
         ("kernel", kernels.kernel_cache(wp.config.version), kernels.KERNEL_VARIABLE),
         ("shape", default_cache_dir() if kernels.user_cache() else None, kernels.USER_VARIABLE),

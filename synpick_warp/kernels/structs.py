@@ -92,8 +92,7 @@ class DropData:
     clearance: float
     """Gap between bounding spheres in the drop column, or between layers and within them [m]."""
     spread: float
-    """Fraction of the opening of a compartment, or in layers of a cell, less the object's bounding radius, over which drop positions
-    spread."""
+    """Fraction of the opening of a compartment, or in layers of a cell, less the bounding radius, over which drop positions spread."""
     layers: int
     """1: objects begin to fall from layers of cells; 0: from a column."""
     gravity: float

@@ -19,8 +19,7 @@ SHADE_REGISTERS = 80
 SAMPLE_SHADE_REGISTERS = 128
 """Register limit of the shading kernel where it supersamples: lower limits spill more (from ptxas for sm_90, not timed)."""
 FILTER_REGISTERS = 80
-"""Register limit of the denoiser's block filter: the smallest without spills, for the highest occupancy (from ptxas for sm_90; other limits
-were not timed)."""
+"""Register limit of the denoiser's block filter: the smallest without spills, for occupancy (ptxas for sm_90; others were not timed)."""
 CHOICE_REGISTERS = 72
 """Register limit of the denoiser's choice of filter widths, found in the same way."""
 PIXEL_BLOCK = 128
@@ -48,8 +47,7 @@ RESTORE_THREADS, KEEP_THREADS = 256, 4096
 """Threads that copy the words of a mask from the previous frame, or clear them, some 3,000; and that keep those of all masks of a view,
 some 30,000 in a full-HD view of a tote."""
 COUNT_THREADS = 1024
-"""Threads that share the pixels of one instance in counts and boxes: enough to hide the latency of reads, few enough that their atomics do
-not contend."""
+"""Threads that share the pixels of one instance in counts and boxes: enough to hide latency, few enough that atomics do not contend."""
 BORDER_GROUPS, BORDER_THREADS = 2112, 128
 """Groups and threads of one that share the pixels of boxes beyond the image: as many as an H200's 132 multiprocessors hold at once."""
 BORDER_CHUNK = 8192

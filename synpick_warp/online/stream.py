@@ -78,8 +78,7 @@ class Selection:
     """Every n-th frame of an episode, from the first on."""
 
     def resolve(self, count: int) -> "Selection":
-        """Selection with all its cameras named, out of `count` cameras; raises ConfigError if there is no such camera, or a value is out of
-        range."""
+        """Selection with its cameras named, out of `count`; raises ConfigError if there is no such camera, or a value is out of range."""
         given = range(count) if self.cameras is None else self.cameras
         cameras = tuple(to_index(camera) for camera in given) if isinstance(given, Iterable) else ()
         if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(range(count)):

@@ -184,8 +184,7 @@ def tote_fixture(tote: Tote, more: Sequence[Patch] = ()) -> Fixture:
 
 
 def tote_interior(tote: Tote) -> Interior:
-    """Empty convex interior of the visual mesh: INTERIOR_MARGIN inside its walls and floor; each rounded corner is cut off by its chord at
-    45°."""
+    """Empty convex interior of the visual mesh: INTERIOR_MARGIN inside its walls and floor; round corners are cut by chords at 45°."""
     top = rim_height(tote)
     half = []
     for level in (0.0, top):
@@ -245,8 +244,7 @@ def _check(tote: Tote) -> None:
 
 
 def _ring(tote: Tote, level: float, offset: float, z: float) -> np.ndarray:
-    """Rounded-rectangle outline (n, 3) at height z [m]: the inner outline of the tote at `level` [m] above the floor, moved outward by
-    `offset` [m]."""
+    """Rounded rectangle (n, 3) at height z [m]: the tote's inside at `level` [m] above the floor, moved outward by `offset` [m]."""
     (length, width), radius = _opening(tote, level)
     return at_height(rounded_rectangle(2 * (length + offset), 2 * (width + offset), radius + offset, CORNER_SEGMENTS), z)
 

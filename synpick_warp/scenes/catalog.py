@@ -97,8 +97,7 @@ def _load_entries(
 def read_objects(
     models: str, objects: Objects, rows: tuple[ObjectRow, ...], bins: tuple[BinSizes, ...], report: Callable[[str], None] = ignore
 ) -> list[RawObject]:
-    """Read and check the objects of a folder, or if it is empty the embedded ones, without collision shapes; files and errors as of
-    `load_catalog`."""
+    """Read and check a folder's objects, or the embedded ones, without collision shapes; files and errors as of `load_catalog`."""
     faults = _Faults(objects.strict, models, report)
     raws = _read_objects(models, _Rules(objects, rows, bins), report, faults)
     faults.tell()
@@ -371,9 +370,8 @@ def _describe_specks(mesh: TriangleMesh, diameter: float, origin: str) -> list[s
 
 
 def describe_masses(raws: Sequence[RawObject], objects: Objects, masses: Sequence[float] = (), *, guesses: bool = False) -> str:
-    """Line on the masses [kg] of objects that have them by their density; empty: there are none. `masses`: their masses, if their collision
-    shapes are known. `guesses`: those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the
-    density."""
+    """Line on masses [kg] that follow from densities; empty: there are none. `masses`: their masses, if their collision shapes are known.
+    `guesses`: those whose mesh is open or whose density is not known; otherwise those of which both are known, or not the density."""
     known = objects.mass_volume == MESH and objects.density != Objects.density
     pairs = zip(raws, masses or [_checked_mass(raw, objects) for raw in raws], strict=True)
     told = {raw.name: mass for raw, mass in pairs if raw.mass is None and not (known and bool(_solid(raw)) == guesses)}
@@ -395,8 +393,7 @@ def _solid(raw: RawObject) -> float:
 
 
 def _checked_mass(raw: RawObject, objects: Objects, pieces: Sequence[ConvexPiece] = ()) -> float:
-    """Mass [kg]: the object's own, or density times the volume that `objects.mass_volume` names; before there are pieces, that of the hull
-    stands for theirs."""
+    """Mass [kg]: the object's own, or density times the volume of `objects.mass_volume`; before there are pieces, that of the hull."""
     origin = raw.source or raw.name
     mass = raw.mass
     if mass is None:

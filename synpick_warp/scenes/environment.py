@@ -159,11 +159,9 @@ MIN_LAMP_SHARE = 0.03
 """Minimum share of a lamp in the irradiance of a surface that faces up; weaker ones stay in the map, which paths sample. 1 %
 has 0.1 dB more in PSNR, with 1.6 times as many lamps."""
 MIN_LAMP_HEIGHT = 0.15
-"""Minimum z of the texel at which a search starts, and of a lamp's mean direction; light from lower ones does not reach the objects in a
-tote."""
+"""Minimum z of the texel at which a search starts, and of a lamp's direction; light from lower ones does not reach into a tote."""
 SEARCH_BLUR = 4.0
-"""Standard deviation of the Gaussian blur of the map, whose brightest texel starts a search [texels]: it prefers a lamp's middle to a
-single bright texel."""
+"""Standard deviation of the blur of the map, whose brightest texel starts a search [texels]: a lamp's middle, not a single texel."""
 SHIFTS = 4
 """Iterations of the mean shift."""
 DISC_RINGS, DISC_SPOKES = 16, 64

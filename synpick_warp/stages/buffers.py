@@ -43,8 +43,7 @@ class LastFrame(array_group(FramePoses, "world", "instance", units=_METRES, **_W
 
 @dataclass(frozen=True, eq=False)
 class ViewBuffers:
-    """Output of the renderer for one batch of views: colour, depth in counts (0: none), segmentation ids, amodal masks, pixel counts,
-    boxes, effects."""
+    """Renderer's output for a batch: colour, depth in counts (0: none), segmentation ids, amodal masks, pixel counts, boxes, effects."""
 
     color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
@@ -53,8 +52,7 @@ class ViewBuffers:
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
     """Instance segmentation: 1 + instance_id, or a `Segment`."""
     mask_words: wp.array = device_array("view", "mask_word", dtype=wp.uint32)
-    """Amodal masks, one bit per pixel of each instance's box (see `InstanceMasks.words`): set where the pixel's ray hits the instance,
-    occluded or not."""
+    """Amodal masks, one bit per pixel of each instance's box (see `InstanceMasks.words`): where its ray hits, occluded or not."""
     mask_first: wp.array = device_array("view", "instance", dtype=wp.int32)
     """Index of the first word of each mask."""
     mask_box: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")

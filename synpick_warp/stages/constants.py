@@ -61,8 +61,7 @@ class SceneData:
 def fill(kind: Any, *sections: Any, **derived: Any) -> Any:
     """Make a struct whose members come from `derived`, else from the first section that has a field of that name. `kind`: a `wp.struct`.
     `sections`: sections of the settings, or other objects with attributes; booleans become integers. `derived`: members that no section
-    holds under their name or in their unit. Raises AttributeError: a member is in neither; TypeError: `derived` names something that is no
-    member."""
+    holds under their name or in their unit. Raises AttributeError: a member is in neither; TypeError: `derived` names no member."""
     unknown = derived.keys() - kind.vars.keys()
     if unknown:
         raise TypeError(f"{kind.key} has no members {sorted(unknown)}")

@@ -91,8 +91,7 @@ class TickReader:
     """Copies the results of a tick to the host, except images: some kilobytes a world."""
 
     def __init__(self, record: TickRecord, target: list[wp.array] | None = None) -> None:
-        """Read the record of each tick into `target`, arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a
-        CPU the record's."""
+        """Read each tick's record into `target`, host arrays for `reported`; None: on a GPU the reader's own, on a CPU the record's."""
         self.parts = _reported_parts(record)
         self.physics, self.arrays = record.physics, record_arrays(record.physics) if record.physics is not None else []
         self.copy = HostCopy(self.reported(record), target)
@@ -201,8 +200,7 @@ def describe_views(
 def split_views(
     group: CameraGroup, report: TickReport, world: np.ndarray, camera: np.ndarray, cameras: EpisodeCameras | None
 ) -> Iterator[tuple[slice, bool]]:
-    """Split a tick's views (world, camera) of a group into batches whose masks fit, see `split_batches`; other arguments as of
-    `describe_views`."""
+    """Split a tick's views (world, camera) into batches, see `split_batches`; other arguments as of `describe_views`."""
     views, share, bounds = group.sizes["view"], group.sizes["mask_word"], group.bounds
     if bounds is None:
         return split_batches(np.zeros(len(world), np.int64), share, views, views)
@@ -226,8 +224,7 @@ def describe_batches(
 
 @dataclass(eq=False)
 class _Launched:
-    """Batch in flight, which the device renders, encodes and copies: ring slot, number of views, description, and what to call when it is
-    consumed."""
+    """Batch in flight, rendered, encoded and copied: ring slot, number of views, description, and what to call when it is consumed."""
 
     ring: ViewRing
     slot: int
@@ -264,8 +261,7 @@ class FrameStream:
         self.in_flight: deque[_Launched] = deque()
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
-        """Yield the tick's views, group by group of cameras, world by world and camera by camera. A batch is valid until the next one is
-        requested."""
+        """Yield the tick's views by groups of cameras, worlds and cameras. A batch is valid until the next one is requested."""
         while self.in_flight:
             # Left by a consumer that stopped early.
             launched = self.in_flight.popleft()

@@ -191,8 +191,7 @@ class TickLoop:
 
 
 MAX_LEAD = 1024
-"""Maximum number of ticks by which physics may be ahead of the renderer. With 256, physics limits the last quarter of a bake of
-150 episodes."""
+"""Maximum number of ticks by which physics may be ahead of the renderer. With 256, physics limits the end of a bake of 150 episodes."""
 QUEUE_BYTES, QUEUE_PART = 1 << 30, 64
 """Memory budget of the ring of records: the device's memory divided by QUEUE_PART, at most QUEUE_BYTES, exceeded only if two slots need
 more. 1 GiB holds MAX_LEAD ticks of 180 worlds, or 30 ticks of 512 worlds whose steps are recorded."""

@@ -119,8 +119,7 @@ class Recorder:
         self.wall = time.perf_counter() - self._started
 
     def write_trace(self, path: Path) -> None:
-        """Write the spans in Chrome's trace event format (JSON), host and device as two tracks; raises OSError if the file cannot be
-        written."""
+        """Write spans as Chrome trace events (JSON), host and device as two tracks; raises OSError if the file cannot be written."""
         events = [
             {"name": "thread_name", "ph": "M", "pid": 0, "tid": track, "args": {"name": ("host", "device")[track]}}
             for track in (HOST, DEVICE)
@@ -147,8 +146,7 @@ _recorder: Recorder | None = None
 
 
 def scope(name: str, device: wp.Device | None = None) -> contextlib.AbstractContextManager[None]:
-    """Measure a block of code by the name of its stage, if a recorder is active; with the device where its work is enqueued, device time,
-    too."""
+    """Measure a block of code by the name of its stage, if a recorder is active; with a device, device time, too."""
     return _NULL_SCOPE if _recorder is None else _recorder.scope(name, device)
 
 

@@ -102,8 +102,7 @@ class CameraGroup:
     colors: bool = True
     """Whether they have colour images."""
     lenses: tuple[LensMap | None, ...] = ()
-    """Lens of each camera (None: a pinhole) if views have lenses of their own, as episodes draw their camera matrices; none: the scene has
-    those of all views."""
+    """Lens of each camera (None: a pinhole) if episodes draw camera matrices; none: the scene has those of all views."""
     bounds: "MaskBounds | None" = None
     """Bounds of the words of views' masks; None: any masks fit a view's share of the pool."""
 
@@ -112,8 +111,7 @@ class CameraGroup:
         return np.searchsorted(np.array(self.cameras), camera).astype(np.int32)
 
     def allocate_cameras(self) -> tuple[Any, Any] | None:
-        """Allocate the cameras of a batch in this frame and in the one before, the same if they do not move; None: the scene has those of
-        all views."""
+        """Allocate cameras of a batch in this frame and the one before, the same if fixed; None: the scene has those of all views."""
         if not self.placed:
             return None
         scene, views = self.renderer.scene, self.sizes["view"]

@@ -160,8 +160,7 @@ class Cleaner:
 
 @contextlib.contextmanager
 def clean_up_behind(layout: DataLayout, out: Path) -> Iterator[Cleaner]:
-    """Context manager: verify the episodes of a bake to `out` while it runs, and delete their files. Raises DatasetError: an episode was
-    damaged."""
+    """Context manager: verify and delete the episodes of a bake to `out` while it runs. Raises DatasetError: an episode was damaged."""
     folders = tuple(map(str, shared_files(load_exporter_classes(layout.formats), layout).folders))
     with Cleaner(CleanedSet(out, folders)) as cleaner:
         yield cleaner
@@ -348,8 +347,7 @@ def _rows_of(meter: SteadyMeter, stopped: int, rows: Iterator[MeasuredRow]) -> I
 
 
 def measure_steady(bench: Bench) -> Iterator[MeasuredRow]:
-    """Views per second to disk while nearly all worlds are live, and CPU time of a view by kind of process; each device simulates
-    `bake.worlds` worlds."""
+    """Views per second to disk while nearly all worlds live, and CPU time of a view by kind of process, of `bake.worlds` a device."""
     config = bench.config
     names = pick_processes(config, bench.devices, INT32_MAX) if bench.devices else ()
     count = max(1, len(names))

@@ -128,8 +128,7 @@ def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tupl
 
 
 def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
-    """Make a consumer that imports colour and ids through DLPack on a CUDA stream of its own, and returns the number of views of a
-    batch."""
+    """Make a consumer that imports colour and ids through DLPack on a CUDA stream of its own, and returns a batch's number of views."""
     stream = wp.Stream(device) if device.is_cuda else None
 
     def consume(batch: ViewBatch) -> int:

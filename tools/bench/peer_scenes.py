@@ -65,8 +65,7 @@ class SensorScene:
         """Outputs of the passes that were prepared last, by argument of the sensor."""
 
     def prepare(self, color: bool) -> tuple[Callable[[], None], ...]:
-        """Passes that render all views, one for each of `ORDERS`: depth and shapes, and with `color` textured color by one light with
-        shadows."""
+        """Passes that render all views, one for each of `ORDERS`: depth and shapes, with `color` textured color by a light with shadows."""
         outputs = {"shape_index_image": "shape_index", "forward_depth_image": "depth_forward"} | ({"color_image": "color"} if color else {})
         size = (len(self.worlds), self.rays.shape[1], self.rays.shape[0])
         self.images = {name: getattr(self.sensor, f"allocate_image_{suffix}")(*size) for name, suffix in outputs.items()}

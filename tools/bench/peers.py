@@ -195,8 +195,7 @@ WARM_STEPS, GRAPH_STEPS = 2, 10
 CONES = {"pyramidal": 10, "elliptic": 20}
 """MuJoCo's friction cones -> maximum iterations of its solver (Newton's method, not the library Newton)."""
 CONTACT_ROOM, MIN_CONTACTS, CAPACITY_STEP = 2.0, 64, 16
-"""Contact capacity of a world in MuJoCo Warp: this multiple of the largest count at the ends of our runs, the minimum, and what it is a
-multiple of."""
+"""Contact capacity of a world in MuJoCo Warp: multiple of the largest count at our runs' ends, minimum, and its divisor."""
 CONTACT_ROWS = 4
 """Constraint rows of a contact in the pyramidal cone; the elliptic one has three."""
 WORLDS_PER_THREAD = 4
@@ -275,8 +274,7 @@ class NewtonEngine:
         make: Callable[[newton.Model], newton.solvers.SolverBase],
         substeps: int = 1,
     ) -> None:
-        """Build `bake.worlds` worlds, and the solver by `make`; `substeps` solver steps, each after a collision detection, are a time
-        step."""
+        """Build `bake.worlds` worlds, and the solver by `make`; a time step is `substeps` of collision detection and solver."""
         self.name, self.worlds, self.device = name, config.bake.worlds, device
         self.model = build_piles(config, pile, self.worlds, device)
         self.pipeline = make_pipeline(config.physics, self.model)

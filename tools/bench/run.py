@@ -20,8 +20,7 @@ MIN_REPEATS = 3
 BURST = 2
 """Ticks, or render passes, between two synchronisations: as in a bake, the device does not wait for the host."""
 LIVE_FRACTION = 0.9
-"""Steady-state threshold: fraction of the worlds that must deliver frames in a tick. Before, worlds settle, and physics has a larger
-part."""
+"""Steady-state threshold: fraction of worlds that must deliver frames. Before, worlds settle, and physics has a larger part."""
 SPARE_EPISODES = 16
 """Episodes planned for each world of a steady state, so that none runs out of them in the measurement."""
 

@@ -77,8 +77,7 @@ class Client:
     find: Callable[[Path], Path | None]
     """File or folder of a data set that it opens; None: the data set has not that format."""
     read: Callable[[Path, Path, str], ClientReading]
-    """Reads, from the path that `find` returned, the data set's folder, and that of a copy of the BOP toolkit (empty: none). Runs in the
-    client's interpreter."""
+    """Reads, by what `find` returned, the data set's folder, and the BOP toolkit's (empty: none). Runs in the client's interpreter."""
     expect: Callable[[Any], Values] = expect_views
     """Expected values, by the same names, of a data set opened by `synpick_warp.open`. Runs in our interpreter."""
     bounds: Mapping[str, float] = field(default_factory=dict)

@@ -29,8 +29,7 @@ SHOULDER_START = 0.6
 
 
 def read_xarray(place: Path, data: Path, _: str) -> ClientReading:
-    """Arrays of the ticks at the sampled frames, selected by names of dimensions, and the objects' masses; coordinates along each labelled
-    dimension."""
+    """Arrays of the ticks at sampled frames, by dimension names, and the objects' masses; coordinates along each labelled dimension."""
     import xarray
 
     row = first_episode(data)

@@ -135,8 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace, device: torch.device) -> list[float]:
-    """Train and measure for each amount; returns the values of mIoU. Raises SynpickError: a setting is wrong, or models or lights cannot be
-    used."""
+    """Train and measure for each amount; returns mIoU. Raises SynpickError: a setting is wrong, or models or lights cannot be used."""
     fixed = {"bake.worlds": options.worlds, "cameras.resolution": parse_resolution(options.resolution)}
     config = configure(options, fixed, {"bake.mode": "mixed", "render.views_per_batch": options.batch})
     if min(config.cameras.resolution) < MIN_SIDE:

@@ -68,8 +68,7 @@ class ForeignViewFiles(StoredViewFiles):
     """`StoredView` of any BOP scene: other file formats are encoded again, other image sizes refused, missing masks rendered."""
 
     def __init__(self, files: SceneFiles, scene: int, frame: int, suffix: str, size: tuple[int, int], root: Path) -> None:
-        """`suffix`: of all colour images; `size`: width and height of all images [px]; `root`: folder of the data set; others as of
-        `StoredViewFiles`."""
+        """`suffix`: of colour images; `size`: width and height [px]; `root`: folder of the data set; others as of `StoredViewFiles`."""
         super().__init__(files, scene, frame)
         self.suffix, self.size, self.root = suffix, size, root
 

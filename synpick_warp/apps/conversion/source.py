@@ -260,9 +260,8 @@ class StoredContext(ExportContext):
         return dict(sorted(names_of(self._source.data).items()))
 
     def copy_constants(self, names: tuple[Path, ...]) -> bool:
-        """Copy these files, and those in folders of these names, from the source to the output folder, in place of what is there; returns
-        True. Raises DatasetError if a file is missing or no regular file, or the source has none of a name, and OSError if a file cannot be
-        written."""
+        """Copy these files, and those in these folders, from the source to the output folder, replacing what is there; returns True. Raises
+        DatasetError if a file is missing or no regular file, or the source has none of a name, and OSError if a file cannot be written."""
         folder = self._source.folder
         known = manifest.read_checksums(folder, manifest.CONSTANTS)
         manifest.check_file_names(folder, manifest.CONSTANTS, known, DataLayout.of(self._source.config))

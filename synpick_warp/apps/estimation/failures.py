@@ -83,8 +83,7 @@ class _Window:
 
 
 def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int) -> list[PoseFailure]:
-    """The worst instance of each of at most `count` objects by ADD-S, worst first; an object's misses with an estimate before those
-    without."""
+    """The worst instance of at most `count` objects by ADD-S, worst first; an object's misses with an estimate before those without."""
     result, errors = list[PoseFailure](), scores.errors[METRIC]
     objects = truth.poses.object_id[scores.target]
     for object_id in np.unique(objects):
@@ -120,8 +119,7 @@ def draw_failures(
     names: Mapping[int, str],
     device: wp.Device,
 ) -> Image:
-    """Draw a sheet with a row for each failure, at least one, with estimates rendered on a device; `models`: of their objects, `names`: by
-    obj_id."""
+    """Draw a sheet with a row for each failure, at least one, with estimates rendered; `models`: of their objects, `names`: by obj_id."""
     meshes, keep = build_meshes([model.mesh for model in models], len(models), device)
     index = {model.object_id: row for row, model in enumerate(models)}
     width = len(_HEADINGS) * PANEL + (len(_HEADINGS) + 1) * _GAP

@@ -56,8 +56,8 @@ class VertexSearch:
         """Largest distance of a vertex from the centroid [m]."""
 
     def mean_distances(self, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
-        """Mean distance (P,) [m] from the vertices, moved by each pose (P, 3, 3), (P, 3) [m], to the nearest vertex of the model in its own
-        frame (ADD-S)."""
+        """Mean distance (P,) [m] of vertices moved by poses (P, 3, 3), (P, 3) [m] to the nearest vertex in the model's own frame
+        (ADD-S)."""
         result = np.empty(len(rotation))
         for rows in chunks(len(rotation), len(self._vertices), _QUERIED):
             points = self._vertices @ rotation[rows].transpose(0, 2, 1) + translation[rows, None]
@@ -162,9 +162,8 @@ class Model:
 
 
 def read_models(folder: Path, object_ids: Iterable[int], vertices: int = 0) -> dict[int, Model]:
-    """Read models of a data set, thinned to a number of vertices (0: all), evenly in the order of the file, as models have them in no order
-    of importance. Raises DatasetError if the data set has no models, or an object has none, and CatalogError if a file of the models is
-    damaged."""
+    """Read models of a data set, thinned to a number of vertices (0: all), evenly in the order of the file. Raises DatasetError if the data
+    set has no models, or an object has none, and CatalogError if a file of the models is damaged."""
     found = find_models(folder, object_ids, "poses are evaluated")
     return {object_id: _read_model(*pair, object_id, vertices) for object_id, pair in found.items()}
 
@@ -194,8 +193,7 @@ LIMIT = 0.1
 
 
 def exact_auc(errors: np.ndarray, limit: float = LIMIT) -> float:
-    """Exact area to `limit` [m] under the accuracy-threshold curve of errors (N,) [m], infinity: missed; from 0 to 1, NaN without
-    errors."""
+    """Area to `limit` [m] under the accuracy-threshold curve of errors (N,) [m], infinity: missed; from 0 to 1, NaN without errors."""
     return float(np.maximum(0.0, 1.0 - errors / limit).mean()) if len(errors) else float("nan")
 
 

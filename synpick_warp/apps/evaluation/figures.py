@@ -80,8 +80,7 @@ def plot_trajectory(
 
 
 def plot_recall(errors: Mapping[str, np.ndarray], metric: str) -> Spec:
-    """Accuracy-threshold curves: the fraction of instances with an error of at most the threshold, from each method's errors (N,) [m],
-    infinity for misses."""
+    """Accuracy-threshold curves: fraction of instances within the threshold, from each method's errors (N,) [m], infinity for misses."""
     threshold = np.linspace(0.0, LIMIT, 1001)
     curves = {name: np.searchsorted(np.sort(one), threshold, side="right") / len(one) for name, one in errors.items()}
     legend = _legend(curves)
@@ -343,8 +342,7 @@ def file_names(names: Sequence[str]) -> list[str]:
 
 
 def write_figures(folder: Path, pictures: Mapping[str, bytes]) -> Iterator[Path]:
-    """Write PNG files to a folder, which is created; yields the path of each once it is written. Raises OutputError if a file cannot be
-    written."""
+    """Write PNG files to a folder, which is created; yields their paths. Raises OutputError if a file cannot be written."""
     for name, picture in pictures.items():
         with output_errors(folder / name):
             make_folder(folder)

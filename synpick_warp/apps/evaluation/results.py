@@ -330,8 +330,7 @@ def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[TargetRow]:
 
 
 def select_targets(truth: Truth, targets: TargetList) -> Truth:
-    """Reduce the ground truth to listed images and objects; speeds stay those of all frames. Raises ResultError if a listed image is not in
-    the data set."""
+    """Ground truth of listed images and objects; speeds stay those of all frames. Raises ResultError if a listed image is missing."""
     objects = targets.objects
     known = set(map(tuple, truth.images.tolist()))
     for scene, image in objects:

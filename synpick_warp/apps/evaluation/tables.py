@@ -43,8 +43,7 @@ class ScoreRow:
 
 
 def summarize(truth: Truth, scores: Sequence[Scores], names: Mapping[int, str], groups: Sequence[str] = GROUPS) -> list[ScoreRow]:
-    """Rows of the table of methods with the same targets, by groups in this order, with names by obj_id; groups without instances are left
-    out."""
+    """Rows of methods with the same targets, by groups in this order, with names by obj_id; groups without instances are left out."""
     target = scores[0].target
     object_ids = truth.poses.object_id[target]
 

@@ -1,5 +1,4 @@
-"""Self-contained HTML report of a data set: frames, film strips, explained attempts, plots, findings and settings; no external
-resources."""
+"""Self-contained HTML report of a data set: frames, film strips, explained attempts, plots, findings and settings."""
 
 from synpick_warp.apps.report.compose import write_report
 

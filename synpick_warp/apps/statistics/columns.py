@@ -92,8 +92,7 @@ class Counts:
                         self.sums[name][key] += amount
 
     def merge(self, other: "Counts") -> None:
-        """Add the sums of another part. The order of merges does not change the result. Raises DatasetError if there are more than
-        MAX_OBJECTS objects."""
+        """Add the sums of another part, in any order. Raises DatasetError if there are more than MAX_OBJECTS objects."""
         for name, sums in self.sums.items():
             sums.update(other.sums[name])
         if len(self.sums["objects"]) > MAX_OBJECTS:

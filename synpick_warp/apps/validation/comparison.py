@@ -298,8 +298,7 @@ class ComparedView:
 
 
 def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False, within: float | None = None) -> Fit:
-    """Compare two masks (h, w); `exact`: by the narrower bounds for data sets of this program; `within`: by the mean distance of the
-    outlines [px] instead."""
+    """Compare two masks (h, w); `exact`: by the bounds for our data sets; `within`: by the mean distance of the outlines [px] instead."""
     differing = int(np.count_nonzero(one ^ other))
     union = int(np.count_nonzero(one | other))
     outline = max(_outline(one), _outline(other))

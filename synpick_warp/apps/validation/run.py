@@ -116,8 +116,7 @@ def validate(folder: Path, options: ValidationOptions, summary: Summary, report:
 
 
 def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation:
-    """Count a violation in the summary; returns it with a shorter text: paths relative to the data set, and the file's own name
-    not twice."""
+    """Count a violation in the summary; returns it with paths relative to the data set, and the file's own name not twice."""
     if violation.level is Level.ERROR:
         summary.errors += 1
     else:
@@ -178,8 +177,7 @@ def _plan_rigs(cameras: int, scenes: list[tuple[SceneRef, np.ndarray]]) -> Itera
 
 
 def _read_plan(layout: Layout) -> tuple[int, bool]:
-    """Number of cameras, and whether the data set has picks, by its settings; 1 and False for data sets from other sources, and where
-    the settings are damaged."""
+    """Number of cameras, and whether the data set has picks, by its settings; 1 and False without settings, or if these are damaged."""
     if layout.ours:
         with suppress(SynpickError):
             config = read_settings(layout.root, read_manifest(layout.root))

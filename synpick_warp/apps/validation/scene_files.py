@@ -87,8 +87,7 @@ RECORDS: dict[str, Any] = {"camera": CAMERA, "gt": list[TruthSchema], "gt_info":
 
 
 def convert(content: Any, schema: Any) -> Any:
-    """Check decoded JSON against a schema; returns it as the schema's types, or raises ValueError in few words, with the place in
-    `content`."""
+    """Convert decoded JSON to a schema's types; raises ValueError in few words, with the place in `content`."""
     try:
         return msgspec.convert(content, schema)
     except RecursionError:

@@ -59,8 +59,7 @@ class CellScene:
     def __init__(
         self, config: Config, progress: Progress, report: Callable[[str], None], objects: Sequence[RawObject] | None = None
     ) -> None:
-        """Build the scene of some objects; None: they are read. Raises SynpickError if device, bins, cameras or all objects cannot be
-        used."""
+        """Build the scene of objects; None: read them. Raises SynpickError if device, bins, cameras or all objects cannot be used."""
         self.config = replace(config, render=replace(config.render, mode=FAST, layers=(), random_yaw=False))
         self.device = device = pick_device(config.bake.device)
         self.sizes = config.cell.bins

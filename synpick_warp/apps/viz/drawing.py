@@ -208,8 +208,7 @@ def draw_layer(name: str, values: np.ndarray, depth_scale: DepthScale | None = N
 
 
 def layer_pictures(files: SceneFiles, frame: int, depth_scale: DepthScale | None) -> list[tuple[str, Image]]:
-    """Caption and colours of each layer that a scene has; raises DatasetError if the scene has a layer, but not for this frame, or the file
-    is damaged."""
+    """Caption and colours of each layer that a scene has; raises DatasetError if a layer lacks this frame, or the file is damaged."""
     present = [name for name in (*_DRAW, *_DEPTHS) if files.has(name)]
     return [draw_layer(name, read_layer(files, name, frame), depth_scale) for name in present]
 

@@ -71,8 +71,8 @@ class SeenAttempt(records.Attempt, dict=True):
 
 
 def read_attempts(dataset: Path, episode: int, number: int | None) -> list[SeenAttempt]:
-    """Read the attempts of an episode, sorted, or one of them; raises DatasetError if the file is missing or damaged, or has no such
-    episode or attempt."""
+    """Read the attempts of an episode, sorted, or one of them; raises DatasetError if the file is missing or damaged, or lacks the
+    attempt."""
     path, lines = _read_lines(dataset)
     keys = [decode_json(line, records.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
     episodes = sorted({key.episode for key in keys})
@@ -404,8 +404,7 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
 
 
 def _draw_bent(canvas: Image, edge: Edge, layout: GraphLayout) -> None:
-    """Draw a removed edge as a dashed arc, so that it does not cover the straight line between its nodes, where the opposite
-    edge may run."""
+    """Draw a removed edge as a dashed arc, beside the straight line between its nodes, where the opposite edge may run."""
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
     route = _arc(start, end, _BEND * np.array([end[1] - start[1], start[0] - end[0]]))
     _draw_arrow(canvas, route, GREY if edge.state == OUTVOTED else RED, 1, dashed=True)

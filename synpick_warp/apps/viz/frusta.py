@@ -187,8 +187,7 @@ class Canvas:
 
 
 def draw_camera(canvas: Canvas, camera: Camera, label: str, color: Color, *, size: float, floor: float, most: float) -> None:
-    """Draw a camera as a pyramid of depth `size`, with a triangle on its upper side, and its rays down to a floor, or to a depth of `most`
-    [m]."""
+    """Draw a camera as a pyramid of depth `size`, with a triangle on its upper side, and its rays to a floor or a depth of `most` [m]."""
     at, along = camera.center, rays(camera, image_border(camera, 1))
     ends = at + size / max(1.0, np.linalg.norm(along, axis=1).max() / _WIDE) * along
     for end in ends:

@@ -37,8 +37,7 @@ class _Drawn:
 
 
 def write_symmetry_sheet(objects: Sequence[RawObject], tolerance: float, out: Path, report: Callable[[str], None]) -> Path:
-    """Draw the symmetries of objects, with distances up to a tolerance [diameters]; returns the path. Raises OutputError if the picture
-    cannot be written."""
+    """Draw the symmetries of objects, with distances up to a tolerance [diameters]. Raises OutputError if the picture cannot be written."""
     objects = sorted(objects, key=lambda raw: raw.obj_id)
     if len(objects) > MAX_OBJECTS:
         report(f"the first {MAX_OBJECTS} of {len(objects)} objects are drawn")

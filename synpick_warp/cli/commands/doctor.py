@@ -102,8 +102,7 @@ def _describe_partition(device: wp.Device) -> str:
 
 
 def _caches() -> list[tuple[str, str, str | None]]:
-    """Rows (name, value, fault) of the kernel cache and the shape cache: folder, content, variable that moves it; why it cannot be
-    written."""
+    """Rows (name, value, fault) of the kernel cache and the shape cache: folder, content, its variable; why it cannot be written."""
     kernels, shapes = Path(wp.config.kernel_cache_dir or ""), default_cache_dir()
     return [
         ("kernel cache", f"{kernels}: {_describe_folder(kernels, 'modules')}; {KERNEL_VARIABLE} moves it", find_fault(kernels)),

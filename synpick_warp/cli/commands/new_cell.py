@@ -361,9 +361,8 @@ def _name_camera(stem: str, taken: Sequence[str]) -> str:
 
 
 def _write_cell(cell: NewCell, name: str, stage: Path, say: Callable[[str], None]) -> list[RawObject] | None:
-    """Write the settings, with a volume budget and masses for the parts, which are moved to their middle if that is far from their origin;
-    returns the parts, None: the embedded objects. `say` is called with each line on them. Raises SynpickError if a setting, or a part,
-    cannot be used."""
+    """Write the settings, with a volume budget and masses for the parts, moved to their middle if that is far from their origin; returns
+    the parts, None: the embedded objects. `say`: called with lines on them. Raises SynpickError if a setting, or a part, cannot be used."""
     from synpick_warp.scenes.catalog import describe_masses, read_objects
 
     lines: list[str] = []

@@ -143,9 +143,8 @@ def draw_cell(
     say: Callable[[str], None],
     objects: Sequence[RawObject] | None = None,
 ) -> None:
-    """Draw the cell of settings, as of `load_settings`; `name`: what the sheet is of, for its title; `objects`: those of the settings,
-    None: they are read. Raises SynpickError if settings, device, bins, cameras or all objects cannot be used, or the file cannot be
-    written."""
+    """Draw the cell of settings, as of `load_settings`; `name`: for its title; `objects`: those of the settings, None: they are read.
+    Raises SynpickError if settings, device, bins, cameras or all objects cannot be used, or the file cannot be written."""
     config = load_settings(preset_or_file)
     from synpick_warp.apps.viz.cell import CellScene, write_cell_sheet
     from synpick_warp.configs.dataset import may_pick

@@ -46,8 +46,7 @@ def _read_setting(key: str, value: object, item: Setting, source: str) -> Any:
 
 
 def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mapping[str, Any], source: str) -> tuple[Any, ...]:
-    """Override values of all rows of a preset by a table [key]. Raises ConfigError if a key may not be overridden for all, or a value is
-    not allowed."""
+    """Override values of all rows of a preset by a table [key]. Raises ConfigError if a key or value is not allowed for all."""
     identity = getattr(kind, "IDENTITY", ())
     if not identity:
         raise ConfigError(f"{key} is a table {source}; allowed: [[{key}]] tables, one for each")
@@ -106,7 +105,7 @@ def check_setting(name: str, key: str, value: Any, source: str) -> Any:
 
 
 def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:
-    """Add a setting, given as NAME.key, to the tables. Raises ConfigError if the split or setting does not exist, or the value is not
+    """Add a setting, given as NAME.key, to the tables. Raises ConfigError if there is no such split or setting, or the value is not
     allowed."""
     name, _, key = path.partition(".")
     if name not in tables:

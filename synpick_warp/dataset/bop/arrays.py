@@ -59,8 +59,7 @@ class SceneArrays:
 
 def read_arrays(files: SceneFiles, images: Sequence[int], camera: Any = None, *, whole: bool = False) -> SceneArrays:
     """Read the ground truth of some images (im_id) of a scene, with cameras of a schema, None: that of the scene. `whole`: whether
-    annotations of a bake must have these images and no others. Raises DatasetError if a file is missing or damaged, or has not all of the
-    images."""
+    annotations of a bake must have these images and no others. Raises DatasetError if a file is missing or damaged, or lacks an image."""
     camera = camera or files.schemas["camera"]
     if isinstance(files, SceneFolder) and files.complete:
         cameras, truth, infos = _read_folder(files, images, camera, whole)

@@ -138,8 +138,7 @@ def to_color(image: np.ndarray) -> np.ndarray:
 
 def measure_info(visible: Sequence[np.ndarray], amodal: Sequence[np.ndarray] | None) -> list[dict[str, Any]]:
     """Measure pixel counts, visible fraction and boxes of each instance from masks (H, W) bool of its visible part, and of its silhouette
-    within the image; without these (None), what is measured in them stays unknown. `px_count_valid`, which needs depth, is that of all
-    pixels."""
+    within the image; without these (None), their measures stay unknown. `px_count_valid`, which needs depth, is that of all pixels."""
     entries = []
     for index, mask in enumerate(visible):
         seen = int(np.count_nonzero(mask))

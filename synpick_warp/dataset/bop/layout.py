@@ -129,8 +129,7 @@ class Layout:
     """Detected layout of a data set."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises DatasetError if the folder does not exist, cannot be listed, has nothing of a BOP data set, or is a scene or split of
-        one."""
+        """Raises DatasetError if the folder does not exist, cannot be listed, has nothing of a BOP data set, or is a part of one."""
         if not folder.is_dir():
             raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")
         self.root = folder

@@ -251,8 +251,7 @@ def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> s
 
 
 def describe_inputs(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """Name the inputs whose digests differ, and the objects among them if both manifests have their digests: "objects and lights (24:
-    bowl)"; empty: none."""
+    """Names of inputs whose digests differ, and of objects if both manifests have theirs: "objects and lights (24: bowl)"; empty: none."""
     differing = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     kinds = " and ".join(_show_key(name) for name in differing if not name.startswith(OBJECT))
     objects = [_show_key(name.removeprefix(OBJECT)) for name in differing if name.startswith(OBJECT)]
@@ -279,8 +278,7 @@ def episode_entry(episode: int) -> Path:
 
 
 def committed_episodes(folder: Path) -> list[int]:
-    """Indices of the episodes that have a manifest entry, sorted. Raises DatasetError if the folder of the entries is a link that leads out
-    of the data set."""
+    """Sorted indices of committed episodes. Raises DatasetError if the folder of the entries is a link that leads out of the data set."""
     entries = path_inside(folder, str(ENTRIES), folder, DatasetError)
     names = (path.stem for path in entries.iterdir() if path.suffix == ".json") if entries.is_dir() else ()
     return sorted(int(name) for name in names if _EPISODE.fullmatch(name) and name == episode_entry(int(name)).name)

@@ -94,8 +94,7 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
-    """Check that the parts are distinct folders, and that the output folder neither is, contains nor lies in one. Raises DatasetError
-    otherwise."""
+    """Check that the parts are distinct, and that the output folder neither is, contains nor lies in one. Raises DatasetError otherwise."""
     known: dict[tuple[int, int], Path] = {}
     try:
         target = out.resolve()

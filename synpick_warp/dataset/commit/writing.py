@@ -256,9 +256,8 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
 def finalize_data_set(
     out: Path, settings: ExportSettings, kinds: Sequence[type[Exporter]], pool: WriterPool, episodes: Sequence[int] | None = None
 ) -> None:
-    """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes, sorted,
-    whose index lines are in LINES; None: those of the manifest, from their files. Raises OutputError if a file cannot be written, or LINES
-    are not of this call."""
+    """Write and commit the indices: lists of episodes, attempts and targets over all committed episodes, sorted, whose index lines are in
+    LINES; None: those of the manifest, from their files. Raises OutputError if a file cannot be written, or LINES are not of this call."""
     if episodes is None and os.path.lexists(out / LINES):
         raise OutputError(f"{out / LINES} is where the lines of indices are joined; move it away")
     try:

@@ -224,8 +224,7 @@ class ViewTruth:
 
 
 class RenderedView:
-    """`EncodedView` of a rendered view, from the arrays (colour, depth and the two mask sources) and the ground truth that `make_view_task`
-    collects."""
+    """`EncodedView` of a rendered view, from the arrays (colour, depth, masks) and the ground truth that `make_view_task` collects."""
 
     graph = None
 

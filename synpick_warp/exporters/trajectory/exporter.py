@@ -189,8 +189,7 @@ def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtyp
 
 
 def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
-    """Rows (frame) of the type `row`, by `batch_type`, of a batch of episodes that have the same number of instances; the capacity of a
-    world may be larger."""
+    """Rows (frame) of the type `row`, by `batch_type`, of episodes with as many instances; the capacity of a world may be larger."""
     rows = np.empty(len(batch), row)
     for name in row.names or ():
         group, _, array = name.partition("/")

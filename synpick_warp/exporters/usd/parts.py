@@ -177,8 +177,7 @@ NORMALS, VALUES, OPACITY, GLOW = "_normal.png", "_values.png", "_opacity.png", "
 
 
 def write_texture(library: Path, name: str, material: Material) -> str | None:
-    """Write a material's texture, and its maps, into the asset library; returns the texture's path relative to the library, None without
-    texture."""
+    """Write a material's texture, and its maps, into the asset library; returns the texture's path in the library, None without texture."""
     if material.texture is None:
         return None
     file = texture_file(name)

@@ -46,8 +46,7 @@ PROPS = f"{ROOT}/Props"
 
 
 def make_episode_layer(ticks: np.ndarray, end: EpisodeEnd, settings: episode.UsdSettings) -> Sdf.Layer:
-    """Build the layer of an episode from its ticks, a row of `episode.tick_type` per frame, and its end, the properties of the root
-    prim."""
+    """Build the layer of an episode from its ticks, a row of `episode.tick_type` per frame, and its end, properties of the root prim."""
     layer = Sdf.Layer.CreateAnonymous()
     stage = Usd.Stage.Open(layer)
     looks = end.row.get("looks") or {}

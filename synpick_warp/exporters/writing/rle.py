@@ -132,8 +132,7 @@ def split_listed_runs(places: np.ndarray, count: np.ndarray, height: int, instan
 
 def _split_runs(begin: np.ndarray, length: np.ndarray, span: int, bounds: np.ndarray, instances: Sequence[int]) -> list[Runs]:
     """Split runs by instance, and return those of some: position of each run's first pixel (M), sorted by instance, then by position,
-    pixels of each run (M), `span` positions per column, index of each instance's first run, and behind them that past the last one (N +
-    1)."""
+    pixels of each run (M), `span` positions per column, index of each instance's first run, and past the last one (N + 1)."""
     length = length.astype(np.int64)
     column, first = (part.astype(np.int64) for part in _divide(begin, span))
     past = first + length

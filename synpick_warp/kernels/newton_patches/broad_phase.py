@@ -126,8 +126,8 @@ def list_occupied_kernel(
     occupied_out: wp.array2d[int],  # (world, shape of a world)
     occupied_count_inout: wp.array[int],  # (world), zero before the launch
 ):
-    """Stream compaction: list the shapes of each world that are neither empty nor UNREACHED, in arbitrary order. Launched over world, shape
-    of a world."""
+    """Stream compaction of each world's shapes that are neither empty nor UNREACHED, in arbitrary order. Launched over world, shape of a
+    world."""
     world, shape = wp.tid()
     index = world * shapes.count + shape
     if lower[index][0] <= upper[index][0] and lower[index][2] < UNREACHED:

@@ -233,13 +233,11 @@ def bind_tree_refresh(function: wp.Function) -> wp.Function:
 
 
 def bind_propagation(function: wp.Function) -> wp.Function:
-    """Wrap the solver's articulated-body algorithm (Featherstone, 2008) in a device function that takes these structs, and return that
-    function."""
+    """Wrap the solver's articulated-body algorithm (Featherstone, 2008) in a device function of these structs, which is returned."""
 
     @wp.func
     def propagate(world: int, bodies: BodyData, impulse_inout: wp.array2d[float], twist_inout: wp.array2d[float], v_inout: wp.array[float]):
-        """Articulated-body algorithm: update joint velocities and twists by the impulses on a gripper's bodies, and set these impulses to
-        0."""
+        """Articulated-body algorithm: update joint velocities and twists by the impulses on a gripper's bodies, and clear these."""
         function(
             world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.cache_world_flag,
             bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,

@@ -44,8 +44,7 @@ class Cycles:
     entering: wp.array2d[float]
     """Weight of the edges from unplaced members that enter each member (view, instance)."""
     best: wp.array2d[float]
-    """Dynamic programming table: maximum weight of an acyclic subgraph of each set of members; bit k of the index stands for member k
-    (view, subset)."""
+    """Dynamic programming table: maximum weight of an acyclic subgraph of each set of members; bit k stands for member k (view, subset)."""
 
 
 @wp.func_native("""

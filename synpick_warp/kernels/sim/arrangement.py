@@ -55,8 +55,7 @@ def assign_episodes_kernel(
 
 @wp.kernel
 def free_idle_worlds_kernel(state_inout: Worlds):
-    """Free the worlds that are idle: their phases become EMPTY, so that `assign_episodes_kernel` assigns episodes to them. Launched over
-    world."""
+    """Free the worlds that are idle: their phases become EMPTY, for `assign_episodes_kernel`. Launched over world."""
     world = wp.tid()
     if state_inout.phase[world] == Phase.IDLE:
         state_inout.phase[world] = Phase.EMPTY
@@ -118,8 +117,7 @@ def is_sampled(catalog_index: wp.array2d[int], world: int, count: int, candidate
 
 @wp.func
 def fits_budget(total: float, volume: float, drop: DropData) -> bool:
-    """True if an object of this volume may be drawn: with `exceed` if it alone is within the budget, else if it is with the total before it
-    [m³]."""
+    """True if an object of this volume may be drawn: with `exceed` if it alone is within the budget, else with the total before it [m³]."""
     return wp.where(drop.exceed == 1, volume, total + volume) <= drop.volume
 
 

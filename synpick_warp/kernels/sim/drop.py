@@ -222,8 +222,7 @@ def raise_objects_kernel(seed: wp.uint64, layout: LayoutData, upright: float, st
 
 @wp.func
 def enclose(key: wp.uint64, instance: int, upright: float, cylinder: wp.vec3, radius: float) -> wp.vec3:
-    """Vertical cylinder about an instance that begins to fall, radius, lower and upper end [m]: its own if it stands, else that of its
-    bounding sphere."""
+    """Vertical cylinder about a falling instance, radius, lower and upper end [m]: its own if it stands, else of its bounding sphere."""
     if stands(key, instance, upright):
         return cylinder
     return wp.vec3(radius, -radius, radius)

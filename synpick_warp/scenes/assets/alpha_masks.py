@@ -75,8 +75,7 @@ def cut_mask(part: MeshPart, alpha: np.ndarray, threshold: float, modes: tuple[i
 
 
 def _cut(rows: np.ndarray, faces: np.ndarray, field: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Cut off what lies where `field` is negative; the last two columns of `rows` are texel column and row. None: more triangles
-    than `most`."""
+    """Cut off where `field` is negative; the last two columns of `rows` are texel column and row. None: more triangles than `most`."""
     sums = np.pad((field < 0.0).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
     kept = [np.zeros((0, 3), np.int64)]
     while len(faces):

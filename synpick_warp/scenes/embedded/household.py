@@ -1,5 +1,4 @@
-"""Household objects: open vessels with walls (bowl, mug, pitcher), banana, drill, wood block, scissors, marker, clamps, foam block.
-Lengths [m]."""
+"""Household objects: vessels with walls (bowl, mug, pitcher), banana, drill, wood block, scissors, marker, clamps, foam. Lengths [m]."""
 
 import numpy as np
 from scipy.interpolate import CubicSpline

@@ -66,8 +66,7 @@ class Gate:
             self.device.stream.record_event(self._ready)
 
     def admit(self, handle: int | None) -> None:
-        """Let a consumer's stream wait for the rendering of this batch. `handle`: the stream by DLPack's convention; it must live until the
-        batch expires."""
+        """Let a stream wait for this batch. `handle`: the stream by DLPack's convention; it must live until the batch expires."""
         if self._ready is None or handle == _NO_ORDER:
             return
         handle = _LEGACY_STREAM if handle is None else handle
@@ -135,8 +134,7 @@ class DeviceArray:
         return array.__dlpack__(stream=_NO_ORDER)
 
     def numpy(self) -> np.ndarray:
-        """The array on the host: on the CPU the buffer itself, on a GPU a copy, for which the host waits. Raises BufferError: the batch has
-        expired."""
+        """The array on the host: on the CPU the buffer itself, on a GPU a copy. Raises BufferError: the batch has expired."""
         array = self._valid()
         self._gate.admit_current()
         return array.numpy()

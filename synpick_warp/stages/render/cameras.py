@@ -34,8 +34,7 @@ def build_cameras(cameras: Sequence[Camera], device: wp.Device) -> Any:
 
 
 def camera_arrays(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> dict[str, np.ndarray]:
-    """Members of `CameraTable` without lenses for matrices (n, 3, 3) [px], world-to-camera rotations (n, 3, 3) and translations (n, 3)
-    [m]."""
+    """`CameraTable` without lenses for matrices (n, 3, 3) [px], world-to-camera rotations (n, 3, 3) and translations (n, 3) [m]."""
     return {
         "intrinsics": matrix[:, [0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float32),
         "rotation": rotation,

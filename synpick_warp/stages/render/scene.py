@@ -173,8 +173,7 @@ def detail_levels(maps: np.ndarray) -> list[np.ndarray]:
 
 
 def pack_details(normals: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Pack filtered maps into texels (H W) uint32, the layout of `Surfaces.detail`: mean normals (H, W, 3), squared GGX width and metallic
-    (H, W, 2)."""
+    """Texels (H W) uint32 of `Surfaces.detail` from filtered maps: mean normals (H, W, 3), squared GGX width and metallic (H, W, 2)."""
     normals, (alpha2, metallic) = normals.reshape(-1, 3), values.reshape(-1, 2).T
     length = np.clip(np.linalg.norm(normals, axis=1), 1e-3, 1.0)
     # Variance of a von Mises-Fisher distribution of normals along one axis, by the length of their mean (Banerjee et al., 2005).
@@ -304,8 +303,7 @@ def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
 
 
 def build_glass(materials: list[Material], objects: int, looks: Looks | None, device: wp.Device) -> wp.array | None:
-    """Transmission of the materials (material) as of `RenderScene.glass`, of which the first `objects` are those of objects; others are
-    opaque."""
+    """Transmission of the materials (material) as of `RenderScene.glass`, of the first `objects`; others are opaque."""
     glass = [(each.glass.transmission, each.glass.ior, each.glass.thickness) for each in materials[:objects]]
     if not any(row[0] for row in glass) and (looks is None or looks.randomize.object_transmission.kind == OFF):
         return None

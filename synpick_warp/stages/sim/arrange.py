@@ -86,8 +86,7 @@ def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) 
 
 
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int, restless: float) -> None:
-    """Re-drop objects that left the bin or are stuck, count ticks at rest, and begin phase ACT in worlds at rest; `restless`: of
-    `settle`."""
+    """Re-drop objects that left or are stuck, count ticks at rest, begin phase ACT in worlds at rest; `restless`: of `settle`."""
     measure_penetration(state, physics)
     measure_displacement(scene, state, physics)
     launch(rest.redrop_objects_kernel, len(state.phase), scene, state, physics.state, seed=wp.uint64(seed))

@@ -33,8 +33,7 @@ class SuctionHold:
     seal_kernel: ClassVar[Any] = seal.apply_seal_forces_kernel
 
     def __init__(self, settings: Suction, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
-        """Upload the surfaces that the rays hit to a device: collision shapes or visual meshes, which `render_scene` owns, by
-        `settings.surface`."""
+        """Upload the surfaces that rays hit: collision shapes or visual meshes, which `render_scene` owns, by `settings.surface`."""
         self._meshes = render_scene.keep
         self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
         self.mouth = None if settings.vacuum is None else _mouth_data(settings, device)

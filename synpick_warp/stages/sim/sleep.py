@@ -31,8 +31,7 @@ class Sleep:
     """Island sleeping of all worlds: hooks of a substep (`physics.Sleepers`) and of the broad phase, and `judge` at the end of a tick."""
 
     def __init__(self, scene: SceneData, physics: Physics) -> None:
-        """Install the hooks in `physics`; raises SynpickError if the broad phase is not `SeparatingBroadPhase`, as with another version of
-        Newton."""
+        """Install the hooks in `physics`; raises SynpickError without `SeparatingBroadPhase`, as with another version of Newton."""
         pipeline = physics.pipeline
         if not isinstance(pipeline.broad_phase, SeparatingBroadPhase):
             raise SynpickError(f"physics.sleep needs another version of Newton than {newton.__version__}; set it to 0")

@@ -41,8 +41,7 @@ class SealState(array_group(Seals, "world", "instance", units=_UNITS, peak=("wor
 
 @dataclass(frozen=True, eq=False)
 class WorldStatus:
-    """Status rows of the worlds, integers (`Status`) and real numbers (`Measure`), and sets of instances, which the host reads after each
-    tick."""
+    """Status rows of the worlds, integers (`Status`) and real numbers (`Measure`), and sets of instances, as read after each tick."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
     """Columns: `Status`."""

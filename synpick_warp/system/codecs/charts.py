@@ -61,8 +61,7 @@ def read_bundle() -> str:
 
 
 def render_charts(specs: Sequence[Spec], scale: float = SCALE) -> list[bytes]:
-    """Render charts in one process: a PNG file of each, with `scale` pixels per pixel of the specification. Raises ChartError: the library
-    cannot run."""
+    """Render charts in one process: a PNG file of each, with `scale` pixels per pixel. Raises ChartError: the library cannot run."""
     if not specs:
         return []
     data = _run(_RENDER, json.dumps([{**spec, "usermeta": {"scale": scale}} for spec in specs], allow_nan=False).encode())

@@ -80,16 +80,14 @@ def to_csv(table: Table, exact: bool = False) -> str:
 
 
 def _plain(value: Value, digits: str, exact: bool) -> Value:
-    """Value of a CSV cell: a number in the format `digits` (empty: unchanged), text escaped and no formula unless `exact`, None
-    as it is."""
+    """CSV cell: a number in the format `digits` (empty: unchanged), text escaped and no formula unless `exact`, None as it is."""
     if isinstance(value, str):
         return value if exact else f"'{escape(value)}" if value.startswith(_FORMULA) else escape(value)
     return value if value is None or not digits else format(value, digits)
 
 
 def to_latex(table: Table) -> str:
-    """LaTeX table in the style of booktabs: text in the first column, numbers in the others, which are grouped below the headers of
-    `spans`."""
+    """LaTeX table for booktabs: text in the first column, numbers in the others, grouped below the headers of `spans`."""
     heads = " & ".join(f"\\multicolumn{{{len(below)}}}{{c}}{{{_escape_latex(name)}}}" for name, below in table.spans)
     rules = "".join(f"\\cmidrule(lr){{{below[0] + 1}-{below[-1] + 1}}}" for _, below in table.spans)
     lines = [f"\\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}", "\\toprule", f" & {heads} \\\\", rules]

@@ -61,8 +61,7 @@ def read_text(path: Path) -> str:
 PIXELS, COPIES, LINK, SETUP = "pixels", "copies", "bake link", "setup"
 """Name prefixes of this package's threads. PIXELS threads launch kernels only while the caller waits; the others never do."""
 ZARR_THREADS = {"async.concurrency": 1, "threading.max_workers": 1}
-"""Configuration of zarr: one worker thread, as writer processes already run in parallel. Zarr names its pool's threads only if the
-pool size is set."""
+"""Configuration of zarr: one thread, as writer processes run in parallel. Zarr names its pool's threads only if the pool size is set."""
 _HARMLESS = re.compile(
     rf"({PIXELS}|{COPIES}|{SETUP})_\d+|{LINK}|(upload|deliver)_\d+|delivery|heartbeat|zarr_(io|pool_\d+)|QueueFeederThread"
 )

@@ -165,9 +165,8 @@ class SmPartition:
         """Numbers of main and of reserved SMs."""
 
     def make_stream(self, on_reserved: bool = False, priority: int = 0) -> wp.Stream:
-        """Create a stream on one of the two sets of SMs. `on_reserved`: whether to use the reserved SMs instead of the main ones.
-        `priority`: CUDA stream priority; lower values have higher priority. Raises DeviceError: the driver is too old, or a CUDA call
-        failed."""
+        """Create a stream on one of the two sets of SMs. `on_reserved`: whether to use the reserved SMs. `priority`: CUDA stream priority;
+        lower values have higher priority. Raises DeviceError: the driver is too old, or a CUDA call failed."""
         stream = ctypes.c_void_p()
         context = self._reserved if on_reserved else self._main
         self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), context, _NON_BLOCKING, priority)

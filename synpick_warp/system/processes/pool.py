@@ -57,8 +57,7 @@ class WorkerProcess:
         self.link.close()
 
     def describe_end(self, setting: str) -> tuple[str, str]:
-        """How the process died, such as "was ended by SIGKILL", and what can be done about it. `setting`: that of the number of
-        processes."""
+        """How it died, such as "was ended by SIGKILL", and what can be done about it. `setting`: that of the number of processes."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(END_TIMEOUT)
         code = self.process.returncode

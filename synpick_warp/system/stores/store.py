@@ -258,8 +258,7 @@ def _tag(state: Any) -> str:
 
 
 def describe_fault(error: BaseException) -> str:
-    """First line of an error's text, as the others describe the library's internals, without secrets: keys, tokens, users, queries of
-    URLs."""
+    """First line of an error's text, as others describe internals, without secrets: keys, tokens, users, queries of URLs."""
     text = (str(error).splitlines() or [type(error).__name__])[0]
     for name, value in os.environ.items():
         if len(value) >= _SHORT and _SECRETS.fullmatch(name):

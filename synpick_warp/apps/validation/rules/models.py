@@ -132,8 +132,7 @@ def sample_area(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarr
 LENGTH_TOLERANCE = 1e-3
 """Largest error of diameter, minimum and size, as a fraction of the diameter; published values have 0.1 % of a small object."""
 SYMMETRY_DISTANCE, SYMMETRY_FRACTION = 15.0, 0.1
-"""Largest distance of a surface from itself after a symmetry: max(15 mm, 0.1 diameters), by which BOP identifies symmetries (Hodaň et al.,
-BOP Challenge 2020)."""
+"""Largest distance of a surface from itself after a symmetry: BOP's max(15 mm, 0.1 diameters) (Hodaň et al., BOP Challenge 2020)."""
 SAMPLES, PROBES = 20_000, 500
 """Points of the surface, and those that are moved."""
 ANGLES = (0.7, 1.9, 3.3)

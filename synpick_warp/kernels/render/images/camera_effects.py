@@ -1,5 +1,4 @@
-"""Parameters of sensors, and camera effects: sampled for each view from ranges (domain randomization), with the lens and sensor models that
-use them."""
+"""Sensor and camera effects: sampled for each view from ranges (domain randomization), with the lens and sensor models that use them."""
 
 import warp as wp
 

@@ -81,8 +81,7 @@ def is_occluded(shot: AnyShot, nearest: wp.array2d[float], focal_baseline: float
 
 @wp.func
 def in_shadow(layer: LayerScene, shot: AnyShot, focal_baseline: float, view: int, row: int, column: int) -> bool:
-    """True if the projector, at the right of the depth image's camera, or the infrared camera, at its left, does not see a pixel's
-    surface."""
+    """True if the projector, right of the depth image's camera, or the infrared camera, left of it, does not see a pixel's surface."""
     registration = layer.sensor.registration
     if is_occluded(shot, layer.nearest, focal_baseline * (1.0 - registration), 1, view, row, column):
         return True

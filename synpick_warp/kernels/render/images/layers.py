@@ -138,8 +138,7 @@ class LayerScene:
 
 
 def kernel_of_layer(value: wp.Function, name: str, dtype: Any) -> Callable[..., None]:
-    """Kernel that writes a function of the pixel to the image of the layer `name`. Launched over view, pixel (tile order, from flat index
-    `first` on)."""
+    """Kernel that writes a function of pixels to the layer `name`. Launched over view, pixel (tile order, from flat index `first` on)."""
 
     @kernel_of_views(name=f"render_{name}_kernel")
     def render_layer_kernel(
@@ -232,8 +231,7 @@ def class_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: 
 
 @wp.func
 def displacement_at(scene: AnyScene, layer: LayerScene, shot: AnyShot, view: int, row: int, column: int) -> wp.vec3:
-    """Backward scene flow: displacement from the surface point to its position in the previous frame, each in the axes of its camera [m];
-    NaN: unknown."""
+    """Backward scene flow: displacement of the surface point to the previous frame, each in the axes of its camera [m]; NaN: unknown."""
     cameras, motions = shot.views.cameras, layer.motions
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
     segment = int(shot.gbuffer.segment[view, row, column])

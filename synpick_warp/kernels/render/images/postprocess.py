@@ -1,5 +1,4 @@
-"""Post-processing of linear radiance to sRGB bytes: lens, exposure, sensor noise, tone map, sRGB transfer curve, contrast, in this
-order."""
+"""Post-processing of linear radiance to sRGB bytes: lens, exposure, sensor noise, tone map, sRGB curve, contrast, in this order."""
 
 from typing import Any
 

@@ -122,8 +122,7 @@ def seal_score(meshes: Meshes, mesh: int, cup: PlacedCup, radius: float) -> floa
 
 @wp.func
 def is_obstructed(scene: AnyScene, shot: AnyShot, view: int, cup: PlacedCup, radius: float) -> bool:
-    """Whether another object, the bin or the table reaches into the cylinder above the cup, from CLEARANCE to CUP_HEIGHT; the gripper does
-    not count."""
+    """Whether another object, bin or table reaches into the cup's cylinder, from CLEARANCE to CUP_HEIGHT; the gripper does not count."""
     meshes, table, bodies, instances = scene.meshes, scene.table, shot.bodies, shot.views.instances
     to_world = wp.transpose(bodies.world_rotation[view, cup.body])
     point = bodies.position[view, cup.body] + to_world * cup.point

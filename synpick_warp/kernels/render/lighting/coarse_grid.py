@@ -10,8 +10,7 @@ from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE
 wp.set_module_options({"enable_backward": False})
 
 PLANE_TOLERANCE = wp.constant(1.0)
-"""Coarse pixels lie on one surface up to this distance from its tangent plane, in widths of a coarse pixel at their depth times the
-filter's stride."""
+"""Coarse pixels lie on one surface up to this distance from its tangent plane, in widths of a coarse pixel times the filter's stride."""
 NORMAL_STEPS = wp.constant(14)
 """Steps of each coordinate of a packed normal; even, so that a normal towards the camera is exact."""
 MIN_WEIGHT = wp.constant(1.0e-4)

@@ -21,11 +21,9 @@ wp.set_module_options({"enable_backward": False})
 LIGHT_CHANGE = wp.constant(0.07)
 """Temporal lag that an average may have, as a fraction of the light, see `lag_frames`; compared with others in tools/DECISIONS.md."""
 MAX_TRAVEL = wp.constant(2.0)
-"""Displacement of a body [sizes] from which on it changes no more of a point's light: it has uncovered all that it covered, and covers as
-much elsewhere."""
+"""Displacement of a body [sizes] from which on it changes no more of a point's light: it covers as much elsewhere as it has uncovered."""
 LAG_STEPS = wp.constant(3)
-"""Newton iterations of `lag_frames`: each that does not reach the solution brings at least one more body, the fastest first, to
-MAX_TRAVEL."""
+"""Newton iterations of `lag_frames`: each before the solution brings at least one more body, the fastest first, to MAX_TRAVEL."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
 MIN_SKIP_PATHS = wp.constant(2)

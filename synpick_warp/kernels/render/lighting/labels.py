@@ -27,8 +27,7 @@ PAPER, INK = wp.constant(0.82), wp.constant(0.03)
 LABEL_ROUGHNESS = wp.constant(0.45)
 """Perceptual roughness of coated paper."""
 BAR_CELLS, MATRIX_CELLS, LETTERS, LINES = wp.constant(60.0), wp.constant(18.0), wp.constant(16.0), wp.constant(5.0)
-"""Cells of the bar code, and of a side of the matrix code; letters of a line, and lines of text. All proportions are those of a shipping
-label, by eye."""
+"""Cells of the bar code, and of a side of the matrix code; letters of a line, and lines of text. Proportions are a shipping label's."""
 CODE_MEAN, TEXT_MEAN = wp.constant(0.5), wp.constant(0.28)
 """Mean ink of a code and of text, which wide pixels see."""
 
@@ -129,8 +128,8 @@ def cell_ink(seed: int, x: float, y: float) -> float:
 
 @wp.func
 def label_reflectance(seed: int, at: wp.vec2, footprint: float) -> float:
-    """Reflectance of a label at coordinates on it, for a pixel of this width in half widths; codes fade to grey where it is as wide as one
-    of their cells."""
+    """Reflectance of a label at coordinates in half widths, for a pixel of this width; codes fade to grey in pixels as wide as their
+    cells."""
     x, y = 0.5 + 0.5 * at[0], 0.5 - 0.5 * at[1]
     if x < 0.06 or x > 0.94 or y < 0.08 or y > 0.92:
         return PAPER

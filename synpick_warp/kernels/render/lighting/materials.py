@@ -113,8 +113,7 @@ def place_details(
     footprint: float,
     to_world: wp.mat33,
 ) -> Surface:
-    """Shading data with tangent, place and label, if the material may have maps, wear or a label; `footprint` [m] is the pixel's on the
-    surface."""
+    """Shading data with tangent, place and label, of a material with maps, wear or label; `footprint` [m]: the pixel's on the surface."""
     return surface
 
 
@@ -408,8 +407,7 @@ def material_at(surfaces: Surfaces, surface: Surface, wear: Wear) -> SurfaceMate
 
 @wp.func
 def material_at(surfaces: RandomizedSurfaces, surface: Surface, wear: Wear) -> SurfaceMaterial:  # noqa: F811
-    """Material at a hit: that of its row or of its maps, changed by `wear`, which all samples of a pixel share. Labels are opaque, and so
-    is metal."""
+    """Material at a hit, by its row or maps, changed by `wear`, which all samples of a pixel share. Labels are opaque, and so is metal."""
     result = SurfaceMaterial()
     result.transmission = transmission_at(surfaces, surface)
     result.metallic = surfaces.metallic[surface.row]

@@ -20,8 +20,7 @@ class EnvironmentCdf:
     conditional: wp.array3d[float]
     """Over the columns of each row: (map, row, column + 1), from 0 to 1."""
     marginal_guide: wp.array2d[wp.uint16]
-    """(map, cell + 1): guide table (Chen and Asau, 1974) of the marginal CDF: its inverse at u = cell / N. The number of cells N is a power
-    of two."""
+    """(map, cell + 1): guide table (Chen and Asau, 1974) of the marginal CDF: its inverse at u = cell / N, N a power of two."""
     conditional_guide: wp.array3d[wp.uint16]
     """(map, row, cell + 1): guide tables of the conditional CDFs."""
 

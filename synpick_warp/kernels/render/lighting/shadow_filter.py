@@ -44,8 +44,7 @@ MAX_STEEPNESS = wp.constant(0.9)
 """Difference of a lamp's visible fractions on both sides of a pixel, STEEPNESS_DISTANCE away, up to which the filter is right, and from
 which on rays from the pixels replace it. Between them both are blended."""
 FULL_SHARE = wp.constant(0.2)
-"""Share of a lamp in the light of an open surface that faces up, below which its shadow counts as less steep: its edge is
-too faint to be missed."""
+"""Share of a lamp in the light of an open surface that faces up, below which its shadow counts as less steep, since it is faint."""
 MIN_SHARE = wp.constant(float(MIN_STEEPNESS) * float(FULL_SHARE))
 """Share of a lamp below which none of its shadows is steep."""
 STEEPNESS_LEVELS = wp.constant(7)
@@ -55,8 +54,7 @@ MIN_COSINE = wp.constant(0.87)
 """Minimum cosine of the angle between the normals of one surface. Lamps behind a surface count as unblocked, and must not light one that
 bends towards them, such as the bevel between a wall and the floor."""
 MIN_SUPPORT = wp.constant(4)
-"""Minimum number of the eight pixels around a pixel, STEEPNESS_DISTANCE away, on its surface; with fewer, its fractions come from too few
-rays."""
+"""Minimum number of the eight pixels around a pixel, STEEPNESS_DISTANCE away, on its surface; fewer have too few rays."""
 EVEN_BYTES = wp.constant(wp.uint64(0x00FF00FF00FF00FF))
 """Bytes 0, 2, 4, 6, each with room for a sum in 16 bits."""
 SEGMENT_BITS = wp.constant(wp.uint32(0xFF))
@@ -65,16 +63,14 @@ SEGMENT_BITS = wp.constant(wp.uint32(0xFF))
 
 @wp.struct
 class LampShadows:
-    """Visible fraction of each lamp and steepness of its shadow, on the shadow grid and at pixels that traced rays of their own.
-    Scratch."""
+    """Visible fraction of each lamp and steepness of its shadow, on the shadow grid and at pixels with rays of their own. Scratch."""
 
     fractions: wp.array3d[wp.uint64]
     """(view, shadow_row, shadow_column): filtered visible fractions of the lamps, byte k that of lamp k in 1/255."""
     record: wp.array3d[wp.vec4]
     """(view, shadow_row, shadow_column): the same with steepness, depth and segmentation id, packed by `pack_shadows`."""
     near_edge: wp.array3d[wp.uint8]
-    """(view, shadow_row, shadow_column): 1 in pixels around steep shadows and edges of surfaces, 0 elsewhere; cleared to 0 when they
-    are listed."""
+    """(view, shadow_row, shadow_column): 1 in pixels around steep shadows and edges of surfaces, 0 elsewhere; cleared when listed."""
     edge: wp.array3d[wp.uint32]
     """(view, row, column): rays from the pixel itself at steep edges, 4 bits a lamp: 0, or 1 + the number of unblocked rays. Before
     they are traced: steepness as in `record`."""

@@ -27,8 +27,7 @@ ALL_RAYS = wp.constant(0xFF)
 LAMP_STRATA = wp.constant(16)
 """Parts of a lamp, of equal irradiance; the pixels of a square of 4 x 4 send a ray to each."""
 POINT_BITS = wp.constant(2)
-"""Binary logarithm of the sample points of a part. A hash of the pixel picks one: with a single point, wide penumbrae show its shadow as a
-contour."""
+"""Binary logarithm of the sample points of a part. The pixel's hash picks one: a single point would show as a contour."""
 LAMP_POINTS = wp.constant(int(LAMP_STRATA) << int(POINT_BITS))
 """Number of a lamp's sample points; the low bits of a point's index are that of its part."""
 STRATA_PERIOD = wp.constant(4)

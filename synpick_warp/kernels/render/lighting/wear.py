@@ -19,8 +19,7 @@ FINE_SCALE = wp.constant(4.0)
 NOISE_SPREAD, STAIN_SPREAD = wp.constant(0.207), wp.constant(0.215)
 """Standard deviations of the noise of rust and of stains, measured at 400,000 places."""
 LOGISTIC = wp.constant(0.5513)
-"""Ratio of standard deviations, √3 / π: times it, the quantile of the logistic distribution, log(p / (1 - p)), approximates the normal
-one's."""
+"""Ratio of standard deviations, √3 / π: times it, the logistic quantile, log(p / (1 - p)), approximates the normal one's."""
 EDGE = wp.constant(0.1)
 """Half width of a patch's soft edge, in noise values."""
 RUST_SCALE, STAIN_SCALE = wp.constant(2.5), wp.constant(1.25)

@@ -91,8 +91,7 @@ class ViewBodies:
     rotation: wp.array2d[wp.mat33]
     """(view, body): camera to body frame."""
     start: wp.array2d[wp.vec3]
-    """(view, body): the point of the optical axis at depth `near`, in the body's frame [m]. Rays start this close to the body, so that
-    float32 suffices."""
+    """(view, body): the point of the optical axis at depth `near`, in the body's frame [m]. Rays start so close that float32 suffices."""
     near: wp.array2d[float]
     """(view, body): lower bound of the planar depth of the body's points [m]."""
     box: wp.array2d[wp.vec4i]
@@ -167,8 +166,7 @@ class ShadedImage:
     """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
     SOURCE_BITS that select the pixel whose radiance it takes, see `images.antialias.source_offset`."""
     passes: wp.array2d[wp.uint8]
-    """(view, tile): what is computed anew in a tile: bits as COLOR_PASS. Elsewhere the image is undefined, and colours are those of the
-    frame before."""
+    """(view, tile): what is computed anew in a tile: bits as COLOR_PASS. Elsewhere the image is undefined, and colours stay."""
     samples: int
     """Number of coverage samples per anti-aliased pixel: 4, 8 or 16, distributed equally over its quadrants."""
 

@@ -49,8 +49,7 @@ and fixtures have an id each."""
 MAX_TRIANGLES = 1 << int(TRIANGLE_BITS)
 """Maximum number of triangles of a mesh."""
 SMALL_PIXELS = wp.constant(256)
-"""Largest screen box [px] of a triangle that one thread rasterizes at once; larger ones are split into blocks, since a warp waits for its
-largest triangle."""
+"""Largest screen box [px] of a triangle in one thread; larger ones are split into blocks, since a warp waits for its largest."""
 BLOCK_ROWS = wp.constant(32)
 BLOCK_COLUMNS = wp.constant(256)
 """Size of a block [px]; each of its rows is one work item."""
@@ -63,8 +62,7 @@ class VisibilityBuffer:
     """
 
     nearest: wp.array3d[wp.uint64]
-    """(kept, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle; `kept` is the view's
-    `Damage.kept_row`."""
+    """(kept, row, column): key of the nearest triangle: depth's float32 bits, body, triangle; `kept` is the view's `Damage.kept_row`."""
     block: wp.array2d[wp.vec4i]
     """(view, block): rank of the body in `ViewBodies.order`, triangle, first row, first column."""
     blocks: wp.array[int]

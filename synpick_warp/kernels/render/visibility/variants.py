@@ -9,8 +9,7 @@ from typing import Any
 import warp as wp
 
 VARIANTS: dict[str, tuple[Any, Any]] = {}
-"""Structs of a parameter that is annotated `Any`, by its name: the plain one and that of the variant. Modules that define structs add
-theirs."""
+"""Structs of parameters annotated `Any`, by name: the plain one and that of the variant. Modules that define structs add theirs."""
 _parameters: dict[wp.Kernel, dict[str, tuple[Any, Any]]] = {}
 """Parameters of each generic kernel that are annotated `Any`, with their structs."""
 _templates: dict[wp.Kernel, wp.Kernel] = {}

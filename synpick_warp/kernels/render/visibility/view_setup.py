@@ -112,8 +112,7 @@ def set_up_views_kernel(
 
 @wp.func
 def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
-    """Sort key of a body: its near depth [m]; FAR for the tote, so that the tote is tested last: a ray with a hit inside can mostly skip
-    it."""
+    """Sort key of a body: its near depth [m]; FAR for the tote, which is then tested last: a ray with a hit inside can mostly skip it."""
     if body == bodies.mesh.shape[1] - FIXTURES:
         return FAR
     return bodies.near[view, body]

@@ -19,15 +19,13 @@ WIDTH = wp.constant(4)
 NODE_RECORDS = wp.constant(4)
 """Number of 16-byte records per node."""
 LEAF = wp.constant(0x80000000)
-"""Flag of a child reference that marks a leaf. The other bits are the triangle's index in `WideBvh.triangle`, or the index of the child
-node."""
+"""Flag of a child reference that marks a leaf. The other bits index the triangle in `WideBvh.triangle`, or the child node."""
 STACK_SIZE = wp.constant(64)
 """Capacity of the traversal stack, in child references."""
 NO_HIT = wp.constant(0xFFFFFFFF)
 """Sort key of a box that the ray misses, and triangle index of a query without a hit."""
 MIN_COMPONENT = wp.constant(1.0e-20)
-"""Smallest absolute component of a ray's direction in the slab test. Smaller ones would have an infinite reciprocal, which times zero is
-NaN."""
+"""Smallest absolute component of a ray's direction in the slab test. Smaller ones have an infinite reciprocal, which times zero is NaN."""
 FAR_SCALE = wp.constant(1.000001)
 """Scale of the distance at which a ray leaves a box, some 8 ulp above 1: rounding never loses a box that the ray touches (Ize, 2013)."""
 

@@ -33,8 +33,7 @@ class PathQueues:
     slot: wp.array4d[wp.uint16]
     """(queue_view, region, stage % 2, rank): slot of each queued path from stage 1 on; double-buffered. In stage 0 it is the rank."""
     record: wp.array3d[wp.vec4]
-    """(queue_view, region, path_record): paths packed by `write_path`, as a structure of arrays: element k * QUEUE_CAPACITY + slot is
-    record k of a slot."""
+    """(queue_view, region, path_record): paths packed by `write_path`; element k * QUEUE_CAPACITY + slot is record k of a slot."""
 
 
 @wp.struct
