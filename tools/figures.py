@@ -33,7 +33,6 @@ class Run(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     commit: str | None
     """Short hash of the code that ran; None: unknown."""
     command: str
-    """Command line that ran."""
     today: str = ""
     """Command that measures the same with the present code; empty: the same one."""
     conditions: str = ""

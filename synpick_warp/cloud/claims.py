@@ -160,9 +160,7 @@ class Sizes(NamedTuple):
     """Partition of a plan into chunks: whole ones, then halves, quarters and eighths in its last part. The same for all workers."""
 
     episodes: int
-    """Episodes of the plan."""
     chunk: int
-    """Episodes of a whole chunk."""
 
     def bounds(self) -> Iterator[tuple[int, int]]:
         """Yield the bounds of each chunk as positions in the plan: first, and the one after its last."""

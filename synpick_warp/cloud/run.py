@@ -120,7 +120,6 @@ class Job:
     """Bake of a data set into an object store: what all of its workers share, and what a worker has for itself."""
 
     config: Config
-    """All settings."""
     url: str
     """Prefix of the data set: new, or of an earlier bake with the same settings."""
     splits: tuple[str, ...] = ()
@@ -140,7 +139,6 @@ class Crew:
     price: float = 0.0
     """Price of a worker an hour."""
     alive: int = 0
-    """Number of running workers."""
     seconds: float = 0.0
     """Accumulated running time of all workers [s]."""
 

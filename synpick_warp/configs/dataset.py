@@ -95,7 +95,6 @@ class DataLayout:
     split: str
     """BOP folder without splits."""
     names: tuple[str, ...]
-    """Names of the cameras."""
     sensor_names: tuple[str, ...]
     """Their names as sensors of a scene."""
     every: tuple[int, ...]

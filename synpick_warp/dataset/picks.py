@@ -47,7 +47,6 @@ class PickTables:
 
     index: int
     folder: Path
-    """Folder of the data set."""
 
     @property
     def picks(self) -> np.recarray:

@@ -33,7 +33,6 @@ class ObjectInfo:
     """Physical properties of a catalog object, in its frame."""
 
     object_id: int
-    """BOP object id."""
     name: str
     mass: float
     """[kg]"""

@@ -27,9 +27,7 @@ class EpisodeRecord:
 
     mode: str
     objects: int = 0
-    """Instances at the first frame."""
     left: int = 0
-    """Instances at the last frame."""
     attempts: tuple[Attempt, ...] = ()
     distractors: tuple[tuple[int, str], ...] = ()
     """Instance and name of each distractor at the first frame."""

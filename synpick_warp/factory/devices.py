@@ -60,7 +60,6 @@ class DeviceShare:
     config: Config
     """Settings with the process's device and writers."""
     episodes: list[int]
-    """In order of their start."""
     processes: int
     """Processes of the bake, which share the host's memory."""
 

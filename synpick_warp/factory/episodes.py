@@ -86,7 +86,6 @@ class BakeSummary:
     """Episodes of the complete data set."""
     episodes: list[EpisodeOutcome] = field(default_factory=list)
     views: int = 0
-    """Views written by this run."""
     wall_seconds: float = 0.0
     """Time from the first tick to the last file [s]."""
     resampled: int = 0
@@ -96,11 +95,8 @@ class BakeSummary:
     remedies: dict[Ending, str] = field(default_factory=dict)
     """Advice against these endings, where a setting cures them; see `remedy`."""
     outcomes: Counter[Outcome] = field(default_factory=Counter)
-    """Attempts by outcome."""
     resumed: int = 0
-    """Episodes committed by earlier runs."""
     stopped: int = 0
-    """Signal that stopped the bake before its end; 0: none."""
 
     def take_record(self, record: Mapping[str, Any]) -> None:
         """Count an episode that an earlier run committed."""

@@ -99,7 +99,6 @@ class Forecast:
 
     episodes: int
     frames: int
-    """Frames of all episodes."""
     views: int
     size: int
     """Size of the data set [B]."""

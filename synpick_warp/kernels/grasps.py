@@ -30,7 +30,6 @@ class PerturbationData:
     """Uniform distributions of the perturbations; see `configs.episodes.picks.Picks`. The first trial of a grasp is not perturbed."""
 
     repeats: int
-    """Trials of each grasp."""
     offset: float
     """Half width of the offset of the grasp point along each axis [m]."""
     angle: float
@@ -38,7 +37,6 @@ class PerturbationData:
     friction: float
     """Half width of the factor on friction about 1."""
     seed: wp.uint64
-    """Seed of the bake."""
 
 
 @wp.struct

@@ -26,13 +26,11 @@ class LayoutData:
     gripper_dofs: int
     """Degrees of freedom of the gripper: x, y, z, tilt."""
     bodies: int
-    """Bodies of a world."""
     coords: int
     """Joint coordinates of a world: the gripper's, then 7 a slot."""
     dofs: int
     """Degrees of freedom of a world: the gripper's, then 6 a slot."""
     shapes: int
-    """Collision shapes of a world."""
     finger_shape: int
     """Index of the shape of the finger, which is the gripper's shaft, in its world."""
 
@@ -68,9 +66,7 @@ class CatalogData:
     variant: wp.array[int]
     """Variant of the object, in slots of its class (single or compound)."""
     empty_single: int
-    """Variant of an empty single slot."""
     empty_compound: int
-    """Variant of an empty compound slot."""
     empty_mass: float
     """Mass of an empty slot's body [kg]."""
 
@@ -100,7 +96,6 @@ class DropData:
     gripper_home: wp.vec3
     """Wrist position while the gripper waits [m]."""
     lights: int
-    """Number of environment maps."""
     random_yaw: int
     """1: sample the yaw of environment maps."""
     exposure_spread: float
@@ -114,7 +109,6 @@ class BinData:
     """
 
     count: int
-    """Number of bins."""
     visible: int
     """1: bins are rendered; 0: there is a table alone."""
     share: wp.array[float]
@@ -337,7 +331,6 @@ class CupData:
     """
 
     count: int
-    """Number of cups."""
     place: wp.array[wp.vec3]
     """(cup): centre of the lip, in the frame of the gripper head, whose origin is on the wrist axis [m]."""
     common_valve: int

@@ -87,7 +87,6 @@ class ExtractedSun(NamedTuple):
     irradiance: np.ndarray
     """Irradiance on a surface that faces the sun (3); zero if the map is not bright there."""
     radius_tangent: float
-    """Tangent of the angular radius of the sun."""
 
 
 def extract_sun(radiance: np.ndarray, direction: np.ndarray) -> ExtractedSun:

@@ -164,7 +164,6 @@ class Prop:
     pose: tuple[float, ...]
     """x, y, z [m] and quaternion x, y, z, w: to the world, or to the frame of the gripper's shaft."""
     follows: bool
-    """Whether it follows the gripper."""
     pieces: Shape = ()
     """Collision shapes in its own frame."""
 

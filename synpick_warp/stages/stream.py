@@ -228,13 +228,10 @@ class _Launched:
 
     ring: ViewRing
     slot: int
-    """Index of the slot of the batch in the ring."""
     count: int
-    """Number of views in use."""
     description: dict[str, Any]
     """Fields of `FrameBatch` by `describe_views`."""
     finished: Callable[[], None] | None = None
-    """Called once the consumer is done with the batch."""
 
 
 class FrameStream:

@@ -40,9 +40,7 @@ class StageTime:
 
     calls: int = 0
     host: float = 0.0
-    """Host time [s]."""
     device: float = 0.0
-    """Device time [s]; 0 where it was not measured."""
 
 
 class Span(NamedTuple):
@@ -51,9 +49,7 @@ class Span(NamedTuple):
     name: str
     track: int
     start: float
-    """Time since the recorder started [s]."""
     duration: float
-    """[s]"""
 
 
 class Recorder:

@@ -193,15 +193,11 @@ class EpisodeEnd:
     attempts.jsonl. Exporters commit its files, or discard them if the ending delivers nothing."""
 
     episode: int
-    """Episode index."""
     arrangement: int
     """Number of arrangements of this episode that were discarded and resampled before this one."""
     frames: int
-    """Number of frames."""
     ending: int
-    """Code of an `Ending`."""
     row: Mapping[str, Any] = field(default_factory=dict)
-    """The episode's row of episodes.jsonl; empty if the arrangement will be resampled."""
     attempts: tuple[str, ...] = ()
     """The episode's lines of attempts.jsonl: JSON, each with its newline."""
     image_ids: tuple[int, ...] | None = None

@@ -126,7 +126,6 @@ class PickBatch:
     columns are missing, unknown, or of other shapes."""
 
     episode: int
-    """Episode index."""
     trials: Mapping[str, np.ndarray]
     """Columns of COLUMNS by name, each (trial[, 3])."""
     states: Mapping[str, np.ndarray]

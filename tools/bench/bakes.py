@@ -73,9 +73,7 @@ class Tally(NamedTuple):
     """Counters of a cleaner: verified episodes and files, deleted bytes, first problem (empty: none)."""
 
     episodes: int = 0
-    """Number of verified episodes."""
     files: int = 0
-    """Number of verified files."""
     deleted: int = 0
     """Disk space freed by deletion [bytes]."""
     problem: str = ""
@@ -91,7 +89,6 @@ class CleanedSet:
     """Data set whose committed episodes are verified and deleted; manifest entries, and files of others, are kept."""
 
     out: Path
-    """Folder of the data set."""
     folders: tuple[str, ...]
     """Folders shared by several episodes, relative to the data set; they are kept even if empty."""
 
@@ -222,7 +219,6 @@ class Reading:
     count: int
     """Views, or frames of worlds, so far."""
     episodes: int
-    """Ended episodes."""
     main: Usage
     """Of the main process."""
     writers: Usage

@@ -42,7 +42,6 @@ class Difference(NamedTuple):
     where: str
     """Key path, with indices in brackets; line or member of an archive."""
     values: str
-    """Both values."""
     largest: float = math.nan
     """Largest difference of two numbers; NaN: something other than numbers differs."""
 

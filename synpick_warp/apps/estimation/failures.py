@@ -64,7 +64,6 @@ class _Window:
     left: float
     top: float
     size: float
-    """[px]"""
 
     def camera(self, intrinsics: np.ndarray) -> Camera:
         """Camera at the origin that sees the window with the resolution of a panel."""

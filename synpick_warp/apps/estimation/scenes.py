@@ -30,7 +30,6 @@ class ScenePlan:
     """Scene, episode and camera to read, and its frames in order."""
 
     scene: int
-    """Index of the scene."""
     episode: int
     camera: int
     frames: tuple[int, ...]
@@ -105,7 +104,6 @@ class EstimationScene:
     files: SceneFiles
     """Where its images are."""
     truth: SceneArrays
-    """Its ground truth."""
     poses: np.ndarray
     """Object to camera (N, 4, 4) float64 [m]."""
     intrinsics: np.ndarray

@@ -234,7 +234,6 @@ class Band:
     high: float
     """The interval includes `low`, and `high` only in the last band."""
     count: int
-    """Number of instances."""
     auc: float
     """Exact area, from 0 to 1; NaN without instances."""
     recall: float
@@ -280,7 +279,6 @@ class Scores:
     """Errors of one method for the T true instances that are visible enough."""
 
     name: str
-    """Name of the method."""
     target: np.ndarray
     """Row of the ground truth (T,) int64."""
     errors: dict[str, np.ndarray]

@@ -34,9 +34,7 @@ class ScoreRow:
     group: str
     """What instances are grouped by: one of GROUPS, or "mean"."""
     label: str
-    """The group's name in the table."""
     targets: int
-    """Number of instances to be found."""
     cells: tuple[dict[str, float], ...]
     """For each method: column -> value. AUC by metric and convention [%], `recall` (ADD(-S) below 0.1 m) [%], and the medians of the found
     instances `rotation` [°] and `translation` [mm]; NaN: nothing found."""

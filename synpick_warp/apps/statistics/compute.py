@@ -59,7 +59,6 @@ class Collected:
 
     counts: Counts = field(default_factory=Counts)
     views: int = 0
-    """Views that were counted."""
     missing: list[str] = field(default_factory=list)
     """Sentences about data that the data set lacks."""
     memory: int = 0

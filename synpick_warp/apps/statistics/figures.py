@@ -37,7 +37,6 @@ class EpisodeFigures:
     frames: int
     """Output frames of simulated time; each is a view of every camera."""
     endings: dict[str, int]
-    """Episodes by ending."""
     objects: int
     """Objects at the first frame, over all episodes."""
     picked: int
@@ -45,9 +44,7 @@ class EpisodeFigures:
     """Objects that left the scene otherwise."""
     attempts: int
     outcomes: dict[str, int]
-    """Attempts by outcome."""
     good_seals: int
-    """Attempts with a good seal."""
     seals: int
     """Attempts in which suction engaged an object."""
     force: float | None
@@ -126,7 +123,6 @@ class LightFigures:
 
     episodes: int
     maps: dict[str, int]
-    """Episodes by name of the environment map."""
     yaw: tuple[int, ...]
     """Episodes by yaw, in YAW_BINS bins."""
     exposure: dict[float, int]

@@ -39,7 +39,6 @@ class Proof(NamedTuple):
     """Result of a proof: the device, the episodes that were baked again, the number of compared files, and the first difference."""
 
     device: str
-    """Name of the device that baked."""
     episodes: list[int]
     files: int
     """Number of compared files, of these episodes and of the constants."""

@@ -59,7 +59,6 @@ class Summary:
     views: int = 0
     """Views whose images were checked."""
     rendered: int = 0
-    """Views that were rendered again."""
     models: int = 0
     errors: int = 0
     warnings: int = 0

@@ -48,7 +48,6 @@ class Laid:
     """Layout of objects side by side on the floor of a bin, in the orientation of their files."""
 
     indices: list[int]
-    """Indices of the objects that are placed."""
     positions: list[tuple[float, float, float]]
     """Positions of their origins in the bin's frame [m]."""
 

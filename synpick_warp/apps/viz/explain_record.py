@@ -271,7 +271,6 @@ class GraphLayout:
     """Layout of the graph in the image [px]."""
 
     nodes: dict[int, tuple[float, float]]
-    """Position of each node."""
     routes: dict[tuple[int, int], np.ndarray]
     """(upper, lower) of a kept edge -> polyline from node to node (N, 2)."""
 

@@ -69,7 +69,6 @@ class Calibration:
     cy: float
     """Focal lengths and principal point [px]."""
     model: str = PINHOLE
-    """Distortion model."""
     distortion: tuple[float, ...] = ()
     """Coefficients in OpenCV's order; empty: none."""
 

@@ -199,9 +199,7 @@ class SceneSettings:
     """What completes a scene."""
 
     view: ViewSettings
-    """Settings of its views."""
     split: str
-    """Name of the split's folder."""
     images: Sequence[int]
     """Images (im_id) that it must have, ascending."""
     categories: tuple[dict[str, Any], ...]

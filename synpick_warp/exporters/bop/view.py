@@ -151,9 +151,7 @@ class ViewSettings:
     effects: tuple[str, ...]
     """Names of the active camera effects."""
     masks: bool
-    """Whether mask files are written."""
     coco: bool
-    """Whether COCO annotations are written."""
     camera: dict[str, Any]
     """Constant part of the views' entries in scene_camera.json."""
     resolution: tuple[int, int]
@@ -161,9 +159,7 @@ class ViewSettings:
     color: bool = True
     """Whether colour files are written."""
     depth: bool = True
-    """Whether depth files are written."""
     layers: tuple[str, ...] = ()
-    """Layers that are written."""
     keypoints: dict[int, Keypoints] = field(default_factory=dict)
     """Keypoints in COCO annotations, by obj_id; empty: none."""
     polygons: bool = False
@@ -212,9 +208,7 @@ class ViewTruth:
     listed: bool
     """Whether the source of visible masks is a list of run boundaries (True) or an image crop (False)."""
     top: int
-    """First row of the crop."""
     left: int
-    """First column of the crop."""
     run_count: np.ndarray
     """Run boundaries of each amodal mask of the view (I), if their source is a list; else empty, and it is the view's words."""
     mask_first: np.ndarray

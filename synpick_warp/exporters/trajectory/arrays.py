@@ -31,7 +31,6 @@ class TrajectoryArray:
     """Schema of one array of the store."""
 
     dims: tuple[str, ...]
-    """Names of its dimensions."""
     dtype: str
     unit: str
     """1: dimensionless."""

@@ -238,7 +238,6 @@ class SpooledEpisode:
     row: np.dtype
     """Type of a row of its spool file."""
     attributes: dict[str, Any]
-    """Attributes of its group."""
     object_id: np.ndarray
     """obj_id of each instance at the first frame (instance) int32."""
     drop_pose: np.ndarray | None

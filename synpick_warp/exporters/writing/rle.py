@@ -65,9 +65,7 @@ class Masks:
     """Amodal (silhouette, hidden parts included) and visible mask of an instance, as runs clipped to the image."""
 
     amodal: Runs
-    """Silhouette, including hidden parts."""
     visible: Runs
-    """Visible (modal) part."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,9 +55,7 @@ class SlotWriter:
     pending: wp.uint64
     """Bits that do not fill a word yet."""
     bits: int
-    """Number of pending bits, below `WORD_BITS`."""
     words: int
-    """Words written."""
 
 
 @wp.struct

@@ -29,15 +29,11 @@ class ShapeData:
     """
 
     count: int
-    """Shapes of a world."""
     box: int
-    """Newton's type of boxes."""
     hull: int
-    """Newton's type of convex hulls."""
     kind: wp.array[int]
     """Type of shape; pairs with other types than boxes and hulls are never rejected."""
     mesh: wp.array[wp.uint64]
-    """Mesh of a hull."""
     gap: wp.array[float]
     """Contact gap: two shapes have contacts up to the sum of their gaps and margins [m]."""
     collides: wp.array2d[wp.uint8]

@@ -139,7 +139,6 @@ class IterationSettings:
 
     iterations: int
     omega: float
-    """Relaxation factor."""
     regularize: int
     freeze_drive_rows: int
     friction_start_iteration: int

@@ -75,9 +75,7 @@ class Sampling:
     """A batch of states whose candidates are sampled, one a view."""
 
     count: int
-    """Candidates of a state."""
     first: int
-    """Number of the first state of the batch."""
     index: wp.array[int]
     """(one): index of the candidate whose grasp is planned."""
     row: wp.array[int]

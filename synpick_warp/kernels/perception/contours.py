@@ -29,15 +29,10 @@ class PolygonMoments:
     cross_v: wp.int64
     """Six times the first moment in v."""
     u: wp.int64
-    """Sum of u over the vertices."""
     v: wp.int64
-    """Sum of v over the vertices."""
     last_u: int
-    """u of the last vertex."""
     last_v: int
-    """v of the last vertex."""
     points: int
-    """Number of vertices."""
 
 
 @wp.func

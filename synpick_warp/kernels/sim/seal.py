@@ -52,9 +52,7 @@ class Wrench:
     """Force [N] and torque [N·m] on the object at the TCP, in the world's axes."""
 
     force: wp.vec3
-    """[N]"""
     torque: wp.vec3
-    """[N·m]"""
 
 
 @wp.struct

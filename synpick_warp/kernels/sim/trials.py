@@ -23,7 +23,6 @@ class TrialData:
     """Parameters of trials; see `configs.episodes.picks.Picks`."""
 
     repeats: int
-    """Trials of each grasp."""
     near: float
     """Distance from the grasp point, along the normal, at which the gripper appears [m]; 0: it approaches as in an attempt."""
     lift_steps: int

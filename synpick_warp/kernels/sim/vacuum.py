@@ -31,7 +31,6 @@ class MouthData:
     ray: wp.array[wp.vec3]
     """(ray): place x, y in the TCP frame [m] and share of the mouth's area [m²]; those on the lip, which have none, first, by angle."""
     lip: int
-    """Rays on the lip."""
     radius: float
     """Radius of the lip [m]."""
     compliance: float

@@ -248,11 +248,8 @@ class ShapeRecipe:
     concave: bool
     """Convex decomposition instead of the convex hull."""
     hull_vertices: int
-    """Maximum vertices of a convex hull."""
     piece_vertices: int
-    """Maximum vertices of each convex piece."""
     pieces: int
-    """Maximum convex pieces."""
     concavity: float
     """CoACD's concavity threshold."""
 

@@ -45,7 +45,6 @@ class TickRecord:
     observation: Observation
     plan: Plan
     physics: PhysicsRecord | None = None
-    """None: physics is not recorded."""
 
 
 def allocate_worlds(sizes: dict[str, int], device: wp.Device) -> tuple[WorldState, AttemptState, SealState, LastFrame, TickRecord]:

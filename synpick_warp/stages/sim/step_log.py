@@ -51,10 +51,8 @@ class PhysicsRecord:
     """Step log, drop poses and support of one tick, for the host."""
 
     steps: StepArrays | None
-    """None: steps are not recorded."""
     drops: DropArrays
     supports: SupportArrays | None = None
-    """None: support is not recorded."""
 
 
 def record_sizes(sizes: dict[str, int], steps_per_tick: int) -> dict[str, int]:

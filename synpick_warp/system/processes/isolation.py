@@ -57,7 +57,6 @@ class Limits:
     seconds: float
     """Processor time of all threads [s]; a call that waits is stopped after _WALL times as long."""
     memory: int
-    """Address space beyond that of the interpreter [bytes]."""
 
 
 @dataclass(frozen=True)

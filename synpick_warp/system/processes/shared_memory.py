@@ -22,7 +22,6 @@ class SharedArray:
     """Descriptor of an array in shared memory: offset [B], shape and type."""
 
     offset: int
-    """First byte [B]."""
     shape: tuple[int, ...]
     dtype: str
 

@@ -171,7 +171,6 @@ class TrainingOutcome:
     """Scores on the photographs with rendered objects: what they lack of `real` is due to the objects' appearance."""
     synthetic: NetworkScores
     overlay: list[Labelled]
-    """The photographs with their labels."""
 
 
 def check_ids(labels: list[np.ndarray]) -> None:

@@ -51,7 +51,6 @@ class Recipe:
     """Hyper-parameters, none of which is chosen on real pictures."""
 
     views: int
-    """Views of the stream."""
     passes: float
     """Number of epochs."""
     batch: int
@@ -91,7 +90,6 @@ class ViewPool:
     capacity: int
     seed: int
     count: int = 0
-    """Views in the pool."""
     seen: int = 0
     """Views that have been added."""
     seconds: float = 0.0

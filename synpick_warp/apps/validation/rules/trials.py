@@ -39,7 +39,6 @@ class PicksSubject:
     root: Path
     """The data set."""
     index: int
-    """Index of the episode."""
     _meshes: dict[int, np.ndarray] = field(default_factory=dict)
 
     @property

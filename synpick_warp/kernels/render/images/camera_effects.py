@@ -23,11 +23,8 @@ class EffectRanges:
     """Lower and upper bound of each effect parameter, and the seed of the data set; see configs.cell.sensors.Effects."""
 
     seed: wp.uint64
-    """Seed of the bake."""
     low: EffectParameters
-    """Smallest value of each parameter."""
     high: EffectParameters
-    """Largest value of each parameter."""
 
 
 @wp.struct
@@ -38,11 +35,9 @@ class SensorParameters:
     """
 
     seed: wp.uint64
-    """Seed of the bake."""
     baseline: float
     """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
     disparity_step: float
-    """Quantization step of disparity [px]."""
     disparity_noise: float
     """Standard deviation of disparity [px]."""
     max_disparity: float

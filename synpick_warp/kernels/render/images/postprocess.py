@@ -191,9 +191,7 @@ class PostProcessSettings:
     """Seed of the noise, tone map, and whether the lens filter has begun, for post-processing with camera effects."""
 
     seed: wp.uint64
-    """Seed of the bake."""
     tone: int
-    """A `Tone`."""
     lens_filter: int
     """1: the image is the result of `filter_lens_rows_kernel`, and the pass along columns is due; 0: no effect needs neighbours."""
 

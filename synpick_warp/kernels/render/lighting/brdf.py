@@ -62,7 +62,6 @@ class Brdf:
     tangent: wp.vec3
     bitangent: wp.vec3
     outgoing: wp.vec3
-    """View direction."""
     roughness: float
     alpha: float
     """GGX width: roughness², at least MIN_ALPHA."""

@@ -28,7 +28,6 @@ class CoarseGrid:
     image: ImageGrid
     """Full-resolution grid [px]."""
     grid: ImageGrid
-    """Grid of the coarse pixels."""
 
 
 @wp.struct

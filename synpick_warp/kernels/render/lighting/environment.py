@@ -23,7 +23,6 @@ class Lights:
     """
 
     maps: int
-    """Number of environment maps."""
     radiance: wp.array3d[wp.vec4]
     """(2 maps, row, column): first every map as it is, then every map without its lamps. Row 0 is the zenith, column
     u = azimuth / 2π + 0.5. The fourth component is padding, so that `read_record` applies."""

@@ -61,7 +61,6 @@ class LightHistory:
     frame: wp.array[int]
     """(world_camera): index of the last frame; NEVER: none."""
     cameras: int
-    """Cameras of a world."""
     max_paths: int
     """Maximum history length [paths]; 0: no history is kept."""
     kept: int

@@ -106,7 +106,6 @@ class Surface:
     """Material row, geometric and interpolated normal, and texture coordinates with their footprint, at one hit."""
 
     row: int
-    """Row of `Surfaces`."""
     face_normal: wp.vec3
     """Geometric normal, towards the viewer."""
     normal: wp.vec3

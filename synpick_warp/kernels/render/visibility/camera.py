@@ -55,11 +55,8 @@ class ImageGrid:
 
     width: int
     height: int
-    """[px]"""
     tile_columns: int
-    """Tiles in a row."""
     tiles: int
-    """Tiles in the image."""
 
 
 @wp.struct
@@ -75,11 +72,8 @@ class Views:
     slot: wp.array[int]
     """(view): row of the scene's cameras, which are those of one image size."""
     cameras: CameraTable
-    """Camera of each view."""
     count: int
-    """Views in the batch."""
     instances: int
-    """Instance capacity of a world."""
 
 
 LensViews = variant_of(Views, "LensViews", cameras=LensCameras)

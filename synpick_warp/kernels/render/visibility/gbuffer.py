@@ -67,7 +67,6 @@ class Meshes:
     entries: int
     """Row of the first bin; see `fixture_mesh`."""
     interior: Interior
-    """Empty interior of the tote."""
 
 
 @wp.struct
@@ -75,9 +74,7 @@ class Table:
     """Horizontal plane below the tote: whether it is visible (1), its z in the world [m], and how much of it cameras see."""
 
     visible: int
-    """1: the scene has a table."""
     height: float
-    """z in the world [m]."""
     half: wp.vec2
     """Half length and width of what cameras see, about the world's origin; FAR: endless [m]."""
 
@@ -181,7 +178,6 @@ class Hit:
     triangle: int
     barycentric: wp.vec2
     depth: float
-    """Planar depth of a camera ray, distance along any other [m]."""
 
 
 @wp.func

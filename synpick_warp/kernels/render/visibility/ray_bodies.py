@@ -18,13 +18,9 @@ class RayBody:
     """Body as a ray needs it: world-to-body rotation, origin in the world [m], BVH root, and row in `ViewBodies`."""
 
     rotation: wp.mat33
-    """World to body frame."""
     position: wp.vec3
-    """Body origin in the world [m]."""
     root: int
-    """Root node of its BVH."""
     row: int
-    """Row of `ViewBodies`."""
 
 
 @wp.func

@@ -29,7 +29,6 @@ class Triangle:
     c: wp.vec3
     """Corners."""
     near: float
-    """Depth at which z is 0 [m]."""
 
 
 @wp.struct

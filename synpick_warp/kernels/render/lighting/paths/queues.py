@@ -45,15 +45,11 @@ class PathPixel:
     offset: int
     """Index of the coarse pixel in its region, in interleaved order."""
     segment: int
-    """Segmentation id of the surface of the coarse pixel."""
     known: int
-    """Number of valid paths of the history of the coarse pixel."""
     number: int
     """Sobol' index of the path; of the first one, if it has several."""
     diffuse: wp.vec3
-    """Diffuse colour of the surface."""
     unoccluded: SplitRadiance
-    """Unoccluded light that the surface reflects."""
     specular_limit: float
     """Firefly clamp of specular light: limit of the largest channel."""
 

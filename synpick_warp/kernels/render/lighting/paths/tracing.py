@@ -135,7 +135,6 @@ class Path:
     """State of a path between two bounces: radiance so far, throughput, and the last hit."""
 
     radiance: SplitRadiance
-    """Radiance collected so far."""
     throughput: Throughput
     hit: Hit
     """Last hit, at which the path scatters next; not set before the first bounce."""
