@@ -8,9 +8,7 @@ import warp as wp
 
 @wp.struct
 class Worlds:
-    """State of each world: episode (-1: none), phase, mode, objects (-1: none) and their body slots, progress of settling, frame, waypoints
-    and setpoint [m], light.
-    """
+    """State of each world."""
 
     arrangement_id: wp.array[wp.vec2i]
     """(world): episode index, and index of the arrangement in it: 0, plus 1 for each resample. Episode -1: none."""
@@ -106,11 +104,7 @@ class Seals:
 
 @wp.struct
 class Observations:
-    """Perception result of each instance, when its world was last observed: visible pixels and fraction, grasp point candidates [px], depth
-    [m], votes[i, j] for j lying above i, clutter graph as bit sets of the instances above.
-
-    `dataset.records.InstanceObservation` has it as JSON.
-    """
+    """Perception result of each instance, when its world was last observed; `dataset.records.InstanceObservation` has it as JSON."""
 
     visible: wp.array2d[int]
     """(world, instance): visible pixels [px]: size of the largest component; 0: not visible."""
@@ -140,9 +134,7 @@ class Observations:
 
 @wp.struct
 class Plans:
-    """Plan of each world, from when it was last observed: target instance (-1: none), grasp point [m] and outward normal in the world, yaw
-    of the shaft and tilt of the cup [rad].
-    """
+    """Plan of each world, from when it was last observed."""
 
     target: wp.array[int]
     """(world): chosen instance; -1: none."""
@@ -158,9 +150,7 @@ class Plans:
 
 @wp.struct
 class Snapshots:
-    """Snapshot of each world at the end of a tick: episode, frame, objects (-1: none), poses to the world, light, and the poses of the
-    previous frame (`last_`).
-    """
+    """Snapshot of each world at the end of a tick, with the poses of the previous frame (`last_`)."""
 
     live: wp.array[int]
     """(world): 1: this tick is a frame of the world's episode."""
@@ -214,9 +204,7 @@ class Frames:
 
 @wp.struct
 class FramePoses:
-    """State of each world in one snapshot: whether the tick is a frame, episode and frame index, objects (-1: none) and poses to the world
-    of instances and fixtures; the next snapshot repeats these as its previous frame.
-    """
+    """State of each world in one snapshot; the next snapshot repeats it as its previous frame."""
 
     live: wp.array[int]
     """(world): 1 if the tick is a frame."""

@@ -30,8 +30,7 @@ _SNAPSHOT = ("bin", "fixture_pose", "fixture_visible", "light", "light_yaw", "li
 
 @dataclass(frozen=True, eq=False)
 class TickReport:
-    """Results of one tick on the host, one row a world: status, measures, objects (-1: none), object-to-world poses [m], perception, and
-    recorded physics (empty: not recorded)."""
+    """Results of one tick on the host, one row a world."""
 
     status: np.ndarray
     """Status rows (world, status) int32; columns: `Status`."""

@@ -33,9 +33,7 @@ history_vec = wp.types.vector(length=8, dtype=wp.int32)
 
 @wp.struct
 class Codes:
-    """Deflate codes of bytes (literals), match lengths (runs) and match distances - 1, packed: the value, in the highest byte the number of
-    bits.
-    """
+    """Deflate codes, packed: the value, in the highest byte the number of bits."""
 
     literal: wp.array[wp.uint32]
     """(byte): packed code of a literal."""
@@ -60,9 +58,7 @@ class SlotWriter:
 
 @wp.struct
 class SlotSums:
-    """Size [bits], sum of the filtered bytes, and sum of position times byte modulo ADLER (both for Adler-32), of each slot or group of
-    slots.
-    """
+    """Size, and sums for Adler-32, of each slot or group of slots."""
 
     bits: wp.array2d[int]
     """(view, slot): size [bits]."""

@@ -16,9 +16,7 @@ LANES = wp.constant(64)
 
 @wp.struct
 class ContactHistory:
-    """History of a list of contacts: sort keys, points and normals of the contact matcher; first constraint rows and normals of the warm
-    start; anchors and impulses of the friction patches, whose pairs of bodies are sorted apart, at other indices.
-    """
+    """History of a list of contacts, and of the friction patches, whose pairs of bodies are sorted apart, at other indices."""
 
     key: wp.array[wp.int64]
     """(contact): sort key of the matcher: two shapes, and which of their contacts."""

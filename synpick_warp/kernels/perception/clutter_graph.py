@@ -25,9 +25,7 @@ NO_CYCLE = wp.constant(-1)
 
 @wp.struct
 class Cycles:
-    """Strongly connected components by view, and the one that is being ordered: its members, weight[a, b] of the edge from b, above, to a
-    (0: none), rank of each member (0: uppermost), and dynamic programming table by set of members.
-    """
+    """Strongly connected components by view, and the one that is being ordered."""
 
     pending: wp.array3d[wp.uint32]
     """Frontier of the graph search: bit sets of ancestors not expanded yet (view, instance, word)."""

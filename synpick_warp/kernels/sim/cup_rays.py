@@ -18,9 +18,7 @@ CUP = wp.constant(1)
 
 @wp.struct
 class SurfaceData:
-    """Surfaces of the catalog objects for ray casts, in their frames: ranges of convex pieces, outward planes n·x ≤ d of each piece, visual
-    meshes (used if `use_mesh` is 1), radius of the bounding sphere [m].
-    """
+    """Surfaces of the catalog objects for ray casts, in their frames."""
 
     first_piece: wp.array[int]
     """(entry + 1): convex pieces of object e are first_piece[e] to first_piece[e + 1] - 1."""

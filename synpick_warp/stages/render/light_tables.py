@@ -29,11 +29,7 @@ MEAN_STEPS = 4096
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentTables:
-    """Precomputed tables of one environment map: radiance with and without lamps, prefiltered by GGX lobes, SH irradiance, lamps, exposure
-    factor.
-
-    See `kernels.render.lighting.environment.Lights`.
-    """
+    """Precomputed tables of one environment map; see `kernels.render.lighting.environment.Lights`."""
 
     radiance: np.ndarray
     """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the whole map, with the sun of its sIBL set drawn as a disc."""

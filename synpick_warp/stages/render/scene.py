@@ -56,9 +56,7 @@ from synpick_warp.system.linear_algebra import dot, matmul
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """Scene on the device, shared by all views, as kernel structs: meshes, surfaces, cameras, environment maps, table; and obj_id of each
-    catalog mesh.
-    """
+    """Scene on the device, shared by all views, as kernel structs."""
 
     meshes: Any
     """The struct `Meshes`."""

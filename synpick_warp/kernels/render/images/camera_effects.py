@@ -20,7 +20,7 @@ LUMA = wp.constant(wp.vec3(0.299, 0.587, 0.114))
 
 @wp.struct
 class EffectRanges:
-    """Lower and upper bound of each effect parameter, and the seed of the data set; see configs.cell.sensors.Effects."""
+    """Lower and upper bound of each effect parameter, and the seed of the data set; see configs.cell.cameras.Effects."""
 
     seed: wp.uint64
     low: EffectParameters
@@ -29,15 +29,13 @@ class EffectRanges:
 
 @wp.struct
 class SensorParameters:
-    """Depth sensor model: seed, baseline [m], disparity quantization, noise and limit [px], range [m]; of structured light axial and
-    lateral noise, grazing limit, matching window, and whether projector shadows are invalid; of infrared images projector, dots, light
-    and noise. See configs.cell.sensors.DepthSensor.
-    """
+    """Depth sensor model; see configs.cell.cameras.DepthSensor."""
 
     seed: wp.uint64
     baseline: float
     """From the camera to the projector, or to the right one of two cameras, to the right [m]."""
     disparity_step: float
+    """Quantization step of disparity [px]."""
     disparity_noise: float
     """Standard deviation of disparity [px]."""
     max_disparity: float

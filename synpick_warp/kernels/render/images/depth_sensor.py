@@ -127,7 +127,7 @@ def measured_pixel(sensor: SensorParameters, grid: ImageGrid, key: wp.uint64, ro
 
 @wp.func
 def axial_noise(sensor: SensorParameters, depth: float, cosine: float) -> float:
-    """Standard deviation of a measured depth [m] for the cosine of the angle of incidence; the law of configs.cell.sensors.DepthSensor."""
+    """Standard deviation of a measured depth [m] for the cosine of the angle of incidence; the law of configs.cell.cameras.DepthSensor."""
     off = depth - sensor.noise_distance
     angle = wp.acos(wp.clamp(cosine, 0.0, 1.0))
     ratio = angle / (wp.HALF_PI - angle)

@@ -18,9 +18,7 @@ SH_CONSTANT = wp.constant(0.282095)
 
 @wp.struct
 class Lights:
-    """Environment maps: radiance with and without lamps, prefiltered maps and irradiance coefficients (SH) without lamps; lamps with unit
-    directions towards them, irradiance, sample points and numbers of shadow rays; exposure factor. Constant.
-    """
+    """Environment maps with and without their lamps. Constant."""
 
     maps: int
     radiance: wp.array3d[wp.vec4]

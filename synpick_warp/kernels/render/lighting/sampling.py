@@ -27,9 +27,7 @@ class EnvironmentCdf:
 
 @wp.struct
 class EnvironmentSample:
-    """Direction sampled from the environment map for next-event estimation: unit vector towards the light, density [1/sr], and radiance
-    divided by density, MIS-weighted.
-    """
+    """Direction sampled from the environment map for next-event estimation."""
 
     direction: wp.vec3
     """Unit vector, in the map's frame or in the world."""

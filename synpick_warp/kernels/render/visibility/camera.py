@@ -23,9 +23,7 @@ NEAR_PLANE = wp.constant(1.0e-3)
 
 @wp.struct
 class CameraTable:
-    """Cameras, a row for each camera of a scene or each view of a batch: intrinsics, extrinsics and lens. Of views filled by
-    `aim_cameras_kernel` or on the host.
-    """
+    """Cameras, a row for each camera of a scene, or by `aim_cameras_kernel` or the host for each view of a batch."""
 
     intrinsics: wp.array[wp.vec4]
     """(row): fx, fy, cx, cy [px]."""

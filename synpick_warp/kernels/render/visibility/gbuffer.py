@@ -26,11 +26,7 @@ MASK_BITS = wp.constant(64)
 
 @wp.struct
 class Interior:
-    """Empty interior of the tote: a convex region in its own frame that no triangle reaches into, open at the top; see
-    `scenes.types.Interior`.
-
-    floor <= z <= top, |x| <= half[0] + z growth[0], |y| <= half[1] + z growth[1], |x| + |y| <= half[2] + z growth[2].
-    """
+    """Empty interior of the tote; see `scenes.types.Interior`."""
 
     half: wp.vec3
     """Half extents at z = 0 [m]; negative: there is no interior."""
@@ -113,9 +109,7 @@ class ViewBodies:
 
 @wp.struct
 class GBuffer:
-    """Primary hit of each pixel: segmentation id (0: nothing, 1 + instance, or a `Segment`), triangle within the body's mesh, barycentric
-    weights of its first two corners, planar depth [m].
-    """
+    """Primary hit of each pixel."""
 
     segment: wp.array3d[wp.uint8]
     """(view, row, column): segmentation id: 0 nothing, 1 + instance, or a member of `Segment`."""
@@ -153,9 +147,7 @@ ALL_PASSES = int(COLOR_PASS) | int(SHADE_PASS) | int(EDGE_PASS)
 
 @wp.struct
 class ShadedImage:
-    """Linear radiance of a batch of views before post-processing, and for each pixel a resolve code: 0, it keeps its radiance, else packed
-    selectors of the pixels whose radiance its samples average.
-    """
+    """Linear radiance of a batch of views before post-processing, and how samples are resolved."""
 
     radiance: wp.array3d[wp.vec3]
     """Linear radiance (view, row, column) before exposure; of anti-aliased pixels, that of the pixel's centre."""

@@ -57,9 +57,7 @@ BLOCK_COLUMNS = wp.constant(256)
 
 @wp.struct
 class VisibilityBuffer:
-    """Visibility key (depth, body, triangle) of the nearest triangle of each pixel, and the work list of blocks of large triangles with its
-    length, which may exceed its capacity.
-    """
+    """Visibility key of the nearest triangle of each pixel, and the work list of blocks of large triangles."""
 
     nearest: wp.array3d[wp.uint64]
     """(kept, row, column): key of the nearest triangle: depth's float32 bits, body, triangle; `kept` is the view's `Damage.kept_row`."""

@@ -24,9 +24,7 @@ _SEGMENT_BITS = wp.constant(8)
 
 @wp.struct
 class PathQueues:
-    """Wavefront queues of the paths that go on after a bounce, by region and stage: lengths, slots of the queued paths (double-buffered),
-    and paths packed into records. Scratch.
-    """
+    """Wavefront queues of the paths that go on after a bounce, by region and stage. Scratch."""
 
     count: wp.array3d[int]
     """(queue_view, region, stage): length of a queue. Stage s holds paths with `Path.bounce` = s + 1."""
