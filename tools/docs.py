@@ -90,11 +90,6 @@ def _allowed(item: Setting) -> str:
     return f"{interval} {item.unit}".rstrip() + (" or distribution" if isinstance(item.default, Distribution) else "")
 
 
-def figures_reference() -> str:
-    """The README of the tools with its tables of figures; the rest is as committed. Raises KeyError for a table without results."""
-    return _with_results(FIGURES, figures_tables(read_runs()))
-
-
 def photographs_reference() -> str:
     """The README of the report on photographs with its table of figures; the rest is as committed."""
     runs = {name: run for name, run in read_runs().items() if name not in STUDIES}
@@ -109,7 +104,7 @@ def _with_results(path: Path, tables: Mapping[str, str]) -> str:
 
 REFERENCES: dict[Path, Callable[[], str]] = {
     SETTINGS_REFERENCE: settings_reference,
-    FIGURES: figures_reference,
+    FIGURES: lambda: _with_results(FIGURES, figures_tables(read_runs())),
     PHOTOGRAPHS: photographs_reference,
 }
 """File -> its content with generated tables."""

@@ -48,8 +48,7 @@ class _Descriptor(io.FileIO):
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[_Descriptor]:
-    """Make the standard streams safe, and restore them; the value has the `fault` of the standard output. Streams that the caller has
-    replaced are left alone."""
+    """Make the standard streams safe, and restore them; the value has the standard output's `fault`. Replaced ones are left alone."""
     open_standard_descriptors()
     before, output = (sys.stdout, sys.stderr), _Descriptor(1, raises=True)
     if sys.stdout is sys.__stdout__:

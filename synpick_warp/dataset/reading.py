@@ -232,8 +232,7 @@ class DataSet(Mapping[int, Episode]):
 
     @cached_property
     def config(self) -> Config:
-        """All settings of the bake. Raises ConfigError if they are missing, or this version cannot read them, and DatasetError if the data
-        set is from another source."""
+        """All settings of the bake. Raises ConfigError if they are missing or unreadable, and DatasetError if others made the data set."""
         if self.found is not None:
             raise DatasetError(f"{self.folder} has no settings: it is from another source than synpick-warp bake")
         from synpick_warp.configs.files.load import load_config

@@ -60,8 +60,7 @@ class PickingEnvironment:
     def reset(
         self, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin episodes in all environments, or after the first reset in those that `options` choose; returns the observation of all, and
-        info.
+        """Begin episodes in all environments, or after the first in those that `options` choose; returns the observation of all, and info.
 
         `seed` is that of environment 0, the others get `seed` + 1 and so on; or a sequence of one for each, of which None continue with
         their next episodes, as all do by default. Options: "reset_mask" (environment) bool or "env_idx", the environments to reset;
@@ -258,7 +257,8 @@ class ArrayExporter:
         """Convert an array of the host: to the device, or for backend "numpy" as it is."""
         if self.backend == env_settings.NUMPY:
             return values
-        return self._export(wp.array(np.ascontiguousarray(values), dtype=_scalar(values.dtype), device=self.device))
+        scalar = wp.bool if values.dtype.kind == "b" else wp.dtype_from_numpy(values.dtype)
+        return self._export(wp.array(np.ascontiguousarray(values), dtype=scalar, device=self.device))
 
     def _export(self, array: wp.array) -> Any:
         """Convert a device array that nothing else refers to; for PyTorch on a GPU, its content is complete on all streams."""
@@ -273,8 +273,3 @@ def _flatten_vectors(array: wp.array) -> wp.array:
     """View of a contiguous array of vectors as scalars, with their components as the last dimension; valid as long as the array."""
     scalar, length = array.dtype._wp_scalar_type_, array.dtype._length_
     return wp.array(ptr=array.ptr, dtype=scalar, shape=(*array.shape, length), device=array.device, copy=False)
-
-
-def _scalar(dtype: np.dtype) -> Any:
-    """Warp scalar type of a NumPy type."""
-    return wp.bool if dtype.kind == "b" else wp.dtype_from_numpy(dtype)

@@ -26,7 +26,8 @@ class PickingVectorEnv(VectorEnv):
         choice = environment.choice
         self.environment, self.num_envs = environment, choice.num_envs
         self.autoreset_mode = AutoresetMode[choice.autoreset.upper()]
-        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": _frames_per_second(environment)}
+        frame_rate = 1.0 / environment.worlds.simulation.config.physics.tick_time
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": [], "render_fps": frame_rate}
         self.single_observation_space = observation_space(choice, environment)
         self.single_action_space = action_space(choice, *environment.bounds)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -90,8 +91,3 @@ def action_space(choice: EnvironmentChoice, low: np.ndarray, high: np.ndarray) -
         ends = [np.append(low, (-1.0, -1.0, 0.0)), np.append(high, (1.0, 1.0, 1.0))]
         return Box(*(np.array(end, np.float32) for end in ends), shape=(ACTION_SIZES[POINT],), dtype=np.float32)
     return Box(-1.0, 1.0, (COMMAND,), np.float32)
-
-
-def _frames_per_second(environment: PickingEnvironment) -> float:
-    """`render_fps` of the metadata: ticks per second of simulated time."""
-    return 1.0 / environment.worlds.simulation.config.physics.tick_time

@@ -96,8 +96,7 @@ def table_schema(columns: Sequence[PickColumn], kind: np.dtype) -> pa.Schema:
 
 
 def check_schema(schema: pa.Schema, columns: Sequence[PickColumn]) -> np.dtype:
-    """Structured dtype of a stored table's rows; raises ValueError if a column is missing, unknown, twice there, or of another type than
-    that of `columns`."""
+    """Structured dtype of a stored table's rows; raises ValueError unless it has each of `columns` once, with its type."""
     sizes = [item.type.list_size for item in schema if item.name == "visible" and pa.types.is_fixed_size_list(item.type)]
     kind = row_type(columns, *sizes[:1])
     known = table_schema(columns, kind)

@@ -191,18 +191,15 @@ def check_episodes(count: int, planned: int) -> None:
         )
 
 
-def is_shortage(error: BaseException) -> bool:
-    """Whether an error says that memory ran out: Python's own, that of Warp's allocators, or CUDA's error 2 (graphs, modules)."""
-    return isinstance(error, MemoryError) or str(error).startswith("Failed to allocate") or "out of memory" in str(error).lower()
-
-
 @contextlib.contextmanager
 def explain_shortage(config: Config) -> Iterator[None]:
     """Replace an out-of-memory error of the enclosed code by a ConfigError that names the setting to lower."""
     try:
         yield
-    except Exception as error:  # Warp raises plain exceptions, too.
-        if isinstance(error, SynpickError) or not is_shortage(error):
+    except Exception as error:
+        # Python's own error, that of Warp's allocators, and CUDA's error 2 (graphs, modules); Warp raises plain exceptions, too.
+        is_shortage = isinstance(error, MemoryError) or str(error).startswith("Failed to allocate") or "out of memory" in str(error).lower()
+        if isinstance(error, SynpickError) or not is_shortage:
             raise
         largest = max(plan_memory(config, pick_device(config.bake.device)), key=lambda term: term.size)
         raise ConfigError(
@@ -254,8 +251,7 @@ def _trials(sizes: dict[str, int], rows: int, physics: Physics, device: wp.Devic
 def _images(
     arrays: list[DryArray], sizes: dict[str, int], cameras: int, layers: tuple[str, ...], host: TransferSettings | None, device: wp.Device
 ) -> Iterator[Term]:
-    """Scratch of the renderer, and images of a batch of views, with extents by `view_sizes`; `host`: what is copied to the host, None:
-    nothing is written."""
+    """Scratch of the renderer and images of a batch of views, by `view_sizes`; `host`: what is copied to the host, None: nothing."""
     views, size = sizes["view"], f"{sizes['column']:,}x{sizes['row']:,} px"
     copied: list[Any] = []
     with dry_run() as images:

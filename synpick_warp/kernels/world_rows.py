@@ -120,8 +120,7 @@ def clear_idle_rows_kernel(
 ):
     """Set type and parent of constraint rows without impulse to -1, none: they start nothing, and may be left from any earlier step.
 
-    `impulses`, `row_type` and `row_parent` are the first words of a family of constraint rows in a record. Launched over row, constraint
-    row.
+    `impulses`, `row_type` and `row_parent` are the first words of constraint rows in a record. Launched over row, constraint row.
     """
     row, index = wp.tid()
     if world[row] >= 0 and record_inout[row, impulses + index] == wp.uint32(0):

@@ -197,8 +197,7 @@ def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count:
 def _is_bright(radiance: np.ndarray, direction: np.ndarray) -> bool:
     """Whether a map is bright near a direction, so that the sun there is plausible.
 
-    Otherwise the set's sun is ignored and the map's brightest place is used: shadows must agree with reflections, and in some sets v
-    points up.
+    Otherwise the set's sun is ignored and the map's brightest place is used: shadows must agree with reflections; in some sets v points up.
     """
     height = min(radiance.shape[0], SUN_ROWS)
     bright = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA).sum(axis=2)

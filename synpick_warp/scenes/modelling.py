@@ -157,8 +157,7 @@ def face(outline: np.ndarray, *holes: np.ndarray) -> Patch:
 def strips(ring: np.ndarray, *, below: bool = False) -> Patch:
     """Close a ring (n, 3) as `cap` does, by strips along x: their bounding boxes overlap less than a fan's, so that rays are faster.
 
-    The ring must be symmetric in x, with its first point and the opposite one at midpoints of sides along x, as `rounded_rectangle`
-    makes it.
+    The ring must be symmetric in x, with its first point and the opposite one in the middle of sides, as `rounded_rectangle` makes it.
     """
     half = len(ring) // 2
     left, right = ring[: half + 1], ring[-np.arange(half + 1)]

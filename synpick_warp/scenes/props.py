@@ -36,8 +36,7 @@ METALLIC, ROUGHNESS = 0.0, 0.5
 
 
 def make_props(rows: Sequence[PropRow], bins: Sequence[BinSizes], report: Callable[[str], None] = ignore) -> tuple[Prop, ...]:
-    """Read or make props. `report`: called with remarks on their files. Raises ConfigError: a mesh or pose cannot be used, or what collides
-    fills a bin."""
+    """Read or make props. `report`: called with remarks. Raises ConfigError: a mesh or pose is unusable, or what collides fills a bin."""
     return tuple(_make_prop(row, bins, report) for row in rows)
 
 

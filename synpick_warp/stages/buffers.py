@@ -11,7 +11,7 @@ from synpick_warp.kernels.render.visibility.masks import InstanceMasks
 from synpick_warp.kernels.state import FramePoses, Frames, Snapshots
 from synpick_warp.stages.arrays import allocate, array_group, bundle, device_array
 from synpick_warp.views.frames import most_words
-from synpick_warp.views.layers import LAYER_TABLE, Layer
+from synpick_warp.views.layers import LAYER_TABLE
 
 FIXTURES = ("tote", "finger", "cup")
 """Order of the dimension "fixture"; finger: the gripper shaft."""
@@ -86,11 +86,6 @@ def masks_of(buffers: ViewBuffers | None) -> Any:
     return masks
 
 
-def _declare_layer(layer: Layer) -> Any:
-    """Declaration of the device array that a layer is rendered to."""
-    return device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit)
-
-
 _LAYER_DTYPES = {
     ("uint8", 1): wp.uint8,
     ("uint8", 3): wp.vec3ub,
@@ -99,7 +94,10 @@ _LAYER_DTYPES = {
     ("float32", 2): wp.vec2,
     ("float32", 3): wp.vec3,
 }
-_LAYER_FIELDS = [(name, wp.array, _declare_layer(layer)) for name, layer in LAYER_TABLE.loadable()]
+_LAYER_FIELDS = [
+    (name, wp.array, device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit))
+    for name, layer in LAYER_TABLE.loadable()
+]
 
 
 class LayerBuffers(make_dataclass("LayerArrays", _LAYER_FIELDS, frozen=True, eq=False)):

@@ -75,8 +75,7 @@ class JpegEncoder:
         self._samples = wp.array(ptr=rows.ptr, dtype=wp.uint8, shape=shape, device=device)
 
     def encode(self, image: wp.array, quality: wp.array, count: int, out: JpegBuffers) -> None:
-        """Encode the first `count` views. `image`: RGB images (view, row, column) vec3ub. `quality`: 1 to 100 (view) int32. `count`: views
-        in use. `out`: written."""
+        """Encode the first `count` views. `image`: RGB (view, row, column) vec3ub. `quality`: 1 to 100 (view) int32. `out`: written."""
         scratch, data = self.scratch, self.scratch.bundle
         blocks, intervals, lanes = ((count, *array.shape[1:]) for array in (scratch.nonzero, scratch.coded, scratch.stuffing))
         _, rows, columns = self._samples.shape

@@ -55,8 +55,7 @@ class TickLoop:
         """Allocate the queue.
 
         `max_lead` is the maximum number of ticks by which physics may ever be ahead; None: by `queue_lead`. `more` is called before a tick
-        begins while worlds are idle: further episodes, or none at present. True: all worlds are idle in the tick last taken, and it may
-        wait."""
+        begins while worlds are idle: further episodes, or none now. True: all worlds are idle in the tick last taken, and it may wait."""
         self.simulation, self.device = simulation, simulation.device
         self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if max_lead is None else max_lead
         self.lead = min(1, self.max_lead)
@@ -226,8 +225,7 @@ class TickQueue:
 
     @collection_paused()
     def __init__(self, record: TickRecord, slots: int) -> None:
-        """Allocate the ring. `record`: record of the simulation, which each tick overwrites. `slots`: capacity [ticks], including the tick
-        being rendered."""
+        """Allocate the ring. `record`: of the simulation, overwritten each tick. `slots`: capacity [ticks], with that being rendered."""
         self.slots = slots
         self._device = device = record.snapshot.live.device
         self._source = [getattr(record.snapshot, item.name) for item in fields(Snapshot)]

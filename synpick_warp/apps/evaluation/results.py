@@ -173,8 +173,7 @@ def _check_duplicates(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarra
 
 
 def check_results(results: ResultFile, truth: Truth, object_ids: Collection[int]) -> None:
-    """Raise ResultError, in one line with the line's number, unless scenes, images and objects of estimates exist in a data set, and
-    lengths are in millimetres."""
+    """Raise ResultError, with the line's number, unless scenes, images and objects of estimates exist, and lengths are in millimetres."""
     poses = results.poses
     scenes = np.unique(truth.images[:, 0])
     _refuse_unknown(results, poses.scene, scenes, "scene")

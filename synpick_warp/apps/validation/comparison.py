@@ -330,11 +330,11 @@ def best_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int]:
     return int(right[nearest]), int(down[nearest])
 
 
-def moved(mask: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Mask shifted right by `columns` and down by `rows`; pixels that leave the window are lost."""
-    height, width = mask.shape
-    result = np.zeros_like(mask)
+def moved(image: np.ndarray, columns: int, rows: int, fill: float = 0.0) -> np.ndarray:
+    """Image shifted right by `columns` and down by `rows`; pixels that leave the window are lost, `fill` is where none have moved to."""
+    height, width = image.shape
+    result = np.full_like(image, fill)
     target = slice(max(0, rows), min(height, height + rows)), slice(max(0, columns), min(width, width + columns))
     source = slice(max(0, -rows), min(height, height - rows)), slice(max(0, -columns), min(width, width - columns))
-    result[target] = mask[source]
+    result[target] = image[source]
     return result

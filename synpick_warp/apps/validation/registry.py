@@ -113,8 +113,7 @@ def apply_rules(
 ) -> Iterator[Violation]:
     """Check a subject by all rules for its type; yields violations. A rule that meets unreadable data ends with a violation about it.
 
-    Deviations up to a tolerance are accepted, and (rule, obj_id, value) of each is appended to `deviations`; None: each rule has its own
-    bound.
+    Deviations up to a tolerance are accepted, and (rule, obj_id, value) of each appended to `deviations`; None: each rule has its bound.
     """
     for item in load_rules().values():
         if item.subject is not type(subject):

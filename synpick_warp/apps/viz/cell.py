@@ -1,5 +1,4 @@
-"""Pictures of a cell before anything is simulated: bins, gripper and objects on the floor, from outside with the frusta of the cameras, and
-from each camera."""
+"""Pictures of a cell before simulation: bins, gripper and objects on the floor, from outside with camera frusta, and from each camera."""
 
 import colorsys
 import math

@@ -106,8 +106,7 @@ def _open_view(dataset: Path, scenes: SceneIndex, attempt: explain_record.SeenAt
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """Map a pixel (column, row) of the perception image to the colour image, by width and height of both [px]; in both, integers are pixel
-    centres.
+    """Map a pixel (column, row) of the perception image to the colour image, by width and height of both [px]; integers are pixel centres.
 
     Both images have the same camera and horizontal field of view, and the same point in the middle; their aspect ratios may differ.
     """

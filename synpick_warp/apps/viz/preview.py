@@ -333,8 +333,7 @@ class Box(NamedTuple):
 
 
 def place_labels(boxes: Sequence[Box], sizes: Sequence[tuple[int, int]], area: tuple[int, int]) -> list[Box | None]:
-    """Place a label for each box so that none overlaps another: in the box, else at it, else as near as there is room; None: there is no
-    room left.
+    """Place a label for each box so that none overlaps another: in the box, else at it, else as near as there is room; None: no room.
 
     Small boxes come first, as they have the fewest places. `sizes` and `area` are width and height of each label, and of the image [px].
     """

@@ -1,6 +1,6 @@
 """Settings of objects, and part counts of an episode's bin (`arrangement.counts`)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import hypot
@@ -192,7 +192,9 @@ COUNTS = "a table of parts with their numbers, or least and largest numbers: { b
 def parse_counts(value: Any) -> Any:
     """Lists [part, least, most] of a table; such lists, which config.toml has, stay as they are. Raises ValueError: it is none, a number is
     not allowed, or a part comes twice."""
-    rows = [[name, *_limits(number)] for name, number in value.items()] if isinstance(value, Mapping) else value
+    rows = value
+    if isinstance(value, Mapping):
+        rows = [[name, *(number if isinstance(number, list | tuple) else (number, number))] for name, number in value.items()]
     if not isinstance(rows, list | tuple) or not all(isinstance(row, list | tuple) and len(row) == 3 for row in rows):
         raise ValueError(COUNTS)
     if not all(isinstance(row[0], str) and row[0] and all(type(number) is int for number in row[1:]) for row in rows):
@@ -202,11 +204,6 @@ def parse_counts(value: Any) -> Any:
     if len({row[0] for row in rows}) < len(rows):
         raise ValueError("each part once")
     return rows
-
-
-def _limits(number: Any) -> Sequence[Any]:
-    """Least and largest number; a single one is both."""
-    return number if isinstance(number, list | tuple) else (number, number)
 
 
 def most_objects(counts: Counts) -> int:

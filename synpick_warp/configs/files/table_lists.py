@@ -14,7 +14,7 @@ from typing import Any
 
 from synpick_warp.configs.check import check_value, is_table
 from synpick_warp.configs.episodes.randomize import Distribution
-from synpick_warp.configs.fields import INT32_MAX, Setting, settings_of
+from synpick_warp.configs.fields import INT32_MAX, settings_of
 from synpick_warp.configs.schema import Split
 from synpick_warp.errors import ConfigError, format_value, shorten, suggest
 
@@ -37,12 +37,11 @@ def read_table(key: str, kind: type[Any], content: object, source: str) -> Any:
     for name in required:
         if name not in content:
             raise ConfigError(f"{key} has no {name} {source}; a row needs {' and '.join(required)}")
-    return kind(**{name: _read_setting(f"{key}.{name}", value, known[name], source) for name, value in content.items()})
-
-
-def _read_setting(key: str, value: object, item: Setting, source: str) -> Any:
-    """Validated value of a setting, which may be a table."""
-    return read_table(key, item.kind, value, source) if is_table(item.kind) else check_value(key, value, item, source)
+    values = {}
+    for name, value in content.items():
+        inner, item = f"{key}.{name}", known[name]
+        values[name] = read_table(inner, item.kind, value, source) if is_table(item.kind) else check_value(inner, value, item, source)
+    return kind(**values)
 
 
 def change_rows(key: str, kind: type[Any], rows: tuple[Any, ...], changes: Mapping[str, Any], source: str) -> tuple[Any, ...]:
@@ -105,8 +104,7 @@ def check_setting(name: str, key: str, value: Any, source: str) -> Any:
 
 
 def override_table(tables: Tables, path: str, value: Any, source: str) -> Tables:
-    """Add a setting, given as NAME.key, to the tables. Raises ConfigError if there is no such split or setting, or the value is not
-    allowed."""
+    """Add a setting, NAME.key, to the tables. Raises ConfigError if there is no such split or setting, or the value is not allowed."""
     name, _, key = path.partition(".")
     if name not in tables:
         known = f"splits: {', '.join(tables)}" if tables else "the settings have none"

@@ -134,7 +134,10 @@ class Layout:
             raise NoLayoutError(f"there is no folder {folder}; name the folder of a BOP data set")
         self.root = folder
         self.listing = list_folder(self.root)
-        self._refuse_parts(folder)
+        if any(_ANNOTATION.fullmatch(name) for name in self.listing.files):
+            raise DatasetError(f"{folder} is a scene; name the data set, two folders above")
+        if _has_scenes(self.listing):
+            raise DatasetError(f"{folder} is a split; name the data set, the folder above")
         self.models = {name: self.listing.enter(name) for name in sorted(filter(MODELS.fullmatch, self.listing.folders))}
         others = sorted(name for name in self.listing.folders if not name.startswith(".") and name not in self.models)
         listings = {name: self.listing.enter(name) for name in others}
@@ -146,13 +149,6 @@ class Layout:
             raise NoLayoutError(
                 f"{folder} is not a BOP data set: it has no split (train_pbr, test, ...) of scenes; name the folder that contains them"
             )
-
-    def _refuse_parts(self, folder: Path) -> None:
-        """Refuse a scene or a split instead of a data set."""
-        if any(_ANNOTATION.fullmatch(name) for name in self.listing.files):
-            raise DatasetError(f"{folder} is a scene; name the data set, two folders above")
-        if _has_scenes(self.listing):
-            raise DatasetError(f"{folder} is a split; name the data set, the folder above")
 
     @property
     def ours(self) -> bool:

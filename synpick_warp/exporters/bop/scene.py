@@ -268,8 +268,7 @@ def _make_annotations(view: EncodedView, masks: list[Masks], settings: ViewSetti
 
 
 def commit_scenes(scenes: tuple[tuple[Path, Path], ...], out: Path, settings: tuple[SceneSettings, ...]) -> None:
-    """Task: complete an episode's scenes, rename each from its staging folder to its place in the data set, (from, to), and spool the
-    checksums.
+    """Task: complete an episode's scenes, rename each from its staging folder to its place, (from, to), and spool the checksums.
 
     JSON files and folder entries are synced to disk before the rename. Images are at least in the page cache: they survive the end
     of this process, and a power cut once the data set is finished.

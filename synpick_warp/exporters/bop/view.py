@@ -305,10 +305,9 @@ def _pose_keys(matrix: np.ndarray, rotation: np.ndarray, translation: np.ndarray
 
 
 def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
-    """Collect the inputs of the task that writes a view. Returns colour (image or file), depth (image, data of its file, or nothing if
-    neither files nor keypoints need it), and two mask sources, of visible and of amodal masks: the device's run boundaries of `instance`
-    and of the masks, or, if a list is incomplete or larger, the image cropped to the objects, and the words of the masks. And the ground
-    truth."""
+    """Collect the inputs of the task that writes a view. Returns colour (image or file), depth (image, data of its file, or nothing if none
+    needs it), and two mask sources, of visible and of amodal masks: the device's run boundaries of `instance` and of the masks, or, if a
+    list is incomplete or larger, the image cropped to the objects, and the words of the masks. And the ground truth."""
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
     width, height = settings.resolution

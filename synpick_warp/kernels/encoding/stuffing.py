@@ -70,8 +70,7 @@ def count_stuffing_kernel(data_inout: JpegData):
 def place_intervals_kernel(header_bytes: int, data_inout: JpegData, files_out: JpegFiles):
     """Place the restart intervals of each view in its file: prefix sum over `interval_size`.
 
-    Writes `interval_begin`, and `jpeg_size`: above the capacity if the file does not fit, or if a bit string did not fit its slot. Launched
-    over view.
+    Writes `interval_begin`, and `jpeg_size`: above the capacity if the file, or a bit string its slot, does not fit. Launched over view.
     """
     view = wp.tid()
     begin = int(header_bytes)

@@ -24,8 +24,7 @@ VELOCITY_LIMITS = wp.constant(5)
 
 @wp.struct
 class JointRowData:
-    """Constraint rows that are solved in generalized coordinates: the gripper's joint limits (`world_...`) and the free bodies' rows
-    (`mf_...`).
+    """Constraint rows that are solved in generalized coordinates: joint limits of the gripper (`world_...`) and free bodies (`mf_...`).
 
     Members are arrays of SolverSteel under the names of its parameters: number and type of rows, Jacobians J, responses Y = M⁻¹Jᵀ,
     right-hand sides, impulses and friction coefficients. `mf` is matrix-free: rows of free bodies, first contacts, up to

@@ -75,8 +75,7 @@ def next_direction(neighbours: int, start: int, turn: int) -> int:
 
 @wp.kernel
 def trace_contours_kernel(segments_inout: Segments, views: Views, width: int, observation_out: Observations):
-    """Border following (Moore neighbours): pixels of the outer contour of each instance's largest component, their number, and its
-    centroid.
+    """Border following (Moore neighbours): outer contour of each instance's largest component, its length and centroid.
 
     From the previous pixel, turn counter-clockwise to the next pixel of the component. A contour begins at the component's smallest index,
     which is the leftmost of its topmost pixels, and ends when the first step would repeat. Every step reads one patch word. A contour

@@ -90,8 +90,7 @@ def smooth_normal_kernel(
 
 @wp.kernel
 def frame_grasp_kernel(pick: PickData, plan_inout: Plans, observation: Observations, gbuffer: GBuffer, views: Views):
-    """Grasp pose of each target: point c + Rᵀ (d · ray) with planar depth d of the grasp pixel; unit normal within the tilt limit; yaw,
-    tilt.
+    """Grasp pose of each target: point c + Rᵀ (d · ray) with planar depth d at its pixel; unit normal within the tilt limit; yaw, tilt.
 
     Worlds without a target keep their values. Launched over view.
     """

@@ -98,8 +98,7 @@ def measure_points_kernel(
 ):
     """Visible pixels, visible fraction Σ (z / fx) (z / fy) / expected area, pole p, and distances to the contour at p, c and (p + c) / 2.
 
-    c is the centroid. Instances that are not visible get 0 pixels, fraction 0, distances 0, and points (-1, -1). Launched over view,
-    instance.
+    c is the centroid. Invisible instances get 0 pixels, fraction 0, distances 0, and points (-1, -1). Launched over view, instance.
     """
     view, instance = wp.tid()
     world = views.world[view]

@@ -142,8 +142,7 @@ def assign_slots(layout: LayoutData, catalog: CatalogData, state: Worlds, world:
 def draw_counted(catalog: CatalogData, key: wp.uint64, catalog_index: wp.array2d[int], world: int) -> int:
     """Draw the number of each object, and their order (Fisher and Yates, 1938); returns the number of objects.
 
-    Samples 0 to E - 1 of the stream are the numbers, uniform from least to most, of E objects; sample E + i swaps instance i with one up
-    to it.
+    Samples 0 to E - 1 are the numbers, uniform from least to most, of E objects; sample E + i swaps instance i with one up to it.
     """
     count = int(0)
     for entry in range(catalog.count):

@@ -32,8 +32,7 @@ def drop_pose(
 ) -> wp.transform:
     """Sample a drop pose at a height above the floor [m]: uniform rotation, position uniform over a fraction `spread` of an area.
 
-    The area, about `center` in the frame of the world's bin, is reduced by the object's bounding radius [m]; `index` counts the drops of
-    the stream.
+    The area, about `center` in the frame of the world's bin, is reduced by the bounding radius [m]; `index` counts the drops of the stream.
     """
     first = index * DROP_SAMPLES
     x = (2.0 * uniform(key, first) - 1.0) * spread * wp.max(0.0, half[0] - radius) + center[0]
@@ -203,8 +202,7 @@ def stands(key: wp.uint64, instance: int, upright: float) -> bool:
 
 @wp.kernel
 def raise_objects_kernel(seed: wp.uint64, layout: LayoutData, upright: float, state: Worlds, motion_inout: Motion):
-    """Turn a fraction `upright` of the objects that have just been dropped so that their z axis points upwards: yaw = 2π u_1 if u_0 <
-    upright.
+    """Turn a fraction `upright` of the objects just dropped so that their z axis points upwards: yaw = 2π u_1 if u_0 < upright.
 
     The samples u are those of the stream (seed, episode, arrangement, Stream.UPRIGHT), two an instance. Launched over world, instance.
     """

@@ -101,9 +101,8 @@ def redrop_objects_kernel(
 ):
     """Drop objects again that left the bin or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
-    They are stacked one above the other, with layers above all other objects, and the guide walls return. `progress` holds ticks since the
-    drop, ticks at rest, re-drops, and whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched
-    over world.
+    They are stacked one above the other, above all other objects, and the guide walls return. `progress` holds ticks since the drop, ticks
+    at rest, re-drops, and whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration. Launched over world.
     """
     world = wp.tid()
     if state_inout.phase[world] != Phase.SETTLE:

@@ -58,8 +58,7 @@ def link_frames_kernel(catalog: CatalogData, snapshot_inout: Snapshots, last_ino
     """Copy the last tick's poses into this snapshot as its previous frame, for optical and scene flow, then store this tick's; bodies that
     moved by less than HOLD since then keep them.
 
-    `follows` is 1 if the last tick was the preceding frame of the same episode; the first frame of an episode follows none. Launched over
-    world.
+    `follows` is 1 if the last tick was the preceding frame of the same episode; its first frame follows none. Launched over world.
     """
     world = wp.tid()
     follows = int(0)

@@ -84,13 +84,12 @@ class _Facets:
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     """Approximate the convex hull of points by an intersection of half-spaces, of the hull's volume.
 
-    A hull of no more vertices, whose facets already differ by 4 degrees, is kept. Otherwise its triangles are clustered by their
-    normals, and each cluster gives a half-space. Those that cut off most are selected greedily, and moved inward, by at most the mean gap
-    between each and the hull, until the polyhedron has the hull's volume. Last, the polyhedron is scaled about its centroid to exactly this
-    volume, by little unless `max_vertices` is small; this also moves flat sides. Turned points give a turned result, except for the
-    half-spaces of the smallest gain: the threshold is relative to the axis-aligned bounding box. If Qhull fails on the half-spaces, which
-    no hull thicker than a millionth of its diameter has shown, the result is the hull of greedily selected points, with less volume and any
-    angles.
+    A hull of no more vertices, whose facets already differ by 4 degrees, is kept. Otherwise its triangles are clustered by their normals,
+    and each cluster gives a half-space. Those that cut off most are selected greedily, and moved inward, by at most the mean gap between
+    each and the hull, until the polyhedron has the hull's volume. Last, the polyhedron is scaled about its centroid to exactly this volume,
+    by little unless `max_vertices` is small; this also moves flat sides. Turned points give a turned result, except for the half-spaces of
+    the smallest gain: the threshold is relative to the axis-aligned bounding box. If Qhull fails on the half-spaces, which no hull thicker
+    than a millionth of its diameter has shown, the result is the hull of greedily selected points, with less volume.
 
     Args:
         points: (N, 3) [m].
@@ -214,8 +213,7 @@ def _fit_volume(facets: _Facets, chosen: Sequence[int], polyhedron: ConvexHull, 
     """Vertices of the intersection, given as a `polyhedron`, whose half-spaces are moved inward, by a common fraction of their mean gaps,
     to the given volume.
 
-    The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. Scaling about the centroid does the
-    rest.
+    The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. Scaling does the rest.
     """
     moved: dict[float, ConvexHull | None] = {0.0: polyhedron}
 

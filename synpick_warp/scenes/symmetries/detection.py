@@ -320,8 +320,7 @@ def find_element(elements: np.ndarray, rotation: np.ndarray, within: float = _EQ
 
 
 def close_transforms(matrices: Sequence[np.ndarray]) -> np.ndarray | None:
-    """The rigid 4 x 4 matrices as they are, and all of their products that have other rotations; without the identity. None if they are
-    more than MAX_ELEMENTS."""
+    """The rigid 4 x 4 matrices as they are, and all products with other rotations; without the identity. None: more than MAX_ELEMENTS."""
     closed = _add_products(np.array([np.eye(4), *matrices]), matrices, _EQUAL)
     return None if closed is None else closed[1:]
 
@@ -379,9 +378,8 @@ def add_symmetries(
     info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str
 ) -> tuple[FileModelInfo, list[str]]:
     """Add the symmetries of the object's row to its entry, or detect them if neither has any and the settings ask for it. `info`: entry of
-    models_info.json; without symmetries if there is none. Returns the entry with symmetries, and lines on what was found, or on what is
-    declared and does not hold. Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or the declared ones generate
-    too many."""
+    models_info.json; without symmetries if there is none. Returns the entry with symmetries, and lines on what was found, or on declared
+    ones that do not hold. Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or they generate too many."""
     if row is not None and (row.symmetries_discrete or row.symmetries_continuous):
         return _declared(info, found, diameter, row, objects.strict, origin)
     if objects.symmetries != DETECT or info.symmetries_discrete or info.symmetries_continuous:

@@ -338,8 +338,7 @@ class PileBank:
 
     def fetch(self, episodes: Sequence[int], ahead: Sequence[int] = ()) -> list[int]:
         """Look up the rows of episodes; settles the piles that the bank lacks, whereby the worlds' current states are lost. Those of
-        `ahead` are prefetched: settled by worlds that would otherwise be idle. Raises StateError if the bank is too small, or a pile does
-        not come to rest."""
+        `ahead` are prefetched by idle worlds. Raises StateError if the bank is too small, or a pile does not come to rest."""
         missing = [episode for episode in dict.fromkeys(episodes) if episode not in self.rows]
         if missing:
             worlds = self.simulation.layout.worlds

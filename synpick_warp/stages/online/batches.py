@@ -315,8 +315,7 @@ class BatchRing:
     """Renders batches of views into a ring of slots; `render` only launches kernels."""
 
     def __init__(self, group: CameraGroup, layers: tuple[str, ...], depth_scale: float) -> None:
-        """Allocate the slots. `group`: cameras and their renderer. `layers`: names of the layers to render. `depth_scale`: millimetres per
-        count of the depth image."""
+        """Allocate the slots. `group`: cameras and their renderer. `layers`: their names. `depth_scale`: millimetres per count."""
         renderer, sizes = group.renderer, group.sizes
         self.group, self.renderer, self.device, self.depth_scale = group, renderer, renderer.scene.device, depth_scale
         self.views, self.instances = sizes["view"], sizes["instance"]

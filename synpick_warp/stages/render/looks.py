@@ -91,7 +91,8 @@ def build_look_table(looks: Looks, first_texture: int, device: Any) -> Any:
     for place, (distribution, low, high) in drawn.items():
         distributions[int(place[0]), int(place[1])] = _pack(distribution, low, high, len(choices))
         if distribution.kind == CHOICE:
-            choices += _pack_choice(distribution)
+            weights = np.array(distribution.weights or [1.0] * len(distribution.values))
+            choices += list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
     table = LookTable()
     table.distribution = wp.array(distributions, dtype=LookDistribution, device=device)
     table.choice = wp.array(np.array(choices or [np.zeros(4)], np.float32), dtype=wp.vec4, device=device)
@@ -114,12 +115,6 @@ def _pack(distribution: Distribution, low: float, high: float, first: int) -> An
         values = np.log(values) if distribution.kind == LOG_UNIFORM else values
         row["a"], row["b"] = values[0], values[-1]
     return row
-
-
-def _pack_choice(distribution: Distribution) -> list[np.ndarray]:
-    """Rows of `LookTable.choice` of a distribution."""
-    weights = np.array(distribution.weights or [1.0] * len(distribution.values))
-    return list(np.column_stack([_vectors(distribution), np.cumsum(weights) / weights.sum()]))
 
 
 def materials_of_view(instances: int, background: bool = True) -> int:

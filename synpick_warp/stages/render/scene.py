@@ -183,11 +183,6 @@ def pack_details(normals: np.ndarray, values: np.ndarray) -> np.ndarray:
     return packed | np.rint(metallic * int(METALLIC_MASK)).astype(np.uint32) << int(METALLIC_SHIFT)
 
 
-def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """Expand vertex values (V, C) to triangle corners (3 F, C), so that a triangle's values are contiguous."""
-    return values[mesh.faces].reshape(-1, values.shape[1])
-
-
 def face_normals(mesh: TriangleMesh) -> np.ndarray:
     """Unit normals of triangles by their winding (F, 3) float32; zero for degenerate ones."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -233,7 +228,7 @@ def build_meshes(
     # Enlarged by 1e-6, so that rounding never lets a bounding sphere exclude its own mesh.
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
     meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
-    meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
+    meshes.corner = wp.array(np.concatenate([shape.vertices[shape.faces].reshape(-1, 3) for shape in shapes]), dtype=wp.vec3, device=device)
     meshes.face_normal = wp.array(np.concatenate([face_normals(shape) for shape in shapes]), dtype=wp.vec3, device=device)
     meshes.entries = entries
     meshes.interior.half = wp.vec3(-1.0, -1.0, -1.0)
@@ -367,8 +362,7 @@ def rays_per_lamp(lamps: int) -> int:
 def build_lights(
     maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device, lamps: int = int(MAX_LAMPS)
 ) -> Any:
-    """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo, `lamps` the maximum number
-    of lamps of a map."""
+    """The struct `Lights`; `exposure` multiplies the automatic one, `ground` is the table's linear albedo, `lamps` the most of a map."""
     tables = map_in_threads(lambda light: precompute_environment(light, ground, lamps), maps)
     lights = Lights()
     lights.maps = len(tables)

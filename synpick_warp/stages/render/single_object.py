@@ -20,8 +20,7 @@ IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camera], device: wp.Device) -> RenderScene:
-    """Scene of objects alone, enough to rasterize. `meshes`: the struct `Meshes`. `keep`: their owners. `cameras`: cameras of one image
-    size. `device`: device of the arrays."""
+    """Scene of objects alone, to rasterize. `meshes`: the struct `Meshes`. `keep`: their owners. `cameras`: cameras of one image size."""
     return replace(
         blank_scene(len(cameras), *cameras[0].resolution, device),
         meshes=meshes,

@@ -43,10 +43,6 @@ class BinaryBvh:
         """Mask of leaves (node) bool."""
         return self.children[:, 0] < 0
 
-    def has_one_triangle_leaves(self) -> bool:
-        """True if every leaf is one triangle."""
-        return bool((self.children[self.leaf, 0] - self.children[self.leaf, 1] == 1).all())
-
 
 @dataclass(frozen=True, eq=False)
 class BvhLevel:
@@ -69,7 +65,8 @@ def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
     node_count = triangle_count = 0
     for shape in shapes:
         binary, levels = build_levels(shape)
-        order = leaf_order(binary, levels)
+        leaves = np.concatenate([level.child[level.leaf] for level in levels])
+        order = binary.triangle[-1 - binary.children[leaves, 0]]
         nodes.append(encode_nodes(binary, levels, node_count, triangle_count))
         triangles.append(encode_triangles(shape, order))
         roots.append(node_count)
@@ -87,7 +84,8 @@ def build_levels(shape: TriangleMesh) -> tuple[BinaryBvh, list[BvhLevel]]:
     Raises CatalogError: even the balanced tree is too deep."""
     for constructor in ("sah", "median"):
         binary = build_binary_bvh(shape, constructor)
-        if binary.has_one_triangle_leaves():
+        leaves = binary.children[binary.leaf]
+        if (leaves[:, 0] - leaves[:, 1] == 1).all():  # Every leaf is one triangle.
             levels = collapse(binary)
             if needed_stack(levels) <= int(STACK_SIZE):
                 return binary, levels
@@ -137,12 +135,6 @@ def needed_stack(levels: list[BvhLevel]) -> int:
         more[level.inner] = below - 1
         below = int(WIDTH) + more.max(axis=1)
     return int(below[0])
-
-
-def leaf_order(binary: BinaryBvh, levels: list[BvhLevel]) -> np.ndarray:
-    """Triangle indices in leaf order (triangle) int32."""
-    leaves = np.concatenate([level.child[level.leaf] for level in levels])
-    return binary.triangle[-1 - binary.children[leaves, 0]]
 
 
 def encode_nodes(binary: BinaryBvh, levels: list[BvhLevel], first_node: int, first_triangle: int) -> np.ndarray:

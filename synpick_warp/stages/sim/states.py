@@ -215,8 +215,7 @@ class WorldStates:
         return {"version": np.array(VERSION)} | {key: np.array(value) for key, value in state.origin.items()} | arrays
 
     def from_host(self, arrays: Mapping[str, np.ndarray]) -> State:
-        """Copy a state of `to_host` to the device; raises StateError if it is of another version, of other objects, cell or capacities, or
-        as of `check_array`."""
+        """Copy a `to_host` state to a device; raises StateError if version, objects, cell or capacities differ, or as of `check_array`."""
         given = {name: str(arrays[name]) if name in arrays else "unknown" for name in ("version", *ORIGINS)}
         if given["version"] != str(VERSION):
             raise StateError(f"the state has version {given['version']}, but this release reads version {VERSION}")

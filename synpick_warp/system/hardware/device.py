@@ -90,8 +90,7 @@ def opening_context(device: wp.Device | None) -> Iterator[None]:
 def start_warp() -> None:
     """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept.
 
-    A kernel cache that cannot be written is replaced by a temporary one, with a note. Raises CacheError: there is no room for a temporary
-    one."""
+    A kernel cache that cannot be written is replaced by a temporary one, with a note. Raises CacheError: there is no room for one."""
     os.environ.setdefault(*_CONNECTIONS)  # CUDA reads it when it starts.
     wp.config.log_level = wp.LOG_WARNING
     wp.config.cuda_output = wp.config.cuda_output or "cubin"  # A new driver would compile PTX instead, one module after the other.

@@ -64,12 +64,8 @@ class KeptInterrupt:
         if self._is_leaving(frame):
             return
         if self._before is None:
-            self._before = signal.signal(signal.SIGALRM, self._retry)
+            self._before = signal.signal(signal.SIGALRM, lambda _, frame: self._raise(frame))
         signal.setitimer(signal.ITIMER_REAL, RETRY, RETRY)
-        self._raise(frame)
-
-    def _retry(self, _: int, frame: FrameType | None) -> None:
-        """Handler of the timer: raise again, if the interrupt was lost."""
         self._raise(frame)
 
     def _raise(self, frame: FrameType | None) -> None:

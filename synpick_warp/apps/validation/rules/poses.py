@@ -168,8 +168,7 @@ def _ray(item: Instance, matrix: np.ndarray) -> np.ndarray:
 
 
 def _overlap(item: Instance, other: Instance) -> float:
-    """Intersection over union of the mask of one instance and the silhouette of another; of visible masks, if there are no others, the
-    part of them in the silhouette."""
+    """Intersection over union of one instance's mask and another's silhouette; without amodal masks, the part of the visible one in it."""
     mask = item.visible if item.mask is None else item.mask
     assert mask is not None
     left, top = min(item.left, other.left), min(item.top, other.top)
@@ -250,7 +249,7 @@ def _describe_offset(item: Instance, rendered: ComparedView, shift: tuple[int, i
     if item.depth is not None and item.visible is not None:
         there = item.silhouette if shift is None else moved(item.silhouette, *shift)
         known = there & item.visible & (item.depth > 0.0)
-        model = item.rendered if shift is None else _moved_depth(item.rendered, *shift)
+        model = item.rendered if shift is None else moved(item.rendered, *shift, np.inf)
         errors = (item.depth - model)[known & np.isfinite(model)]
         away = float(np.median(errors)) if errors.size else 0.0
         spread = _spread(errors) if errors.size else 0.0
@@ -265,12 +264,6 @@ def _describe_offset(item: Instance, rendered: ComparedView, shift: tuple[int, i
 def _spread(errors: np.ndarray) -> float:
     """Robust spread: upper quartile of the distances from the median."""
     return float(np.percentile(np.abs(errors - np.median(errors)), 75))
-
-
-def _moved_depth(depth: np.ndarray, columns: int, rows: int) -> np.ndarray:
-    """Depth shifted right by `columns` and down by `rows`; inf where nothing has moved to."""
-    result = np.roll(depth, (rows, columns), (0, 1))
-    return np.where(moved(np.isfinite(depth), columns, rows), result, np.float32(np.inf))
 
 
 def _check_instance(item: Instance, rendered: ComparedView) -> list[Finding]:

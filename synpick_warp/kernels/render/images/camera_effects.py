@@ -98,8 +98,7 @@ def sample_effects_kernel(
 ):
     """Sample the effect parameters of each view: low_i + (high_i - low_i) u_i, with u_i uniform in [0, 1).
 
-    u_i are those of the random number stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer. Launched over
-    view.
+    u_i are of the random number stream (seed, episode, frame, camera, EFFECTS). JPEG quality is a uniform integer. Launched over view.
     """
     view = wp.tid()
     key = shot_key(ranges.seed, shot, view, Stream.EFFECTS)

@@ -123,8 +123,7 @@ def plan_passes_kernel(grid: ImageGrid, flags: TileFlags, image_inout: ShadedIma
     """Plan `ShadedImage.passes` of each tile, by its distance from the dirty ones.
 
     Colours change in dirty tiles and their neighbours, since anti-aliasing and the filter of shadow edges read up to 4 pixels around. Their
-    colours are computed from the radiance of the next ring of tiles, too, and that from the shadow edges of one more ring. Launched over
-    view, tile.
+    colours need the radiance of the next ring of tiles, too, and that from the shadow edges of one more ring. Launched over view, tile.
     """
     view, tile = wp.tid()
     distance = distance_to_dirty(grid, flags.dirty, view, tile, 3)

@@ -141,8 +141,7 @@ def find_moving_bodies_kernel(
     # Out:
     moving_inout: MovingBodies,
 ):
-    """List the bodies of each view that moved, appeared or disappeared since the previous frame, if the history contains that frame
-    (`holds`).
+    """List the bodies of each view that moved, appeared or disappeared since the previous frame, if the history has that (`holds`).
 
     Writes all members of `MovingBodies` but `holds`; `touched` starts at 0. Launched over view. The struct `Views` is not an argument, as
     its cameras change which products the compiler fuses with sums.

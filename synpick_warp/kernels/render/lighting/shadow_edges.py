@@ -71,8 +71,7 @@ def listed_pixel(coarse: CoarseGrid, cell: wp.array3d[int], view: int, chunk: in
 def list_edge_cells_kernel(coarse: CoarseGrid, views: AnyViews, first: int, shadows_inout: LampShadows, lists_inout: EdgeLists):
     """Stream compaction: `cell` receives the pixels of the shadow grid that `near_edge` marks, in any order; the marks are cleared.
 
-    `count`, which must be 0, receives the number at CELLS. Launched over view, pixel of the shadow grid (tile order, from flat index
-    `first` on).
+    `count`, 0 before, receives the number at CELLS. Launched over view, pixel of the shadow grid (tile order, from flat index `first` on).
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if view < views.count and in_image(coarse.grid, row, column):

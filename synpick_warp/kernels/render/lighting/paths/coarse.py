@@ -219,8 +219,7 @@ def trace_pixel(
 ):
     """Trace the paths of a thread's coarse pixel, if this kernel is responsible: writes guide image and light, or queues the path.
 
-    With `queued` (a constant, so that the compiler removes the other case) it is for pixels with one path, if there are queues; else for
-    others.
+    With `queued` (a constant, so that the compiler removes the other case) it is for pixels with one path; else for others.
     """
     regions = queues.count.shape[1]
     index = thread

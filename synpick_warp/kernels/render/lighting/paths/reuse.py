@@ -42,9 +42,8 @@ def schedule_paths_kernel(
 ):
     """Schedule paths: append the coarse pixels that trace paths in this frame (see `period_bits`) to the path lists.
 
-    Where no surface is visible, the history is reset. `due`, which must be 0, becomes 1 in tiles of coarse pixels whose light changes:
-    where a path is traced, and where the visible body moved. Launched over view, coarse pixel (interleaved order, from flat index `first`
-    on).
+    Where no surface is visible, the history is reset. `due`, which must be 0, becomes 1 in tiles whose light changes: where a path is
+    traced, and where the visible body moved. Launched over view, coarse pixel (interleaved order, from flat index `first` on).
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)
