@@ -60,10 +60,8 @@ def _interpolate(values: np.ndarray, count: int, axis: int) -> np.ndarray:
     """Linear interpolation along an axis, from centre to centre; OpenCV's, by Intel's IPP, depends on the processor."""
     at = ((np.arange(count) + 0.5) * (values.shape[axis] / count) - 0.5).clip(0, values.shape[axis] - 1)
     low = at.astype(int)
-    high, share = (
-        np.minimum(low + 1, values.shape[axis] - 1),
-        (at - low).reshape([-1 if each == axis else 1 for each in range(values.ndim)]),
-    )
+    high = np.minimum(low + 1, values.shape[axis] - 1)
+    share = (at - low).reshape([-1 if each == axis else 1 for each in range(values.ndim)])
     return values.take(low, axis) * (1.0 - share) + values.take(high, axis) * share
 
 
@@ -226,12 +224,14 @@ def _shift_window(bright: np.ndarray, center: np.ndarray) -> np.ndarray:
     directions, solid_angles = map_directions(len(bright))
     result = bright
     for _ in range(SHIFTS):
-        inside = (dot(directions, center) > np.cos(LAMP_RADIUS).round(DECIMALS)) & (directions[..., 2] > 0.0)
-        excess = np.where(inside, bright, 0.0)
+        first, last = (np.arccos(center[2]) + np.array([-LAMP_RADIUS, LAMP_RADIUS])) / np.pi * len(bright)
+        rows = slice(max(int(first) - 1, 0), int(last) + 2)  # Others are farther from the center.
+        inside = (dot(directions[rows], center) > np.cos(LAMP_RADIUS).round(DECIMALS)) & (directions[rows, :, 2] > 0.0)
+        excess = np.where(inside, bright[rows], 0.0)
         if not excess.any():
             break
-        result = excess
-        center = ((excess * solid_angles)[..., None] * directions).sum(axis=(0, 1))
+        result = np.pad(excess, ((rows.start, len(bright) - rows.start - len(excess)), (0, 0)))
+        center = ((excess * solid_angles[rows])[..., None] * directions[rows]).sum(axis=(0, 1))
         center /= norm(center)
     return result
 
