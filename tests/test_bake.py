@@ -243,10 +243,9 @@ def four_cups(tmp_path_factory) -> Baked:
         return Baked(tmp_path_factory.mktemp("cups") / "1", FOUR_CUPS | {"bake.worlds": 1})
 
 
-@pytest.mark.parametrize("worlds", [2, pytest.param(8, marks=pytest.mark.slow)])
-def test_four_cups_pick_the_same_in_any_number_of_worlds(four_cups, tmp_path, worlds):
+def test_four_cups_pick_the_same_in_any_number_of_worlds(four_cups, tmp_path):
     with boxes(large_boxes):
-        other = Baked(tmp_path / "other", FOUR_CUPS | {"bake.worlds": worlds})
+        other = Baked(tmp_path / "other", FOUR_CUPS | {"bake.worlds": 2})
     assert {name for name, _ in other.files().items() ^ four_cups.files().items()} == {"config.toml"}
     assert max(len(attempt["sealed"]) for attempt in records(four_cups, "attempts")) > 1
 
