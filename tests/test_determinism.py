@@ -180,8 +180,12 @@ SCALAR = "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX512F,-AVX"
 PROCESSORS = {
     "Haswell": {"NPY_DISABLE_CPU_FEATURES": " ".join(name for name in SIMD if name != "X86_V3")},
     "Zen": {},
-    "Sandybridge": {"NPY_DISABLE_CPU_FEATURES": " ".join(SIMD), "OPENCV_IPP": "disabled"},
-    "Prescott": {"NPY_DISABLE_CPU_FEATURES": " ".join(SIMD), "GLIBC_TUNABLES": SCALAR, "OPENCV_CPU_DISABLE": "AVX2,AVX,FP16"},
+    "Prescott": {
+        "NPY_DISABLE_CPU_FEATURES": " ".join(SIMD),
+        "GLIBC_TUNABLES": SCALAR,
+        "OPENCV_CPU_DISABLE": "AVX2,AVX,FP16",
+        "OPENCV_IPP": "disabled",
+    },
 }
 """By OpenBLAS's kernels (OPENBLAS_CORETYPE): what else such a processor lacks."""
 
