@@ -83,10 +83,11 @@ def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> No
 
 
 def lose_one(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> BakeSummary:
-    """Generate a share of a bake; of two episodes at least one is lost: the process is killed as it commits the first."""
-    from synpick_warp.factory import pipeline  # The others need no simulator.
+    """Generate a share of a bake of boxes; of two episodes at least one is lost: the process is killed as it commits the first."""
+    from synpick_warp.factory import assembly, pipeline  # The others need no simulator.
+    from tests.worlds.small_worlds import catalog
 
-    commit = pipeline.commit_episode
+    assembly.load_catalog, commit = lambda config, report: catalog(), pipeline.commit_episode
 
     def commit_and_die(*arguments: object) -> None:
         commit(*arguments)

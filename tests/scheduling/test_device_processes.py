@@ -22,11 +22,11 @@ from synpick_warp.system.hardware import device as devices
 from synpick_warp.system.hardware.device import describe_kinds, pick_devices
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.testing.exporters import digests
-from tests.builders import assignments, mistake, refusal
-from tests.harness.bake_server import TINY, TINY_PICKS
+from tests.builders import assignments, boxes, mistake, once, refusal
 from tests.harness.device_programs import program
 from tests.harness.processes import wait_for, wait_until_gone
-from tests.worlds.small_worlds import QUICK
+from tests.test_bake import EPISODES, TINY, Baked
+from tests.worlds.small_worlds import QUICK, catalog
 
 
 class Reports(SilentProgress):
@@ -194,38 +194,28 @@ def test_without_a_gpu_all_is_the_cpu(machine, monkeypatch):
 
 # ---- bakes on several devices, here processes of the CPU ----
 
-EPISODES = 3
-SETTINGS = TINY | {"bake.episodes": EPISODES, "bake.worlds": 1, "bake.formats": ["bop"], "arrangement.max_objects": 2, "render.layers": []}
-SETTINGS |= TINY_PICKS
-"""Objects are the embedded ones: each process loads them for itself."""
-
-
-def command(out: Path) -> list[str]:
-    overrides = {key: value for key, value in (QUICK | SETTINGS).items() if key != "bake.device"}
-    return ["bake", "--out", str(out), "--config", "smoke", *assignments(overrides)]
-
-
-def bake(out: Path, *arguments: str) -> int:
-    return main([*command(out), *arguments])
+COMMAND = ["bake", "--config", "smoke", *assignments({key: value for key, value in (QUICK | TINY).items() if key != "bake.device"})]
 
 
 @pytest.mark.slow
-def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path, capsys, monkeypatch):
+def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_one(tmp_path_factory, tmp_path, capsys, monkeypatch):
     """Begun on two devices, of which one is killed with an episode left, and finished on one."""
-    one, several = tmp_path / "one", tmp_path / "several"
-    assert bake(one, "--device", "cpu") == 0
+    several = [*COMMAND, "--out", str(tmp_path / "set")]
     monkeypatch.setattr(pipeline, "_DEVICE_PROGRAM", program("lose_one"))
-    assert bake(several, "--devices", "cpu,cpu") == EXIT_MISTAKE
-    there = committed_episodes(several)
-    assert 1 <= len(there) < EPISODES
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("synpick-warp: error: ")]
-    assert "lost cpu: its process was ended by SIGKILL" in line
-    assert f"{len(there)} of {EPISODES} episodes are complete; the same command resumes" in line
-    assert verify(several).problem == ""
-    assert not (several / PARTIAL).exists()
-    assert bake(several, "--device", "cpu") == 0
+    with boxes() as patch:
+        patch.setattr("synpick_warp.factory.devices.load_catalog", lambda config, report: catalog())
+        one, _ = once(tmp_path_factory, "stirred", lambda out: Baked(out).summary)
+        assert main([*several, "--devices", "cpu,cpu"]) == EXIT_MISTAKE
+        there = committed_episodes(tmp_path / "set")
+        assert 1 <= len(there) < EPISODES
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("synpick-warp: error: ")]
+        assert "lost cpu: its process was ended by SIGKILL" in line
+        assert f"{len(there)} of {EPISODES} episodes are complete; the same command resumes" in line
+        assert verify(tmp_path / "set").problem == ""
+        assert not (tmp_path / "set" / PARTIAL).exists()
+        assert main([*several, "--device", "cpu"]) == 0
     assert f"{EPISODES} of {EPISODES} episodes ({len(there)} of them before)" in capsys.readouterr().out
-    assert digests(several) == digests(one)
+    assert digests(tmp_path / "set") == digests(one)
 
 
 @pytest.mark.parametrize(
@@ -238,5 +228,5 @@ def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_
     ],
 )
 def test_wrong_options_are_one_line_and_leave_nothing(tmp_path, arguments, said):
-    assert mistake(*command(tmp_path / "set"), *arguments).startswith(said)
+    assert mistake(*COMMAND, "--out", tmp_path / "set", *arguments).startswith(said)
     assert not (tmp_path / "set").exists()
