@@ -9,9 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import newton
 import numpy as np
-import warp as wp
 
 from synpick_warp.configs.cell.gripper import COMMON, SUCTION1, SUCTION_ARRAY, Gripper, Suction
 from synpick_warp.errors import ConfigError
@@ -27,55 +25,6 @@ FINGER_TIP = 0.03
 """Maximum diameter of the shaft at the wrist axis [m]; at most that of its top."""
 # Armature (rotor inertia) of the wrist joint [kg·m²], which keeps the stiff drive well conditioned at 2 ms.
 CUP_ARMATURE = 1e-3
-
-
-def add_gripper(
-    world: newton.ModelBuilder, gripper: Gripper, head: "Head", shape: newton.ModelBuilder.ShapeConfig
-) -> tuple[int, tuple[int, ...]]:
-    """Add shaft (three prismatic axes) and head (revolute wrist about y); returns the indices of the shaft's shape and of the head's.
-
-    The impedance controller compensates their weight.
-    """
-    dof = newton.ModelBuilder.JointDofConfig
-    finger = world.add_link(
-        mass=gripper.finger_mass,
-        inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
-        com=wp.vec3(0.0, 0.0, gripper.finger_length / 2),
-        lock_inertia=True,
-        label="finger",
-    )
-    cup = world.add_link(
-        mass=gripper.cup_mass,
-        inertia=wp.mat33(np.diag(head.inertia)),
-        com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2),
-        lock_inertia=True,
-        label="cup",
-    )
-    axes = [dof(axis=axis, limit_lower=-np.inf, limit_upper=np.inf, armature=0.0) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
-    slide = world.add_joint_d6(-1, finger, linear_axes=axes)
-    limit = np.radians(gripper.tilt_limit)
-    wrist = world.add_joint_revolute(
-        finger,
-        cup,
-        axis=newton.Axis.Y,
-        target_ke=gripper.tilt_stiffness,
-        target_kd=gripper.tilt_damping,
-        limit_lower=-limit,
-        limit_upper=limit,
-        effort_limit=gripper.tilt_torque,
-        armature=CUP_ARMATURE,
-    )
-    world.add_articulation([slide, wrist], label="gripper")
-    finger_shape = world.add_shape_convex_hull(finger, mesh=hull_mesh(finger_collider(gripper)), cfg=shape)
-    head_shapes = tuple(world.add_shape_convex_hull(cup, mesh=hull_mesh(piece), cfg=shape) for piece in head.pieces)
-    for each in head_shapes:
-        world.add_shape_collision_filter_pair(finger_shape, each)
-    return finger_shape, head_shapes
-
-
-def hull_mesh(piece: ConvexPiece) -> newton.Mesh:
-    """Newton's mesh of a convex piece."""
-    return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)
 
 
 def finger_fixture(gripper: Gripper) -> Fixture:

@@ -24,8 +24,8 @@ from synpick_warp.configs.schema import UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.scenes.bins import TABLE_SIZE, guide_walls, make_bins, make_fixtures
+from synpick_warp.scenes.build import hull_mesh
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.grippers import hull_mesh
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.cameras import build_cameras
