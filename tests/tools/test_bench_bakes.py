@@ -20,8 +20,9 @@ from tests.harness.processes import wait_for
 from tests.tools.test_reports import SHORT_PICKS
 from tests.worlds.box_sets import episode_content
 from tools.bench import __main__ as bench
-from tools.bench import bakes, run, scaling
-from tools.bench.bakes import CleanedSet, Cleaner, Tally, Usage, measure_usage
+from tools.bench import bakes, cleaning, run, scaling
+from tools.bench.bakes import Usage, measure_usage
+from tools.bench.cleaning import CleanedSet, Cleaner, Tally
 from tools.bench.run import Bench
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *SHORT_PICKS)
@@ -183,8 +184,8 @@ def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):
 
 
 def test_damage_is_raised_when_the_bake_has_ended(tmp_path, monkeypatch):
-    monkeypatch.setattr(bakes.Cleaner, "poll", lambda self: Tally(problem="damaged"))
-    with pytest.raises(DatasetError, match="damaged"), bakes.clean_up_behind(DataLayout.of(bench.Config()), tmp_path):
+    monkeypatch.setattr(Cleaner, "poll", lambda self: Tally(problem="damaged"))
+    with pytest.raises(DatasetError, match="damaged"), cleaning.clean_up_behind(DataLayout.of(bench.Config()), tmp_path):
         pass
 
 

@@ -1,12 +1,10 @@
 """Parts that bake to the temporary folder (TMPDIR): the steady state, with and without pictures.
 
-Readings of counts and resources are taken after each tick while nearly all worlds act; then the bake is stopped. Meanwhile processes verify
-each committed episode as `synpick-warp verify` does, and delete its files, so that the disk does not fill.
+Readings of counts and resources are taken after each tick while nearly all worlds act; then the bake is stopped.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import shutil
@@ -17,9 +15,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial, reduce
+from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
@@ -29,20 +27,16 @@ from synpick_warp.cli.commands.doctor import GIB
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.commit.manifest import committed_episodes, episode_entry, read_checksums
-from synpick_warp.dataset.commit.verify import check_files
-from synpick_warp.errors import DatasetError, SynpickError
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes, shared_files
+from synpick_warp.exporters.registry import Exporters
 from synpick_warp.factory.forecast import predict_frames
 from synpick_warp.factory.memory_plan import pick_processes
 from synpick_warp.factory.pipeline import run_bake
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.stages.sim.arrange import sample_episodes_ahead
-from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import pick_device
-from synpick_warp.system.processes.pool import WorkerPool, WorkerProgram
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.views.frames import TickBatch
+from tools.bench.cleaning import Cleaner, Tally, clean_up_behind
 from tools.bench.run import LIVE_FRACTION, SPARE_EPISODES, Bench
 from tools.options import MeasuredRow
 
@@ -54,119 +48,11 @@ WITHOUT_PICTURES = ("usd", "zarr")
 """Formats of trajectories alone; worlds that pick still render the images of their perception."""
 HOUR = 3600.0
 """[s]"""
-LIST_INTERVAL = 0.5
-"""Interval at which committed episodes are listed [s]."""
-CORES_PER_PROCESS = 4
-"""Number of CPU cores per process that verifies; with fewer cores there is one process. Verifying and deleting a view takes less CPU time
-than writing it: on an H200's host with 16 cores, 4 processes kept up with 877 full-HD views/s with all masks."""
 _PARENT, _USER, _SYSTEM, _RESIDENT = 1, 11, 12, 21
 """Indices in /proc/PID/stat (proc_pid_stat(5)) after the command's name: parent process, CPU time in user mode and in system mode [clock
 ticks], resident memory [pages]."""
 _ANONYMOUS = re.compile(r"^RssAnon:\s*(\d+) kB$", re.MULTILINE)
 """Line of /proc/PID/status, which processes that have ended and kernel threads lack."""
-
-
-# ---- verification and deletion ----
-
-
-class Tally(NamedTuple):
-    """Counters of a cleaner: verified episodes and files, deleted bytes, first problem (empty: none)."""
-
-    episodes: int = 0
-    files: int = 0
-    deleted: int = 0
-    """Disk space freed by deletion [bytes]."""
-    problem: str = ""
-    """Description of the first missing or damaged file, after which nothing more is verified; empty: none."""
-
-    def plus(self, other: Tally) -> Tally:
-        """Sum of two counters, with the problem of the first that has one."""
-        return Tally(self.episodes + other.episodes, self.files + other.files, self.deleted + other.deleted, self.problem or other.problem)
-
-
-@dataclass(frozen=True)
-class CleanedSet:
-    """Data set whose committed episodes are verified and deleted; manifest entries, and files of others, are kept."""
-
-    out: Path
-    folders: tuple[str, ...]
-    """Folders shared by several episodes, relative to the data set; they are kept even if empty."""
-
-    def clean(self, episode: int) -> Tally:
-        """Verify a committed episode, and delete its files; an episode with a problem is kept."""
-        deleted = 0
-        try:
-            known = read_checksums(self.out, episode_entry(episode))
-            if problem := check_files(self.out, known).problem:
-                return Tally(problem=problem)
-            for name in known:
-                deleted += (self.out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
-                (self.out / name).unlink()
-        except SynpickError as error:
-            return Tally(problem=str(error))
-        except OSError as error:
-            return Tally(problem=f"{error.filename} cannot be deleted: {error.strerror}")
-        self._remove_empty_folders(known)
-        return Tally(1, len(known), deleted)
-
-    def _remove_empty_folders(self, names: dict[str, str]) -> None:
-        """Remove the parent folders of files `names` that are now empty, except shared folders and their parents."""
-        stay = {folder for name in self.folders for folder in (Path(name), *Path(name).parents)} | {Path()}
-        folders = {parent for name in names for parent in Path(name).parents} - stay
-        for folder in sorted(folders, key=lambda folder: -len(folder.parts)):
-            with contextlib.suppress(OSError):  # It holds other files.
-                os.rmdir(self.out / folder)
-
-
-class Cleaner:
-    """Pool of processes that verify and delete the episodes of a running bake; a context manager that ends them."""
-
-    def __init__(self, data_set: CleanedSet, processes: int | None = None) -> None:
-        """Start `processes` processes; None: a number by CORES_PER_PROCESS."""
-        program = WorkerProgram(partial(CleanedSet, data_set.out, data_set.folders), "process that verifies episodes", "bake.worlds")
-        self._pool = WorkerPool(program, processes or max(1, count_cores() // CORES_PER_PROCESS))
-        self._out, self._known, self._tally, self._listed = data_set.out, set[int](), Tally(), 0.0
-
-    @property
-    def pids(self) -> tuple[int, ...]:
-        """Ids of the worker processes."""
-        return self._pool.pids()
-
-    def poll(self) -> Tally:
-        """Hand over new episodes, and return the totals of those that are done; a process that died is a problem."""
-        if self._tally.problem:
-            return self._tally
-        try:
-            if time.monotonic() - self._listed >= LIST_INTERVAL:
-                self._listed = time.monotonic()
-                for episode in sorted(set(committed_episodes(self._out)) - self._known):
-                    self._known.add(episode)
-                    self._pool.submit(partial(CleanedSet.clean, episode=episode), drain=False)
-            while done := self._pool.receive(0.0):
-                self._tally = reduce(Tally.plus, (future.result() for future in done), self._tally)
-        except SynpickError as error:
-            self._tally = self._tally._replace(problem=str(error))
-        return self._tally
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.kill()
-
-
-@contextlib.contextmanager
-def clean_up_behind(layout: DataLayout, out: Path) -> Iterator[Cleaner]:
-    """Context manager: verify and delete the episodes of a bake to `out` while it runs. Raises DatasetError: an episode was damaged."""
-    folders = tuple(map(str, shared_files(load_exporter_classes(layout.formats), layout).folders))
-    with Cleaner(CleanedSet(out, folders)) as cleaner:
-        yield cleaner
-        tally = cleaner.poll()
-    if tally.problem:
-        raise DatasetError(tally.problem)
-
-
-# ---- readings ----
 
 
 class Usage(NamedTuple):
@@ -200,14 +86,10 @@ def measure_usage() -> dict[int, Usage]:
             own = 1024 * int(anonymous[1]) if anonymous else 0
             usages[int(entry.name)] = Usage(tick * (user + system), pages * os.sysconf("SC_PAGE_SIZE"), own)
             parents[int(entry.name)] = values[_PARENT - 1]
-    return {pid: usage for pid, usage in usages.items() if _descends(pid, os.getpid(), parents)}
-
-
-def _descends(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
-    """True if a process is the ancestor or one of its descendants."""
-    while pid in parents and pid != ancestor:
-        pid = parents[pid]
-    return pid == ancestor
+    ours = {os.getpid()}
+    while more := {pid for pid, parent in parents.items() if parent in ours} - ours:
+        ours |= more
+    return {pid: usages[pid] for pid in ours}
 
 
 @dataclass(frozen=True)

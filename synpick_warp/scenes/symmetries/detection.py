@@ -7,7 +7,7 @@ condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, takewhile
 
 import numpy as np
 
@@ -281,9 +281,10 @@ def _close(surface: SampledSurface, turns: list[Turn], tolerance: float) -> tupl
         if larger is None:
             continue
         middle = _common_point([*used, turn], surface.center)
-        distances = np.array([surface.deviation(_about(each, middle), tolerance) for each in larger])
-        if distances.max() <= tolerance:
-            group, offs, center = larger, distances, middle
+        distances = (surface.deviation(_about(each, middle), tolerance) for each in larger)
+        found = np.array([*takewhile(lambda distance: distance <= tolerance, distances)])
+        if len(found) == len(larger):
+            group, offs, center = larger, found, middle
             used.append(turn)
     matrices, offs = np.array([_about(each, center) for each in group[1:]]).reshape(-1, 4, 4), offs[1:]
     if len(offs):
