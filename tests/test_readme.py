@@ -91,7 +91,9 @@ def run_blocks(document: str, folder: Path, monkeypatch: pytest.MonkeyPatch, **q
 @pytest.mark.slow(minutes=1)
 def test_the_lines_of_the_readme_run_as_written(tmp_path, monkeypatch):
     assert [language for language, _ in blocks(README)].count("python") == 3
-    run_blocks(README, tmp_path, monkeypatch, **STIRRING | {"cameras.resolution": [160, 90]})
+    run_blocks(
+        README, tmp_path, monkeypatch, **STIRRING | {"cameras.resolution": [160, 90], "arrangement.max_objects": 4, "move.rounds": 1}
+    )
     assert (tmp_path / "DATA.png").stat().st_size > 10_000
     assert (tmp_path / "view.png").stat().st_size > 10_000
 

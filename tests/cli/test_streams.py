@@ -227,6 +227,7 @@ def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
 
 
 BAKE_ON_FULL_DEVICE = """
+import gc; gc.disable()
 import sys, synpick_warp.factory.pipeline as pipeline
 from synpick_warp.cli.main import main
 def build(*_, **__): raise AssertionError("the bake goes on")

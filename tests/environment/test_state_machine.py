@@ -129,7 +129,7 @@ def run(machine: type[Environments], examples: int, **given: Any) -> None:
     run_state_machine_as_test(machine, settings=settings(max_examples=examples, stateful_step_count=12, **given))
 
 
-@pytest.mark.parametrize("examples", [15, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("examples", [15, pytest.param(30, marks=pytest.mark.slow)])
 def test_the_same_history_gives_the_same_bits(machine, examples):
     run(machine, fuzz_examples(examples))
 

@@ -28,7 +28,7 @@ from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.harness.probe import probe
-from tests.worlds.small_worlds import CUBE, catalog, place_cubes, settings
+from tests.worlds.small_worlds import COARSE, CUBE, catalog, place_cubes, settings
 
 TICKS = 30
 ARCHITECTURE, BODIES, ROWS, GRIPPER_ROWS, MOST_BODIES = 90, 5, 96, 256, 253
@@ -332,7 +332,7 @@ def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monke
 def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
     """Piles that fall, rest and are stirred have bitwise identical trajectories; at least half the pairs without contacts are rejected."""
     worlds = 8 if device.is_cuda else 2
-    config = settings(bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__deterministic=True)
+    config = settings(bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__deterministic=True, **COARSE)
     found, phases, simulations = [], set(), []
     for version in (physics.KNOWN_NEWTON, "another"):
         monkeypatch.setattr(physics, "KNOWN_NEWTON", version)
@@ -433,6 +433,7 @@ def test_worlds_that_differ_keep_the_broad_phase_of_newton(world, body, group):
 # ---- compilation: what a bake does not launch is not compiled ----
 
 SHARED_MODULES = """
+import gc; gc.disable()
 from warp._src import context
 from synpick_warp.factory import assembly
 from newton.solvers import SolverSteel

@@ -339,7 +339,7 @@ def run(examples: int, steps: int, **given: Any) -> None:
     run_state_machine_as_test(DataSets, settings=settings(**given))
 
 
-@pytest.mark.parametrize(("examples", "steps"), [(15, 12), pytest.param(50, 25, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("examples", "steps"), [(15, 12), pytest.param(30, 25, marks=pytest.mark.slow)])
 def test_no_sequence_loses_or_repeats_anything(examples, steps):
     run(fuzz_examples(examples), steps)
 
