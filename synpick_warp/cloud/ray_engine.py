@@ -20,8 +20,7 @@ from synpick_warp.cloud.claims import open_claims, plan_chunks
 from synpick_warp.cloud.run import Crew, Job, PlanProgress, bake_into_store, open_ledger
 from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.errors import DeviceError, SynpickError
-from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.pipeline import with_measures
+from synpick_warp.factory.episodes import BakeSummary, measured
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.inputs.urls import RAY, check_engine
@@ -53,7 +52,7 @@ def bake_with_ray(job: Job, engine: str, workers: int, progress: Progress, crew:
     of `workers.start_bake`. `engine`: "ray" is the cluster at RAY_ADDRESS, or else a local one, started for this bake; "ray://HOST:PORT" is
     reached by Ray Client. `workers`: number of workers; 0: as many as the cluster has GPUs at the time, or CPU cores with `bake.device`
     cpu. Returns the summary of the workers that ended."""
-    job = replace(job, config=with_measures(job.config, ()))
+    job = replace(job, config=measured(job.config, ()))
     address = find_address(engine)
     ray = import_ray(address)
     ledger = open_ledger(job)

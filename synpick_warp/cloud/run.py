@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -27,10 +28,7 @@ from synpick_warp.exporters.formats import indexed_files
 from synpick_warp.exporters.registry import Needs, shared_files
 from synpick_warp.exporters.writing.files import LINES, parse_checksums
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import BakeSummary
-from synpick_warp.factory.forecast import EpisodeSource
-from synpick_warp.factory.memory_plan import count_writers
-from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.factory.episodes import BakeSummary, EpisodeSource, count_writers, measured
 from synpick_warp.system import clock
 from synpick_warp.system.inputs.files import MAX_JSON, make_folder
 from synpick_warp.system.progress import ForwardingProgress, Progress
@@ -196,7 +194,7 @@ def bake_into_store(
 
     Returns the summary of this run's episodes, without those that were done before, or lost to other workers with the leases of their
     chunks. Raises SynpickError: an error that the user can correct; done episodes stay, and the same bake resumes."""
-    job = replace(job, config=with_measures(job.config, devices))
+    job = replace(job, config=measured(job.config, devices))
     ranges = DataLayout.of(job.config).plan_shard(job.splits, shard)
     ledger = open_ledger(job)
     claims = open_claims(ledger, job.lease) if claim else None
@@ -388,7 +386,7 @@ def _bake(
     job: Job, ledger: Ledger, place: Path, work: _Work, progress: Progress, devices: Sequence[str], ended: BakeSummary
 ) -> BakeSummary:
     """Bake and upload episodes in a new temporary folder, after those of `ended`; messages of errors name the store in its place."""
-    bake = job.bake or bake_episodes
+    bake = job.bake or import_module("synpick_warp.factory.pipeline").bake_episodes  # The simulator, which who starts workers needs not.
     folder = Path(tempfile.mkdtemp(dir=place))
     if ledger.manifest is not None:  # It has the digests of objects and lights, which the bake compares.
         (folder / MANIFEST_FILE).write_bytes(ledger.manifest)

@@ -19,10 +19,10 @@ from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.devices import DeviceProcesses
-from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.episodes import BakeSummary, count_writers, measured
 from synpick_warp.factory.forecast import deal_writers
-from synpick_warp.factory.memory_plan import count_writers, pick_processes
-from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.factory.memory_plan import pick_processes
+from synpick_warp.factory.pipeline import bake_episodes
 from synpick_warp.factory.worker import BakeLink
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.system.hardware.cores import count_cores
@@ -73,7 +73,7 @@ class _Share(Job):
 def bake_with_devices(job: Job, devices: Sequence[str], progress: Progress, crew: Crew) -> BakeSummary:
     """Bake a data set into an object store by a claiming worker on each device; other claiming workers may take part. Arguments as of
     `start_bake`; returns the summary of the chunks of these workers."""
-    job = replace(job, config=with_measures(job.config, devices))
+    job = replace(job, config=measured(job.config, devices))
     config, ranges = job.config, DataLayout.of(job.config).plan(job.splits)
     planned = sum(map(len, ranges))
     names = pick_processes(config, devices, planned)

@@ -21,9 +21,9 @@ from synpick_warp.configs.episodes.manipulation import PICKS
 from synpick_warp.configs.schema import FAST, Config, Render
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory.attempts import AttemptLog, EpisodeRecord
-from synpick_warp.factory.episodes import PLACES, EpisodeOutcome
+from synpick_warp.factory.episodes import PLACES, EpisodeOutcome, count_writers
 from synpick_warp.factory.forecast import order_longest_first
-from synpick_warp.factory.memory_plan import check_memory, count_writers, explain_shortage, fit_to_device, plan_memory, without_pictures
+from synpick_warp.factory.memory_plan import check_memory, explain_shortage, fit_to_device, plan_memory, without_pictures
 from synpick_warp.factory.picks import PickEngine, PickQueue
 from synpick_warp.kernels.render.lighting.brdf import measure_albedo_kernel
 from synpick_warp.kernels.render.lighting.paths.coarse import trace_coarse_paths_kernel

@@ -30,9 +30,8 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs, aborting
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import BakeSummary
+from synpick_warp.factory.episodes import BakeSummary, count_writers
 from synpick_warp.factory.forecast import check_disk, deal_episodes, deal_writers, forecast_bake, order_longest_first
-from synpick_warp.factory.memory_plan import count_writers
 from synpick_warp.scenes.build import REPEATS, must_repeat, without_distractors
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog

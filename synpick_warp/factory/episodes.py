@@ -1,19 +1,25 @@
-"""Episode rows of episodes.jsonl, the summary of a bake, and its throughput."""
+"""What a bake begins with, source of episodes, completed settings and writers; its episode rows, summary and throughput."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
 from synpick_warp.codes import Ending, Outcome
+from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.records import Attempt
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
+from synpick_warp.scenes.bin_meshes.loading import measure_meshes
+from synpick_warp.system.hardware.cores import count_cores
+from synpick_warp.system.hardware.device import pick_devices
+from synpick_warp.system.hardware.free_memory import free_host_memory
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, name_bin
 
@@ -22,6 +28,39 @@ if TYPE_CHECKING:
 
 PLACES = 6
 """Decimal places of a time [s]; more would be noise."""
+WRITER_BYTES = 100 << 20
+"""Memory reserved for a writer process besides its image slots [bytes]. Measured are 50 MB, with its part of shared libraries, at full HD
+with bop and shards; the rest is headroom for formats with larger libraries."""
+WRITERS_FRACTION = 0.5
+"""Fraction of the free host memory that writer processes may take if their number is chosen."""
+
+
+class EpisodeSource(list[int]):
+    """Work queue of a bake: a list of the episodes that it begins with, sorted, and a source of further ones while worlds are idle."""
+
+    def __init__(self, episodes: Iterable[int], expected: int = 0) -> None:
+        super().__init__(episodes)
+        self.expected = expected
+        """Number of episodes to choose worlds for, if it is larger than that of the first ones, and the settings leave it open."""
+
+    def more(self, wait: bool) -> list[int]:
+        """Further episodes, which were never returned before; empty: none at present. `wait`: the bake ends if there are none."""
+        del wait
+        return []
+
+
+def measured(config: Config, devices: Sequence[str]) -> Config:
+    """Complete the settings by what files of bins and grippers say of themselves, and by the first of several devices."""
+    if found := measure_meshes(config.bin, config.gripper):
+        config = override_config(config, found)
+    return config.with_values({"bake.device": pick_devices(devices)[0]}) if devices else config
+
+
+def count_writers(writers: int, slot_bytes: int) -> int:
+    """Writer processes of a bake: `bake.writers`, or if it is 0, one per usable CPU core, as far as the host's free memory has room for
+    them and their slots of `slot_bytes` (see `Needs`)."""
+    room = int(WRITERS_FRACTION * free_host_memory()) // (WRITER_BYTES + QUEUE_DEPTH * slot_bytes)
+    return writers or max(1, min(count_cores(), room))
 
 
 class EpisodeOutcome(NamedTuple):

@@ -5,7 +5,7 @@ depends on the order or on its device.
 """
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,20 +33,6 @@ In a Monte Carlo of 150 mixed episodes in 100 worlds a bake is 1 % faster than i
 SORTED_EPISODES = 1024
 """Number of episodes at the end of the list that are sorted: two rounds of MAX_GPU_WORLDS. Before them modes stay mixed, which keeps
 progress and load even."""
-
-
-class EpisodeSource(list[int]):
-    """Work queue of a bake: a list of the episodes that it begins with, sorted, and a source of further ones while worlds are idle."""
-
-    def __init__(self, episodes: Iterable[int], expected: int = 0) -> None:
-        super().__init__(episodes)
-        self.expected = expected
-        """Number of episodes to choose worlds for, if it is larger than that of the first ones, and the settings leave it open."""
-
-    def more(self, wait: bool) -> list[int]:
-        """Further episodes, which were never returned before; empty: none at present. `wait`: the bake ends if there are none."""
-        del wait
-        return []
 
 
 def predict_frames(modes: np.ndarray, objects: np.ndarray, deviations: float = 0.0) -> np.ndarray:

@@ -26,7 +26,6 @@ from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Arrangement, Config, Perception, Physics
 from synpick_warp.errors import ConfigError, SynpickError, format_value
 from synpick_warp.exporters.registry import Needs
-from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
 from synpick_warp.factory.picks import count_batch, count_rows
 from synpick_warp.newton_patches.history import CONTACT_BYTES
 from synpick_warp.scenes import build
@@ -366,11 +365,6 @@ HEADROOM = 1.5
 0.7 GiB beyond it."""
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
-WRITER_BYTES = 100 << 20
-"""Memory reserved for a writer process besides its image slots [bytes]. Measured are 50 MB, with its part of shared libraries, at full HD
-with bop and shards; the rest is headroom for formats with larger libraries."""
-WRITERS_FRACTION = 0.5
-"""Fraction of the free host memory that writer processes may take if their number is chosen."""
 _OPEN_SIZES = ("render.views_per_batch", "perception.views", "picks.worlds", "bake.worlds")
 """Settings of sizes that are chosen automatically if they are 0. (So is `bake.writers`, see `count_writers`.)"""
 
@@ -410,16 +404,6 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
         else:
             return config
     return config
-
-
-def count_writers(writers: int, slot_bytes: int) -> int:
-    """Writer processes of a bake: `bake.writers`, or if it is 0, one per usable CPU core, as far as the host's free memory has room for
-    them and their slots of `slot_bytes` (see `Needs`)."""
-    if writers:
-        return writers
-    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes
-    room = int(WRITERS_FRACTION * free_memory(None)) // each
-    return max(1, min(count_cores(), room))
 
 
 def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ import numpy as np
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.dataset import DataLayout, ExportSettings
-from synpick_warp.configs.files.load import override_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.commit.manifest import committed_episodes, describe_strays, episode_entry, read_entry
 from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, digest_inputs, finalize_data_set
@@ -20,12 +19,11 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.factory.assembly import Factory, build_factory, make_compiler
 from synpick_warp.factory.attempts import EpisodeRecord
 from synpick_warp.factory.devices import DeviceShare, bake_on_devices, load_assets, open_exporters, prepare_folder
-from synpick_warp.factory.episodes import BakeSummary, ThroughputMeter, episode_end, is_resampled
-from synpick_warp.factory.forecast import SAMPLED, EpisodeSource, check_disk, forecast_bake, predict_length
-from synpick_warp.factory.memory_plan import advise_processes, check_episodes, count_writers, explain_shortage, pick_processes
+from synpick_warp.factory.episodes import BakeSummary, EpisodeSource, ThroughputMeter, count_writers, episode_end, is_resampled, measured
+from synpick_warp.factory.forecast import SAMPLED, check_disk, forecast_bake, predict_length
+from synpick_warp.factory.memory_plan import advise_processes, check_episodes, explain_shortage, pick_processes
 from synpick_warp.factory.picks import PickQueue
 from synpick_warp.factory.worker import BakeLink
-from synpick_warp.scenes.bin_meshes.loading import measure_meshes
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import limit_threads
 from synpick_warp.stages.render.suction_surface import with_suctionable_area
@@ -33,7 +31,6 @@ from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.hardware.cores import count_cores
-from synpick_warp.system.hardware.device import pick_devices
 from synpick_warp.system.processes.interrupt import StopRequest
 from synpick_warp.system.progress import Progress
 from synpick_warp.views.frames import EpisodeEnd, FrameBatch
@@ -59,17 +56,10 @@ def run_bake(
     `shard` (i, n): only episodes with index % n == i; `splits`: only their episodes, empty: all; `devices` have a process each, see
     `pick_processes`, empty: `bake.device` alone. Raises SynpickError for what the user can correct; committed episodes stay, and the same
     bake resumes."""
-    config = with_measures(config, devices)
+    config = measured(config, devices)
     planned = DataLayout.of(config).plan_shard(splits, shard)
     check_episodes(sum(map(len, planned)), config.bake.episodes)
     return bake_episodes(config, out, progress, [episode for each in planned for episode in each], devices)
-
-
-def with_measures(config: Config, devices: Sequence[str]) -> Config:
-    """Complete the settings by what files of bins and grippers say of themselves, and by the first of several devices."""
-    if measured := measure_meshes(config.bin, config.gripper):
-        config = override_config(config, measured)
-    return config.with_values({"bake.device": pick_devices(devices)[0]}) if devices else config
 
 
 def bake_episodes(
@@ -85,7 +75,7 @@ def bake_episodes(
     """Generate these episodes of a data set, sorted, in a folder, or the remaining ones of them; of an `EpisodeSource` one device takes
     further ones, too. Other arguments and errors as of `run_bake`.
 
-    `config` has measures (`with_measures`). `deliver` is called at the end, also after a stop, in place of writing the indices: it takes
+    `config` has measures (`measured`). `deliver` is called at the end, also after a stop, in place of writing the indices: it takes
     the episodes elsewhere; None: they are written. `processes` bake on this host, and share its memory; `stop` requests to stop one device,
     None: signals do."""
     needs, source = Needs.of(config), episodes if isinstance(episodes, EpisodeSource) else EpisodeSource(episodes)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from synpick_warp.cloud import run
 from synpick_warp.system.progress import SilentProgress
-from tests.cloud.conftest import tiny
 from tests.harness import scripted_bake
+from tests.harness.scripted_bake import tiny
 
 
 def bake_or_die(marker: Path, *given):

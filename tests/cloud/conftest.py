@@ -17,15 +17,7 @@ from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import CONTROL, open_store
 from tests.builders import once
 from tests.harness import scripted_bake
-
-EPISODES = 4
-
-
-def tiny(episodes: int = EPISODES, formats: tuple[str, ...] = ("bop", "shards")):
-    """Settings of a few small files an episode."""
-    return scripted_bake.settings(episodes, formats).with_values(
-        {"bop.split": "train", "bop.color_format": "png", "bop.masks": False, "bop.coco": False}
-    )
+from tests.harness.scripted_bake import tiny
 
 
 class Server:

@@ -10,7 +10,7 @@ from synpick_warp.cli.display import make_progress
 from synpick_warp.cloud.ray_engine import bake_with_ray
 from synpick_warp.cloud.run import Crew, Job
 from tests.cloud.claiming_worker import bake_or_die
-from tests.cloud.conftest import tiny
+from tests.harness.scripted_bake import tiny
 
 if __name__ == "__main__":
     url, episodes, workers, marker = sys.argv[1:]

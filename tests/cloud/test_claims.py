@@ -21,9 +21,10 @@ from synpick_warp.system import clock
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import EPISODES, files, stored, tiny
+from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake
 from tests.harness.processes import module_command
+from tests.harness.scripted_bake import EPISODES, tiny
 
 
 def work(url: str, **given):

@@ -34,9 +34,10 @@ from synpick_warp.system.stores import opening
 from synpick_warp.system.stores import store as store_module
 from synpick_warp.system.stores.opening import Probe, open_store, probe
 from tests.builders import mistake
-from tests.cloud.conftest import files, stored, tiny
+from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake
 from tests.harness.processes import module_command
+from tests.harness.scripted_bake import tiny
 
 
 @pytest.fixture(params=["memory", "prefix"])

@@ -18,8 +18,9 @@ from synpick_warp.exporters.writing.files import LINES
 from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores.opening import Probe, open_store
 from tests.builders import mistake
-from tests.cloud.conftest import files, stored, tiny
+from tests.cloud.conftest import files, stored
 from tests.harness import scripted_bake
+from tests.harness.scripted_bake import tiny
 
 QUIET = SilentProgress()
 

@@ -15,8 +15,7 @@ from synpick_warp.dataset.commit.writing import OutputFolder, commit_episode, fi
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, Needs
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome
-from synpick_warp.factory.forecast import EpisodeSource
+from synpick_warp.factory.episodes import BakeSummary, EpisodeOutcome, EpisodeSource
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.system.progress import Progress
 from synpick_warp.testing import box_views
@@ -26,6 +25,7 @@ from tests.worlds import trajectories
 from tests.worlds.trajectories import seen_object
 
 FRAMES = 2
+EPISODES = 4
 INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}
 SEEN = {"visible": 5, "centroid": [1.0, 1.5], "midpoint": [1.0, 1.25], "distances": [1.0, 0.5, 0.75], "depth": 1.9, "ancestors": [3]}
 ATTEMPT = trajectories.ATTEMPT | {
@@ -41,6 +41,11 @@ def settings(episodes: int = 2, formats: tuple[str, ...] = FORMATS) -> Config:
     bake = dataclasses.replace(config.bake, formats=formats, episodes=episodes, mode="pick", writers=1)
     cameras = dataclasses.replace(config.cameras, resolution=(16, 12), positions=config.cameras.positions[: len(_LENSES)])
     return dataclasses.replace(config, bake=bake, cameras=cameras)
+
+
+def tiny(episodes: int = EPISODES, formats: tuple[str, ...] = ("bop", "shards")):
+    """Settings of a few small files an episode."""
+    return settings(episodes, formats).with_values({"bop.split": "train", "bop.color_format": "png", "bop.masks": False, "bop.coco": False})
 
 
 def small_settings() -> Config:

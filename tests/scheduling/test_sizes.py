@@ -18,11 +18,11 @@ from synpick_warp.configs.schema import Arrangement, Config, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.registry import Needs
 from synpick_warp.factory import assembly, forecast, memory_plan
+from synpick_warp.factory.episodes import EpisodeSource, count_writers
 from synpick_warp.factory.forecast import (
     DEVIATIONS,
     FRAMES_OF_MODE,
     SORTED_EPISODES,
-    EpisodeSource,
     deal_episodes,
     deal_writers,
     order_longest_first,
@@ -33,7 +33,6 @@ from synpick_warp.factory.memory_plan import (
     RUNTIME_BYTES,
     advise_processes,
     check_memory,
-    count_writers,
     fit_to_device,
     pick_processes,
     plan_memory,
@@ -79,7 +78,8 @@ def give(monkeypatch):
     def give(gpu: float = 140.0, host: float = 128.0) -> None:
         monkeypatch.setattr(GPU, "total_memory", int(gpu * GIB))
         monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: int(gpu * GIB))
-        monkeypatch.setattr(memory_plan, "free_host_memory", lambda: int(host * GIB))
+        for module in ("memory_plan", "episodes"):
+            monkeypatch.setattr(f"synpick_warp.factory.{module}.free_host_memory", lambda: int(host * GIB))
 
     give()
     return give
@@ -212,7 +212,7 @@ def writers_of(config: Config) -> int:
 
 
 def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
-    monkeypatch.setattr(memory_plan, "count_cores", lambda: 64)
+    monkeypatch.setattr("synpick_warp.factory.episodes.count_cores", lambda: 64)
     config = load_config("synpick", {})
     assert writers_of(config) == 64
     give(host=8.0)

@@ -25,7 +25,7 @@ from synpick_warp.system.progress import SilentProgress
 from synpick_warp.system.stores import store
 from synpick_warp.system.stores.opening import Probe
 from synpick_warp.system.stores.store import Store
-from tests.cloud.conftest import tiny
+from tests.harness.scripted_bake import tiny
 from tests.simulation.faulty_store import DELAYED, LOST, REFUSED, FaultyStore, Write
 from tests.simulation.scheduler import START, Process, Simulation
 

@@ -27,7 +27,8 @@ from synpick_warp.dataset.commit.manifest import (
 from synpick_warp.dataset.commit.verify import check_files
 from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.writing.files import output_errors, write_atomically
-from synpick_warp.factory.pipeline import bake_episodes, with_measures
+from synpick_warp.factory.episodes import measured
+from synpick_warp.factory.pipeline import bake_episodes
 from synpick_warp.system.hardware.device import pick_device
 from synpick_warp.system.progress import Progress
 
@@ -64,7 +65,7 @@ def prove(folder: Path, share: float, seed: int, progress: Progress, device: str
         again.mkdir()
         (again / MANIFEST_FILE).write_bytes((folder / MANIFEST_FILE).read_bytes())  # Its digests of objects and lights are compared.
         try:
-            summary = bake_episodes(with_measures(config, ()), again, progress, drawn, deliver=lambda: None)
+            summary = bake_episodes(measured(config, ()), again, progress, drawn, deliver=lambda: None)
         except SynpickError as error:
             raise type(error)(str(error).replace(str(again), str(folder))) from error
         if summary.stopped:

@@ -17,8 +17,9 @@ from synpick_warp.configs.dataset import DataLayout
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, DeviceError
 from synpick_warp.exporters.registry import Needs
+from synpick_warp.factory.episodes import count_writers
 from synpick_warp.factory.forecast import GB, check_disk, forecast_settings
-from synpick_warp.factory.memory_plan import check_memory, count_writers, fit_to_device, plan_memory, split_memories, without_pictures
+from synpick_warp.factory.memory_plan import check_memory, fit_to_device, plan_memory, split_memories, without_pictures
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.hardware.cores import count_cores
 from synpick_warp.system.hardware.device import SmPartition, count_reserved, pick_device
