@@ -141,13 +141,13 @@ class SceneFiles(ABC):
         """An `image`, with its channels and type checked; see `check_planes`."""
         return check_planes(self.image(name, frame), channels, f"{name} of image {frame} in {self.place}", dtype)
 
-    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
-        """Suffix and content of an image's file; raises DatasetError unless its header states the scene's size. `name` as for `image`."""
+    def image_file(self, name: str, frame: int) -> tuple[str, bytes, str]:
+        """Suffix, content and path of an image's file; raises DatasetError unless its header has the scene's size. `name`: of `image`."""
         suffix, data, source = self._need(name, frame)
         if (stated := image_size(data)) != self.image_size(frame):
             there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
             raise DatasetError(f"{source} {there}")
-        return suffix, data
+        return suffix, data, source
 
     def image_size(self, frame: int) -> tuple[int, int]:
         """Width and height of a frame's images [px]: of colour, or else depth, or else the first mask."""

@@ -1,5 +1,9 @@
 """Twins of annotated images: what they change, what they keep, and appearance of known pixels."""
 
+import re
+import shutil
+
+import cv2
 import numpy as np
 import pytest
 
@@ -37,9 +41,41 @@ def test_twins_differ_in_the_pixels_of_objects_alone(picked_set, tmp_path):
     assert text.count("\n") == 2 + len({int(index) for view in real.views() for index in view.object_ids})
 
 
+def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
+    """A grey sensor's folder has its name, and files have four digits: twins are grey, and the linked data set keeps its bytes."""
+    real = tmp_path / "real"
+    shutil.copytree(picked_set / "models", real / "models")
+    scene = shutil.copytree(next(picked_set.glob("*/000000/rgb")).parent, real / "test" / "000000")
+    (scene / "rgb").rename(scene / "gray1")
+    for path in list((scene / "gray1").iterdir()):
+        cv2.imwrite(str(path.with_name(f"{path.stem[2:]}.png")), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+        path.unlink()
+    for path in list(scene.iterdir()):
+        if re.fullmatch("(scene_(camera|gt|gt_info).json|depth|mask|mask_visib)", path.name):
+            path.rename(path.with_name(f"{path.stem}_gray1{path.suffix}"))
+    before = {path: path.read_bytes() for path in real.rglob("*") if path.is_file()}
+    code, _, error = run("gap", real, "--out", tmp_path / "a" / "twins", "--device", "cpu")
+    assert code == 0, error
+    made = {path.relative_to(tmp_path / "a" / "twins"): path for path in (tmp_path / "a" / "twins").rglob("*") if path.is_file()}
+    assert {real / name for name in made} == before.keys() == {path for path in real.rglob("*") if path.is_file()}
+    assert all(path.read_bytes() == data for path, data in before.items())
+    changed = [path for name, path in made.items() if path.read_bytes() != before[real / name]]
+    assert changed
+    assert {path.parent.name for path in changed} == {"gray1"}
+    assert {cv2.imread(str(path), cv2.IMREAD_UNCHANGED).ndim for path in changed} == {2}
+
+
 def test_what_has_no_twins_is_one_line(picked_set, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     assert "allowed: a new or an empty folder" in mistake("gap", picked_set, "--out", tmp_path / "full")
     assert "is not a data set" in mistake("gap", tmp_path / "full", "--out", tmp_path / "new")
+    shutil.copytree(picked_set / "models", tmp_path / "real" / "models")
+    scene = shutil.copytree(next(picked_set.glob("*/000000/rgb")).parent, tmp_path / "real" / "test" / "000000")
+    truth = (scene / "scene_gt.json").read_text()
+    (scene / "scene_gt.json").write_text(re.sub(r'("cam_R_m2c": ?\[)[^]]*', r"\g<1>1, 0, 0, 0, 1, 0, 0, 0, -1", truth))
+    assert "cam_R_m2c that is no rotation" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new", "--device", "cpu")
+    (scene / "scene_gt.json").unlink()
+    (scene / "scene_gt_info.json").unlink()
+    assert "no image with objects" in mistake("gap", tmp_path / "real", "--out", tmp_path / "new")
     assert not (tmp_path / "new").exists()

@@ -91,7 +91,7 @@ class ForeignViewFiles(StoredViewFiles):
         if size != self.size:
             shown, first = (f"{width} x {height}" for width, height in (size, self.size))
             raise DatasetError(f"{self.files.place}: image {self.frame} has {shown} pixels, the first one {first}; formats have one size")
-        suffix, data = self.files.image_file("rgb", self.frame)
+        suffix, data, _ = self.files.image_file("rgb", self.frame)
         if suffix.replace("jpeg", "jpg") == self.suffix:
             return self.suffix, data
         image = self.color_image()
@@ -99,7 +99,7 @@ class ForeignViewFiles(StoredViewFiles):
 
     def layer(self, name: str) -> Buffer:
         """PNG file of a layer, as depth: copied, or encoded again with 16 bits."""
-        suffix, data = self.files.image_file(name, self.frame)
+        suffix, data, _ = self.files.image_file(name, self.frame)
         return data if suffix == ".png" else encode_png(self.files.typed_image(name, self.frame, None, "uint16"))
 
     def masks(self) -> list[Masks]:

@@ -70,7 +70,7 @@ class StoredViewFiles:
 
     @property
     def color(self) -> tuple[str, Buffer]:
-        return self.files.image_file("rgb", self.frame)
+        return self.files.image_file("rgb", self.frame)[:2]
 
     @property
     def depth(self) -> Buffer:
@@ -78,7 +78,7 @@ class StoredViewFiles:
 
     def layer(self, name: str) -> Buffer:
         """Bytes of a layer's file, as stored; raises DatasetError if it is no PNG."""
-        suffix, data = self.files.image_file(name, self.frame)
+        suffix, data, _ = self.files.image_file(name, self.frame)
         if suffix != ".png":
             raise DatasetError(f"{name} of image {self.frame} in {self.files.place} is a {suffix} file, expected: .png; {ADVICE}")
         return data

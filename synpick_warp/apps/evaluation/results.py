@@ -309,9 +309,8 @@ def _read_entry(entry: TargetEntry) -> list[TargetRow]:
 
 
 def in_layout(targets: Sequence[TargetRow], sensors: Sequence[str]) -> list[TargetRow]:
-    """Convert targets from the classic layout, a scene for each camera, to scenes with `sensors`: the inverse of `in_classic_layout`.
-
-    Without sensors the lists are alike."""
+    """Convert targets from the classic layout, a scene for each camera, to scenes with `sensors` (none: as they are); the inverse of
+    `in_classic_layout`."""
     if not sensors:
         return list(targets)
     count = len(sensors)

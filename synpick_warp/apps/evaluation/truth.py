@@ -156,11 +156,8 @@ def _assemble(parts: list[tuple[SceneArrays, int, int, int, str]], period: float
         return np.concatenate([get(arrays) for arrays, *_ in parts])
 
     images = np.concatenate([np.stack((np.full(len(part[0].images), part[1]), part[0].images), axis=1) for part in parts])
-    scene, image, object_id = (
-        repeat(part[1] for part in parts).astype(np.int64),
-        stack(lambda one: one.images[one.row]),
-        stack(lambda one: one.object_id),
-    )
+    scene = repeat(part[1] for part in parts).astype(np.int64)
+    image, object_id = stack(lambda one: one.images[one.row]), stack(lambda one: one.object_id)
     poses = PoseTable(
         scene=scene,
         image=image,
