@@ -105,8 +105,28 @@ def test_the_loss_of_known_logits():
     assert float(segmentation_loss(even, classes, 2.0)) - entropy == pytest.approx(2 * 0.75)
 
 
-def test_the_network_has_logits_of_the_images_size():
-    assert training.ResidualNetwork(5, 4)(torch.zeros(2, 3, 24, 40, dtype=torch.uint8)).shape == (2, 5, 12, 20)
+def test_logits_are_those_of_every_second_pixel():
+    """So the training compares them; those between are interpolated, without a shift."""
+    network, image = training.ResidualNetwork(5, 4), torch.randint(256, (2, 3, 32, 64), dtype=torch.uint8)
+    half = network(image)
+    assert half.shape == (2, 5, 16, 32)
+    network.head.register_forward_hook(lambda *_: half)  # In `eval`, statistics are not those of the batch.
+    whole = network.eval()(image)
+    assert whole.shape == (2, 5, 32, 64)
+    torch.testing.assert_close(whole[..., ::2, ::2], half)
+    torch.testing.assert_close(whole[..., 1:-1:2, ::2], (half[..., 1:, :] + half[..., :-1, :]) / 2)
+
+
+def test_images_are_blurred_or_sharpened():
+    """A flat image stays as it is; an edge becomes softer, or overshoots by at most SHARPENING times what a blur takes off."""
+    flat, edge = torch.full((64, 3, 8, 8), 0.5), torch.full((64, 3, 8, 8), 0.4)
+    edge[..., 4:] = 0.6
+    torch.manual_seed(0)
+    torch.testing.assert_close(training.jitter_views(flat, 0.0), flat)
+    steps = training.jitter_views(edge, 0.0)[:, 0, 4, 4] - 0.6
+    assert -0.2 / 3 <= float(steps.min()) < -0.05
+    assert 0.05 < float(steps.max()) <= training.SHARPENING * 0.2 / 3
+    assert 0.5 < float((steps > 0).float().mean()) < 0.75
 
 
 def test_a_pool_replaces_views_once_it_is_full():

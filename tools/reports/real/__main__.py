@@ -139,7 +139,7 @@ def score_pool(network: nn.Module, pool: ViewPool, classes: int) -> NetworkScore
     def pairs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for images, truth in zip(*(values[: pool.count].split(SCORED) for values in pool.tensors()), strict=True):
             with torch.no_grad():
-                found = upsample(network(images), truth.shape[1:]).argmax(1)
+                found = network(images).argmax(1)
             yield from zip(found.to(torch.uint8).cpu().numpy(), truth.cpu().numpy(), strict=True)
 
     return score(pairs(), classes, MIN_PIXELS)

@@ -80,12 +80,8 @@ class Recipe:
 
 @dataclass(eq=False)
 class ViewPool:
-    """Replay buffer of views on the device; once full, new ones replace random ones.
-
-    Attributes:
-        images: (N, 3, H, W) uint8.
-        classes: obj_ids (N, H, W) uint8.
-    """
+    """Replay buffer of views on the device, `images` (N, 3, H, W) uint8 and obj_ids `classes` (N, H, W) uint8; once full, new ones
+    replace random ones."""
 
     capacity: int
     seed: int
@@ -159,10 +155,8 @@ class Trained:
 
 class ResidualNetwork(nn.Module):
     """Residual U-Net: a stem of 1/2 of the image's size with half of `width` channels, levels of 1/4 to 1/32 with `width` to 8 x `width`
-    channels. Its blocks begin at 1/4, as in a ResNet: at 1/2 they would take four times the operations.
-
-    A pixel of its coarsest level sees about 420 pixels of the image to each side.
-    """
+    channels, whose pixels see up to 420 pixels of the image to each side. Blocks begin at 1/4, as in a ResNet: at 1/2 they would take four
+    times the operations."""
 
     def __init__(self, classes: int, width: int) -> None:
         super().__init__()
@@ -176,14 +170,19 @@ class ResidualNetwork(nn.Module):
         self.head = nn.Conv2d(widths[0], classes, 1)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Logits (B, classes, H / 2, W / 2) of an image (B, 3, H, W): uint8, or float32 as it is."""
+        """Logits of an image (B, 3, H, W), uint8, or float32 as it is, with even sides: of every second row and column in training
+        (B, classes, H / 2, W / 2), else interpolated between these (B, classes, H, W)."""
         skips = [self.stem(image.float().div(255).sub(0.5) if image.dtype == torch.uint8 else image)]
         for level in self.down:
             skips.append(level(skips[-1]))
         x = skips.pop()
         for level, skip in zip(reversed(self.up), reversed(skips), strict=True):
             x = level(torch.cat((upsample(x, skip.shape[2:]), skip), dim=1))
-        return self.head(x)
+        x = self.head(x)
+        if self.training:
+            return x
+        between = functional.interpolate(x, size=[2 * side - 1 for side in x.shape[2:]], mode="bilinear", align_corners=True)
+        return functional.pad(between, (0, 1, 0, 1), "replicate")
 
 
 class _Block(nn.Module):
