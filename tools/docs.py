@@ -30,7 +30,7 @@ _SETTINGS_HEAD = """# Reference of the settings
 <!-- Written by `python -m tools.docs` from the schema in this folder; edit the help texts there. -->
 
 What they are for: the [guide](README.md). Intervals hold for each number of a list; a parenthesis leaves the bound out. Where the meaning
-names the choices, or any text is allowed, nothing else is shown. A setting that allows a distribution is off unless a default is shown.
+names the choices, or any text is allowed, nothing else is shown. A setting that allows a distribution is `"off"` unless a default is shown.
 """
 _MEASURED = "measured"
 """Table of a bin that users do not set."""

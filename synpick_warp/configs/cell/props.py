@@ -29,7 +29,7 @@ class PropRow:
     collide: bool = setting(False, "Collide, as the convex hull of each connected part of the mesh.")
     follows: str = setting(
         WORLD,
-        "What carries the prop: the world, or the gripper (the pose is in the frame of its shaft, and an obstacle to the layer "
-        "suction_seal).",
+        "What carries the prop: the world, or the gripper (the pose is in the frame of its shaft, and the layer suction_seal takes the "
+        "prop for an obstacle).",
         choices=(WORLD, GRIPPER),
     )

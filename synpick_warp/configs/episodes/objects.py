@@ -179,7 +179,7 @@ class ObjectRow:
     )
     symmetries_continuous: Annotated[tuple[tuple[float, ...], ...], "m"] = setting(
         (),
-        f"Continuous symmetries, likewise; each {_CONTINUOUS}.",
+        f"Continuous symmetries, as symmetries_discrete; each {_CONTINUOUS}.",
         parse=partial(_parse_each, flatten=_flatten_continuous, rule=_CONTINUOUS),
     )
 

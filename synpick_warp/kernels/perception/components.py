@@ -159,7 +159,7 @@ def unite(component: wp.array2d[int], view: int, a: int, b: int):
 
 @wp.kernel
 def merge_strips_kernel(segments_inout: Segments, views: Views, width: int):
-    """Union pass: unite runs of equal ids with the strip to the left and with the row above, diagonals included, once a pair of runs.
+    """Union pass: unite runs of equal ids with the strip to the left and with the row above, diagonals included, once for each pair.
 
     `component_inout` receives the links between labels. Launched over view, row, strip.
     """

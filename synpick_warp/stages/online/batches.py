@@ -134,7 +134,7 @@ class DeviceArray:
         return array.__dlpack__(stream=_NO_ORDER)
 
     def numpy(self) -> np.ndarray:
-        """The array on the host: on the CPU the buffer itself, on a GPU a copy. Raises BufferError: the batch has expired."""
+        """The array on the host: on the CPU the buffer itself, on a GPU a copy, awaited. Raises BufferError: the batch has expired."""
         array = self._valid()
         self._gate.admit_current()
         return array.numpy()
@@ -315,7 +315,7 @@ class BatchRing:
     """Renders batches of views into a ring of slots; `render` only launches kernels."""
 
     def __init__(self, group: CameraGroup, layers: tuple[str, ...], depth_scale: float) -> None:
-        """Allocate the slots. `group`: cameras and their renderer. `layers`: their names. `depth_scale`: millimetres per count."""
+        """Allocate the slots. `group`: cameras and their renderer. `layers`: names of those to render. `depth_scale`: [mm] of a count."""
         renderer, sizes = group.renderer, group.sizes
         self.group, self.renderer, self.device, self.depth_scale = group, renderer, renderer.scene.device, depth_scale
         self.views, self.instances = sizes["view"], sizes["instance"]

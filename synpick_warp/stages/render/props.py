@@ -34,7 +34,7 @@ class PropPlacer:
         self._placed: Snapshot | None = None
 
     def place(self, snapshot: Snapshot, fixture_visible: wp.array) -> Snapshot:
-        """Append props to a snapshot's instances. `fixture_visible`: as of `set_up_views`; hidden grippers hide what follows them."""
+        """Copy of a snapshot with props as instances. `fixture_visible`: as of `set_up_views`; hidden grippers hide what follows them."""
         if not self.scene.prop_count:
             return snapshot
         device, worlds = self.scene.device, snapshot.pose.shape[0]

@@ -87,7 +87,7 @@ class SceneBehind:
         return bundle(ViewBodies, SimpleNamespace(present=present, body_mask=self.groups.body_mask), bodies)
 
     def rasterize(self, snapshot: Snapshot, shot: Any) -> Any:
-        """Render the G-buffer of the scene behind the views of the struct `ShotData`, which is returned; None: nothing needs it."""
+        """Render the G-buffer of the scene behind views; takes their, returns its struct `ShotData`; None: nothing needs it."""
         if self.gbuffer is None:
             return None
         bodies = self.opaque(shot.bodies, self.groups.opaque)
