@@ -255,6 +255,7 @@ def gap(
     /,
     *,
     out: Annotated[Path, Parameter(help="Folder of the twins: new or empty.")],
+    split: options.EpisodesOfOption = None,
     config: ConfigOption = None,
     device: DeviceOption = None,
     lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
@@ -266,7 +267,8 @@ def gap(
     """
     from synpick_warp.cli.commands.evaluate import write_gap
 
-    return write_gap(folder, out, _resolve(config, {"bake.device": device, "bake.lights": lights, "render.table": False}, None, set_))
+    given = {"bake.device": device, "bake.lights": lights, "render.table": False}
+    return write_gap(folder, out, split, _resolve(config, given, None, set_))
 
 
 @app.command(name="config")

@@ -199,7 +199,7 @@ def describe_views(
 def split_views(
     group: CameraGroup, report: TickReport, world: np.ndarray, camera: np.ndarray, cameras: EpisodeCameras | None
 ) -> Iterator[tuple[slice, bool]]:
-    """Split a tick's views (world, camera) into batches, see `split_batches`; other arguments as of `describe_views`."""
+    """Split a tick's views (world, camera) of a group into batches, see `split_batches`; other arguments as of `describe_views`."""
     views, share, bounds = group.sizes["view"], group.sizes["mask_word"], group.bounds
     if bounds is None:
         return split_batches(np.zeros(len(world), np.int64), share, views, views)

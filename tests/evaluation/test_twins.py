@@ -42,7 +42,8 @@ def test_twins_differ_in_the_pixels_of_objects_alone(picked_set, tmp_path):
 
 
 def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
-    """A grey sensor's folder has its name, and files have four digits: twins are grey, and the linked data set keeps its bytes."""
+    """A grey sensor's folder has its name, files have four digits, and no camera has a pose: twins are grey, the linked data set keeps its
+    bytes, and another split is left out."""
     real = tmp_path / "real"
     shutil.copytree(picked_set / "models", real / "models")
     scene = shutil.copytree(next(picked_set.glob("*/000000/rgb")).parent, real / "test" / "000000")
@@ -53,11 +54,15 @@ def test_twins_of_a_sensor_stand_where_its_images_do(picked_set, tmp_path):
     for path in list(scene.iterdir()):
         if re.fullmatch("(scene_(camera|gt|gt_info).json|depth|mask|mask_visib)", path.name):
             path.rename(path.with_name(f"{path.stem}_gray1{path.suffix}"))
+    cameras = scene / "scene_camera_gray1.json"
+    cameras.write_text(re.sub(r'"cam_[Rt]_w2c": ?\[[^]]*\],? ?', "", cameras.read_text()).replace(", }", "}"))
     before = {path: path.read_bytes() for path in real.rglob("*") if path.is_file()}
-    code, _, error = run("gap", real, "--out", tmp_path / "a" / "twins", "--device", "cpu")
+    shutil.copytree(scene, real / "train" / "000001")
+    code, _, error = run("gap", real, "--out", tmp_path / "a" / "twins", "--device", "cpu", "--split", "test")
     assert code == 0, error
+    assert "images without cam_R_w2c are taken as upright" in error
     made = {path.relative_to(tmp_path / "a" / "twins"): path for path in (tmp_path / "a" / "twins").rglob("*") if path.is_file()}
-    assert {real / name for name in made} == before.keys() == {path for path in real.rglob("*") if path.is_file()}
+    assert {real / name for name in made} == before.keys()
     assert all(path.read_bytes() == data for path, data in before.items())
     changed = [path for name, path in made.items() if path.read_bytes() != before[real / name]]
     assert changed

@@ -237,7 +237,7 @@ def draw_figures(
 
     The trajectory is that of a track, or of those that all methods have the one that moves farthest; there is none if all methods have no
     track of two images in common, and no error by visibility or speed if none is known. `attempts`: episode -> frames of its pick attempts.
-    Raises ConfigError if ground truth or a method lack the track, and ChartError if the charts' library cannot run.
+    Raises ConfigError if ground truth or a method lacks the track, and ChartError if the charts' library cannot run.
     """
     charts = _draw_errors(truth, scores)
     world, to_world = replace(truth, poses=truth.motion.to_world(truth.poses)), truth.motion.to_world

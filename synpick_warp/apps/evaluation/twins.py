@@ -7,19 +7,20 @@ therefore the appearance gap; what it lacks on twins has other causes. Without a
 
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from synpick_warp.codes import MAX_INSTANCES
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.bop.layout import find_models
 from synpick_warp.dataset.commit.merge import link_file
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder
+from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import output_errors
 from synpick_warp.online.render import render_scene
@@ -32,7 +33,12 @@ UNIT = 1e-3
 """Unit of BOP models [m]."""
 JPEG_QUALITY = 95
 """Quality of twins of JPEG images."""
+UPRIGHT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""World to camera where a data set does not say it: up in the image is up."""
 _LEVELS = 255.0
+_ROTATION = "cam_R_w2c"
+_TURNED = f"images without {_ROTATION} are taken as upright: light comes from above in them"
+_HIDDEN = "without mask_visib, objects are drawn over what hides them"
 
 
 class Appearance(NamedTuple):
@@ -73,38 +79,48 @@ def _inside(instance: np.ndarray) -> np.ndarray:
 
 
 def write_twins(
-    data_set: DataSet, out: Path, settings: Config, report: Report = ignore_progress
+    data_set: DataSet, out: Path, settings: Config, report: Report = ignore_progress, note: Callable[[str], object] = print
 ) -> dict[int, tuple[Appearance, Appearance]]:
-    """Write the twins of all views of a data set in BOP's folders to the new folder `out`, with all else as links or copies. Returns the
-    mean appearance of each obj_id in images and in twins, inside of outlines, over the views that show it. Raises SynpickError: there are
-    no objects, files are missing or damaged, or a setting cannot be used; then there is no folder."""
-    scenes, wanted, count, out = dict[tuple[int, int], SceneFiles](), set[int](), 0, out.resolve()
+    """Write the twins of all views of a data set, or of one split, in BOP's folders to the new folder `out`, with all else but other splits
+    as links or copies. Returns the mean appearance of each obj_id in images and in twins, inside of outlines, over the views that show it.
+    `note` receives what is assumed. Raises SynpickError: there are no objects, files are missing or damaged, or a setting cannot be used;
+    then there is no folder."""
+    scenes, wanted, count, out = dict[tuple[int, int], SceneFolder](), set[int](), 0, out.resolve()
+    remarks = set[str]()
     for view in data_set.views():
         if (key := (view.episode, view.camera)) not in scenes:
-            scenes[key] = scene = data_set.scene_files(*key)
+            scene = data_set.scene_files(*key)
             if not isinstance(scene, SceneFolder):
                 raise DatasetError(f"{scene.place} is a shard; twins are made of data sets in folders: synpick-warp convert")
+            scenes[key] = scene
+        if len(view) > MAX_INSTANCES:
+            raise DatasetError(f"{view.place}: image {view.image_id} has {len(view)} objects; allowed: {MAX_INSTANCES}")
+        remarks |= {text for known, text in ((_ROTATION in view.records.camera, _TURNED), (view.has("mask_visib"), _HIDDEN)) if not known}
         wanted, count = wanted | set(view.object_ids.tolist()), count + 1
     if not wanted:
         raise DatasetError(f"{data_set.folder} has no image with objects in its scene_gt.json, so none has a twin")
     models = find_models(data_set.folder, wanted, "twins are rendered")
+    for text in sorted(remarks):
+        note(text)
     found: dict[int, list[tuple[Appearance, Appearance]]] = {}
+    root, own = data_set.folder, {scene.folder.parent for scene in scenes.values()}
+    others = {path.parent.parent for path in root.glob("*/*/scene_*.json")} - own
     with output_errors(out):
         make_folder(out.parent)
         part = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
         try:
-            for path in sorted(data_set.folder.rglob("*")):
-                if path.is_symlink() or not path.is_dir():
-                    link_file(path, part / path.relative_to(data_set.folder))
+            for path in sorted(root.rglob("*")):
+                if others.isdisjoint(path.parents) and (path.is_symlink() or not path.is_dir()):
+                    link_file(path, part / path.relative_to(root))
             for done, view in enumerate(data_set.views(), 1):  # Made anew: a view keeps the images that were read.
                 suffix, _, source = scenes[view.episode, view.camera].image_file("rgb", view.image_id)
                 if len(view):
                     twin, pairs = _make_twin(view, [models[int(index)][0] for index in view.object_ids], settings)
-                    _replace(part / Path(source).relative_to(data_set.folder), suffix, twin)
+                    _replace(part / Path(source).relative_to(root), suffix, twin)
                     for index, pair in pairs:
                         found.setdefault(index, []).append(pair)
                 report("views", done, count)
-            part.chmod(data_set.folder.stat().st_mode)
+            part.chmod(root.stat().st_mode)
             part.rename(out)
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
@@ -115,12 +131,13 @@ def write_twins(
 
 def _make_twin(view: View, models: Sequence[Path], settings: Config) -> tuple[np.ndarray, list[tuple[int, tuple[Appearance, Appearance]]]]:
     """Twin (H, W, 3) uint8 of a view, grey if the image is; obj_id and appearance in both of each object that it shows."""
-    placed, color = view.world_to_camera, view.rgb
+    placed, color = view.world_to_camera if _ROTATION in view.records.camera else UPRIGHT, view.rgb
     if not all(is_orthonormal(pose) and det(pose) > 0 for pose in view.object_to_camera[:, :3, :3]):
         raise DatasetError(f"{view.place}: an object of image {view.image_id} has a cam_R_m2c that is no rotation")
     camera = Camera(*view.size, np.asarray(view.intrinsics), placed[:3, :3], placed[:3, 3], lens=view.lens)
     shown = np.logical_or.reduce(view.masks) if view.has("mask_visib") else None
-    twin, instance = render_twin(color, list(zip(models, view.object_to_world, strict=True)), camera, settings, shown)
+    objects = zip(models, np.linalg.inv(placed) @ view.object_to_camera, strict=True)
+    twin, instance = render_twin(color, list(objects), camera, settings, shown)
     if (color == color[..., :1]).all():
         twin = cv2.cvtColor(cv2.cvtColor(twin, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     masks = [(int(index), (instance == number) & _inside(instance)) for number, index in enumerate(view.object_ids, 1)]

@@ -22,6 +22,7 @@ from synpick_warp.cli.options import (
     check_range,
     find_data_set,
     name_fetched,
+    open_split,
 )
 from synpick_warp.configs.dataset import split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError, escape, format_value
@@ -322,17 +323,16 @@ def estimate(
     return 0
 
 
-def write_gap(data: Path, out: Path, settings: Config) -> int:
-    """Write twins of a data set, and print how its objects look in both; returns the exit code."""
+def write_gap(data: Path, out: Path, split: str | None, settings: Config) -> int:
+    """Write twins of a data set, or of one split, and print how its objects look in both; returns the exit code."""
     from synpick_warp.apps.evaluation.twins import Appearance, write_twins
     from synpick_warp.cli.display import count_on_stderr
-    from synpick_warp.dataset.reading import open_data_set
 
     data = find_data_set(data, "synpick-warp gap DIR")
     check_new_folder(out, "--out")
     check_output_file(out, "--out", data, is_folder=True)
     with count_on_stderr() as counter:
-        found = write_twins(open_data_set(data), out, settings, counter.report)
+        found = write_twins(open_split(data, split), out, settings, counter.report, lambda line: print(escape(line), file=sys.stderr))
     print("obj_id", *(f"{name:>16}" for name in Appearance._fields), "   (image, twin)")
     for index, pair in found.items():
         print(f"{index:>6}", *(f"{real:>9.3f} {twin:>6.3f}" for real, twin in zip(*pair, strict=True)))

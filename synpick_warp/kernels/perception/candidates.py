@@ -72,7 +72,7 @@ class Candidates:
 
 @wp.struct
 class Sampling:
-    """A batch of states whose candidates are sampled, one a view."""
+    """A batch of `count` states from number `first` on, whose candidates are sampled, one a view."""
 
     count: int
     first: int

@@ -130,7 +130,7 @@ class Renderer:
             self.annotator.annotate(shot, self.damage, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers, placed: tuple[Any, Any] | None = None) -> Any:
-        """First part of `render`: G-buffer, depth, instances, amodal masks. Returns snapshot with props and views with cameras."""
+        """First part of `render`: G-buffer, depth, instances, amodal masks. Returns the snapshot with props, and the views with cameras."""
         scene, views = self.scene, with_cameras(views, self.cameras if placed is None else placed[0])
         snapshot, wide = self.props.place(snapshot, snapshot.fixture_visible), self.props.widen(views)
         with scope("set up views", scene.device):

@@ -203,7 +203,7 @@ def _farthest_side(box: list[int], seen: tuple[int, int, int, int], sides: Itera
 
 
 def wrong_sides(box: list[int], mask: StoredMask) -> list[int]:
-    """Sides, as in `box_sides`, on which the amodal box of a silhouette contradicts its mask, the part inside the image, not empty.
+    """Sides, as in `box_sides`, on which the amodal box of a silhouette contradicts its mask (its part inside the image, not empty).
 
     A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
     only if its box stays within the image on the others: around a corner of the image it may reach farther than inside.

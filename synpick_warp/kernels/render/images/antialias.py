@@ -62,7 +62,7 @@ JUMP_SLOPE = wp.constant(8.0)
 """If the slope changes by more than JUMP_SLOPE [m/m] in all, but by less than FLAT_SLOPE on one side of two pixels, both show the surface
 of that side: the jump lies beyond them, not within the footprint. This saves rays, and changes no image."""
 MIN_CONTRAST = wp.constant(0.08)
-"""Footprints whose colours differ by at most this fraction in every channel are left out, at an error of some four grey levels."""
+"""Footprints whose colours differ by at most this fraction in every channel are left out: an error of some four in 255."""
 MIN_CHANNEL = wp.constant(0.1)
 """Contrast is relative to a channel's value, but at least to this fraction of the brightest channel: dark channels are hardly visible."""
 DISTANCE_WEIGHT = wp.constant(0.1)
