@@ -363,7 +363,7 @@ def test_a_merge_refuses_an_episode_that_a_power_cut_has_cut_short(tmp_path):
 BUGS = {
     "uncommitted files stay": lambda patch: patch.setattr(OutputFolder, "_remove_incomplete", lambda self, end: None),
     "a data set may shrink": lambda patch: patch.setattr(DataLayout, "is_planned", lambda self, episode: True),
-    "a merge moves files": lambda patch: patch.setattr(merge, "_link", _move),
+    "a merge moves files": lambda patch: patch.setattr(merge, "link_file", _move),
 }
 """Planted bugs, by name."""
 
