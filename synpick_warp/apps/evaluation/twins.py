@@ -70,11 +70,11 @@ def render_twin(
     instance = views["instance"].numpy()[0]
     if shown is not None:
         instance = np.where(shown, instance, 0).astype(np.uint8)
-    return np.where(_inside(instance)[..., None], views["color"].numpy()[0], color), instance
+    return np.where(inner_pixels(instance)[..., None], views["color"].numpy()[0], color), instance
 
 
-def _inside(instance: np.ndarray) -> np.ndarray:
-    """Pixels of objects (H, W) bool but those at outlines, which blend with the background, which the image does not have."""
+def inner_pixels(instance: np.ndarray) -> np.ndarray:
+    """Pixels of objects (H, W) bool but those at outlines: renderings blend these with a background that the image does not have."""
     return cv2.erode((instance > 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
 
 
@@ -140,7 +140,7 @@ def _make_twin(view: View, models: Sequence[Path], settings: Config) -> tuple[np
     twin, instance = render_twin(color, list(objects), camera, settings, shown)
     if (color == color[..., :1]).all():
         twin = cv2.cvtColor(cv2.cvtColor(twin, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-    masks = [(int(index), (instance == number) & _inside(instance)) for number, index in enumerate(view.object_ids, 1)]
+    masks = [(int(index), (instance == number) & inner_pixels(instance)) for number, index in enumerate(view.object_ids, 1)]
     return twin, [(index, (measure_appearance(color, mask), measure_appearance(twin, mask))) for index, mask in masks if mask.any()]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 
 import synpick_warp
-from synpick_warp.apps.evaluation.twins import UNIT, Appearance, measure_appearance, render_twin
+from synpick_warp.apps.evaluation.twins import UNIT, Appearance, inner_pixels, measure_appearance, render_twin
 from synpick_warp.configs.files.load import parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
@@ -55,9 +55,9 @@ def compare_objects(frames: Sequence[RealFrame], twins: Sequence[RealFrame]) -> 
     for frame, twin in zip(frames, twins, strict=True):
         for index in set(frame.object_ids):
             real, rendered = frame.label == index, twin.label == index
-            if (both := real & rendered).any():
+            if (both := real & rendered & inner_pixels(twin.label)).any():
                 pair = np.transpose([measure_appearance(one.color, both) for one in (frame, twin)])
-                found.setdefault(index, []).append(np.append(pair, both.sum() / (real | rendered).sum()))
+                found.setdefault(index, []).append(np.append(pair, (real & rendered).sum() / (real | rendered).sum()))
     names = [f"{name}, {where}" for name in Appearance._fields for where in ("photograph", "twin")] + ["masks: IoU"]
     return [
         MeasuredRow(f"obj_id {index}: {name}", round(float(value), 3), part="object")
