@@ -20,6 +20,7 @@ from synpick_warp.scenes.collision.hulls import hull_size, is_concave, mass_prop
 from synpick_warp.scenes.collision.shapes import ShapeRecipe, collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects, solids
 from synpick_warp.scenes.props import make_props
+from synpick_warp.scenes.symmetries.cache import cached_symmetries
 from synpick_warp.scenes.symmetries.detection import add_symmetries
 from synpick_warp.scenes.symmetries.surface import look_alike, shape_profile
 from synpick_warp.scenes.types import FIRST_DISTRACTOR, Catalog, CatalogEntry, ConvexPiece, HullSize, RawObject, TriangleMesh
@@ -249,7 +250,7 @@ def _read_model(model: ModelFile, info: FileModelInfo, rules: _Rules) -> tuple[R
     raw = _raw(model, mesh, hull, found.material, row, objects)
     lines += _describe_specks(mesh, hull.diameter, str(model.path))
     _check_size(raw, str(model.path if model.is_bop else raw.name), rules.bins)
-    info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path))
+    info, said = add_symmetries(info, found, hull.diameter, row, objects, str(model.path), cached_symmetries)
     lines += said
     raw = replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous)
     # A copy of the file could not name its texture as it does, and would have another unit than BOP's.

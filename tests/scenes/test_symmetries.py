@@ -18,6 +18,7 @@ from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.collision.hulls import hull_size
+from synpick_warp.scenes.symmetries import cache
 from synpick_warp.scenes.symmetries.detection import close_group, find_element, find_symmetries
 from synpick_warp.scenes.symmetries.surface import SampledSurface
 from tests.builders import refusal
@@ -282,3 +283,27 @@ def test_detected_symmetries_reach_models_info_and_evaluation(tmp_path, name, me
     model = read_models(tmp_path / "set", [1])[1]
     assert model.symmetric
     assert len(model.symmetries) == poses
+
+
+def test_symmetries_are_found_once_for_a_mesh_and_a_tolerance(tmp_path, monkeypatch):
+    """What is read has the bits of what was found; a damaged file is no error, and neither is a folder that cannot be written."""
+    calls, (block, disc, wheel) = [], (MAKE.box((0.03, 0.04, 0.05)), MAKE.cylinder(0.02, 0.01, sections=64), gear(5))
+    monkeypatch.setattr(cache, "find_symmetries", lambda *given: calls.append(given) or find_symmetries(*given))
+    folder, given = (
+        tmp_path / "new",
+        [(body.vertices, body.faces, 0.1, 0.003) for body in (block, disc, wheel)] + [(block.vertices, block.faces, 0.1, 0.03)],
+    )
+
+    def bits(found):
+        turns = [*found.continuous, *([found.missed] if found.missed else [])]
+        numbers = [(*turn.axis.tolist(), *turn.point.tolist(), turn.fold, turn.deviation) for turn in turns]
+        return found.discrete.tobytes(), found.deviations.tobytes(), found.discrete.shape, len(found.continuous), numbers
+
+    first, second = ([bits(cache.cached_symmetries(*each, folder)) for each in given] for _ in range(2))
+    assert first == second == [bits(find_symmetries(*each)) for each in given]
+    assert len(calls) == len(list(folder.iterdir())) == 4
+    for file in folder.iterdir():
+        file.write_bytes(file.read_bytes()[:-60])
+    assert [bits(cache.cached_symmetries(*each, folder)) for each in given[:2]] == first[:2]
+    assert bits(cache.cached_symmetries(*given[0], Path("/dev/null/none"))) == first[0]
+    assert len(calls) == 7

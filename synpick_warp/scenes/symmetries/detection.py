@@ -5,7 +5,7 @@ The surface is symmetric under a rotation if the Hausdorff distance between it a
 condition (Hodaň et al., BOP Challenge 2020), which takes 0.1 of the diameter, at least 15 mm. Texture does not count.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, takewhile
 
@@ -58,6 +58,10 @@ class Symmetries:
     deviations: np.ndarray
     continuous: tuple[Turn, ...]
     missed: Turn | None
+
+
+Detector = Callable[[np.ndarray, np.ndarray, float, float], Symmetries]
+"""A function as `find_symmetries`."""
 
 
 def turn_matrix(axis: np.ndarray, point: np.ndarray, angle: float) -> np.ndarray:
@@ -376,9 +380,9 @@ _MAX_SHOWN = 4
 
 
 def add_symmetries(
-    info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str
+    info: FileModelInfo, found: MeshFile, diameter: float, row: ObjectRow | None, objects: Objects, origin: str, find: Detector
 ) -> tuple[FileModelInfo, list[str]]:
-    """Add the symmetries of the object's row to its entry, or detect them if neither has any and the settings ask for it. `info`: entry of
+    """Add the symmetries of the object's row to its entry, or find them if neither has any and the settings ask for it. `info`: entry of
     models_info.json; without symmetries if there is none. Returns the entry with symmetries, and lines on what was found, or on declared
     ones that do not hold. Raises CatalogError: with `objects.strict`, a declared symmetry does not hold; or they generate too many."""
     if row is not None and (row.symmetries_discrete or row.symmetries_continuous):
@@ -386,7 +390,7 @@ def add_symmetries(
     if objects.symmetries != DETECT or info.symmetries_discrete or info.symmetries_continuous:
         return info, []
     tolerance = objects.symmetry_tolerance * diameter
-    symmetries = find_symmetries(found.mesh.vertices, found.mesh.faces, diameter, tolerance)
+    symmetries = find(found.mesh.vertices, found.mesh.faces, diameter, tolerance)
     return _with(info, symmetries.discrete, [(turn.axis, turn.point) for turn in symmetries.continuous]), [
         f"{origin}: {describe_symmetries(symmetries, tolerance)}"
     ]
