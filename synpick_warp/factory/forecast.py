@@ -111,7 +111,7 @@ def forecast_bake(config: Config, catalog: Catalog, episodes: Sequence[int]) -> 
 
 
 def predict_length(config: Config, catalog: Catalog, episodes: Sequence[int]) -> float:
-    """Mean number of frames of episodes, by modes and objects; 0 of none. Those of mode move follow speed and rounds; a still has one."""
+    """Predict the mean number of frames per episode from its mode and its number of objects; 0 if there are no episodes."""
     if not len(episodes):
         return 0.0
     modes, objects = sample_episodes_ahead(config, catalog, np.asarray(episodes, np.int32), pick_device(config.bake.device))

@@ -36,7 +36,7 @@ METALLIC, ROUGHNESS = 0.0, 0.5
 
 
 def make_props(rows: Sequence[PropRow], bins: Sequence[BinSizes], report: Callable[[str], None] = ignore) -> tuple[Prop, ...]:
-    """Read or make props. `report`: called with remarks. Raises ConfigError: a mesh or pose is unusable, or what collides fills a bin."""
+    """Load or generate props. `report` receives remarks. Raises ConfigError if a mesh or a pose is invalid, or a collider fills a bin."""
     return tuple(_make_prop(row, bins, report) for row in rows)
 
 

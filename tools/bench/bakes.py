@@ -1,6 +1,6 @@
 """Parts that bake to the temporary folder (TMPDIR): the steady state, with and without pictures.
 
-Readings of counts and resources are taken after each tick while nearly all worlds act; then the bake is stopped.
+Counts and resources are sampled after each tick while nearly all worlds are active; then the bake is stopped.
 """
 
 from __future__ import annotations

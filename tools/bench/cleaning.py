@@ -38,7 +38,7 @@ class Tally(NamedTuple):
     """Description of the first missing or damaged file, after which nothing more is verified; empty: none."""
 
     def plus(self, other: Tally) -> Tally:
-        """Sum of two counters, with the problem of the first that has one."""
+        """Add two tallies; the first problem is kept."""
         return Tally(self.episodes + other.episodes, self.files + other.files, self.deleted + other.deleted, self.problem or other.problem)
 
 

@@ -193,7 +193,7 @@ LIMIT = 0.1
 
 
 def exact_auc(errors: np.ndarray, limit: float = LIMIT) -> float:
-    """Area to `limit` [m] under the accuracy-threshold curve of errors (N,) [m], infinity: missed; from 0 to 1, NaN without errors."""
+    """Area under the accuracy-threshold curve (AUC) up to `limit` [m], 0 to 1. `errors` (N,) [m]: infinite if missed; NaN if N is 0."""
     return float(np.maximum(0.0, 1.0 - errors / limit).mean()) if len(errors) else float("nan")
 
 

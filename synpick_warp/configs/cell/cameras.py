@@ -395,7 +395,7 @@ def intrinsics(row: CameraRow) -> tuple[float, float, float, float]:
 
 
 def lens_map(row: CameraRow) -> LensMap | None:
-    """Distortion of a row with a resolution; None: a pinhole. Raises ConfigError: no lens with these coefficients covers the image."""
+    """Lens distortion of a camera; None for a pinhole. Raises ConfigError if no lens with these coefficients covers the image."""
     if not row.distortion or row.resolution is None:
         return None
     from synpick_warp.configs.calibration.lens import PINHOLE, make_lens_map

@@ -249,7 +249,7 @@ _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY | os.O_NOFOLLO
 
 
 def open_regular(path: Path | str) -> int:
-    """Open a regular file for reading, no link, pipe or device. Raises FileNotFoundError, or OSError with the reason as `strerror`."""
+    """Open a regular file for reading. Raises FileNotFoundError, or OSError with a reason, also for a link, a pipe or a device."""
     try:
         handle = os.open(path, _FLAGS)
     except OSError as error:

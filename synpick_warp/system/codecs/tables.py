@@ -80,7 +80,7 @@ def to_csv(table: Table, exact: bool = False) -> str:
 
 
 def _plain(value: Value, digits: str, exact: bool) -> Value:
-    """CSV cell: a number in the format `digits` (empty: unchanged), text escaped and no formula unless `exact`, None as it is."""
+    """Format a CSV cell: a number by `digits` (empty: unchanged); text is escaped, also against formulas, unless `exact`."""
     if isinstance(value, str):
         return value if exact else f"'{escape(value)}" if value.startswith(_FORMULA) else escape(value)
     return value if value is None or not digits else format(value, digits)
