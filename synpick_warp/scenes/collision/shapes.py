@@ -143,20 +143,25 @@ class _Saver:
         if not self._writable or file == Path(os.devnull):
             return shape
         try:
-            make_folder(file.parent)
-            handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
-            try:
-                with os.fdopen(handle, "wb") as stream:
-                    np.savez(stream, allow_pickle=False, **pack_pieces(shape))
-                os.replace(temporary, file)
-            except BaseException:
-                os.unlink(temporary)
-                raise
+            write_arrays(file, **pack_pieces(shape))
         except OSError as error:
             self._writable = False
             reason = f"{file.parent} cannot be written ({error.strerror})"
             self._report(f"collision shapes are not cached: {reason}; set {USER_VARIABLE} to a folder that can")
         return shape
+
+
+def write_arrays(file: Path, **arrays: np.ndarray) -> None:
+    """Write a cache file (NPZ) atomically, in a folder that need not exist. Raises OSError."""
+    make_folder(file.parent)
+    handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **arrays)
+        os.replace(temporary, file)
+    except BaseException:
+        os.unlink(temporary)
+        raise
 
 
 def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:

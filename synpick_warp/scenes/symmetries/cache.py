@@ -4,18 +4,18 @@ that commands on the same part detect its symmetries once, and a change of the p
 import contextlib
 import hashlib
 import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
 import scipy
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.collision.shapes import write_arrays
 from synpick_warp.scenes.symmetries import detection, surface
 from synpick_warp.scenes.symmetries.detection import Symmetries, Turn, find_symmetries
 from synpick_warp.system import linear_algebra
 from synpick_warp.system.hardware.kernels import user_cache
-from synpick_warp.system.inputs.files import check_regular_file, make_folder
+from synpick_warp.system.inputs.files import check_regular_file
 
 MAX_FILE = 1 << 22
 """Largest file that is read [bytes]: 20,000 symmetries, more than an object can have."""
@@ -37,11 +37,8 @@ def cached_symmetries(vertices: np.ndarray, faces: np.ndarray, diameter: float, 
             return Symmetries(data["discrete"].reshape(-1, 4, 4), data["deviations"], tuple(continuous), missed[0] if missed else None)
     found = find_symmetries(vertices, faces, diameter, tolerance)
     with contextlib.suppress(OSError):  # Without a cache they are found each time.
-        make_folder(file.parent)
         turns = [*found.continuous, *([] if found.missed is None else [found.missed])]
         rows = np.array([(*turn.axis, *turn.point, turn.fold, turn.deviation) for turn in turns], np.float64)
-        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, turns=rows, continuous=len(found.continuous), discrete=found.discrete, deviations=found.deviations)
-        Path(temporary).replace(file)
+        count = np.array(len(found.continuous))
+        write_arrays(file, turns=rows, continuous=count, discrete=found.discrete, deviations=found.deviations)
     return found
