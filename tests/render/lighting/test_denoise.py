@@ -6,9 +6,10 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.lighting import coarse_grid, denoise
+from synpick_warp.kernels.render.lighting import coarse_grid, denoise, upsampling
 from synpick_warp.kernels.render.lighting.paths.coarse import SEQUENCE_PERIOD
 from synpick_warp.kernels.render.lighting.paths.lists import AGED, FRESH, REGION_PIXELS, PathLists, append_pixel, listed_pixel
+from synpick_warp.kernels.render.lighting.plane_distance import Plane
 from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.kernels.render.visibility.records import read_record, write_record
 from synpick_warp.stages.arrays import allocate_struct
@@ -33,7 +34,31 @@ def repack_surface(records: wp.array3d[wp.vec4], index: int, segment: int, depth
     return int(coarse_grid.surface_segment(surface)), coarse_grid.surface_depth(surface), coarse_grid.surface_normal(surface)
 
 
-shrink, repacked = probe(denoise.shrink), probe(repack_surface)
+@wp.func
+def upsample_step(records: wp.array3d[upsampling.RatioRecord], index: int, step: float):
+    """Ratio halfway between coarse pixels of ratio 1 on its tangent plane and others of ratio 0, `step` coarse pixels behind it."""
+    coarse = coarse_grid.CoarseGrid()
+    coarse.size = 4
+    coarse.grid.width = 4
+    coarse.grid.height = 4
+    coarse.image.width = 16
+    coarse.image.height = 16
+    plane = Plane()
+    plane.segment = wp.uint8(1)
+    plane.facing = -1.0
+    plane.height = -1.0
+    plane.width = 1.0e-3
+    for r in range(4):
+        for c in range(4):
+            ratio = wp.vec3(wp.where(c < 2, 1.0, 0.0))
+            depth = wp.where(c < 2, 1.0, 1.0 + 4.0e-3 * step)
+            records[index, r, c] = upsampling.pack_ratios(ratio, ratio, ratio, depth, wp.uint8(1))
+    ratios = upsampling.RatioImages()
+    ratios.record = records
+    return upsampling.upsample_ratios(ratios, coarse, index, 8, 8, plane).specular[0]
+
+
+shrink, repacked, upsampled = probe(denoise.shrink), probe(repack_surface), probe(upsample_step)
 
 
 @given(wide=colors, narrow=colors, variance=st.floats(0.0, 20.0))
@@ -144,6 +169,15 @@ def count_visit(coarse: coarse_grid.CoarseGrid, visits: wp.array3d[int], index: 
 
 
 count_visits, morton = probe(count_visit), probe(coarse_grid.morton_index)
+
+
+def test_light_does_not_leak_across_an_edge_of_the_same_body(device):
+    """Between pixels of one plane it is interpolated; a face half a coarse pixel behind, or further away, has no share."""
+    records = wp.empty((4, 4, 4), dtype=upsampling.RatioRecord, device=device)
+    found = np.asarray(upsampled(records, np.arange(4), np.float32([0.0, 0.01, 0.5, 20.0]), device=device))
+    assert found[0] == pytest.approx(0.5, abs=1e-3)
+    assert 0.5 < found[1] < 0.6
+    assert (found[2:] > 0.999).all()
 
 
 @given(width=st.integers(1, 150), height=st.integers(1, 100), size=st.integers(1, 5), views=st.integers(1, 3))

@@ -5,7 +5,6 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import (
     MIN_WEIGHT,
-    PLANE_TOLERANCE,
     CoarseGrid,
     coarse_coordinate,
     middle_pixel,
@@ -16,6 +15,11 @@ from synpick_warp.kernels.render.visibility.camera import clamp_index
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
+PLANE_WIDTH = wp.constant(0.03)
+"""Distance from the pixel's tangent plane at which a coarse pixel's weight has fallen to a quarter [coarse pixels]. With a hard bound of
+one coarse pixel, metal has teeth at the edges of its faces (PSNR of a bin of brackets at full HD: 29.8 dB, 30.2 dB so)."""
+ON_SURFACE = wp.constant(0.1)
+"""Least edge-stopping weight of a coarse pixel that is taken for one on the pixel's surface."""
 RING = wp.constant(1)
 """Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 RatioRecord = wp.types.vector(length=3, dtype=wp.uint64)
@@ -78,15 +82,18 @@ def add_ratios(total: Ratios, record: RatioRecord, weight: float) -> Ratios:
 
 @wp.func
 def upsampling_weight(record: RatioRecord, coarse: CoarseGrid, plane: Plane, row: int, column: int, r: int, c: int) -> float:
-    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its surface, MIN_WEIGHT off it, 0 on background."""
+    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its tangent plane, less with the distance from it,
+    but at least MIN_WEIGHT; that on other bodies, 0 on background."""
     segment = record_segment(record)
     if int(segment) == Segment.NOTHING:
         return 0.0
     pixel = middle_pixel(coarse, r, c)
     distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, record_depth(record))
-    if segment != plane.segment or distance > PLANE_TOLERANCE * float(coarse.size) * plane.width:
+    if segment != plane.segment:
         return MIN_WEIGHT
-    return 1.0
+    relative = distance / (PLANE_WIDTH * float(coarse.size) * plane.width)
+    falloff = 1.0 / (1.0 + relative * relative)
+    return wp.max(falloff * falloff, MIN_WEIGHT)
 
 
 @wp.func
@@ -126,7 +133,7 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, history: int, row: 
             result = add_ratios(result, record, weight)
             total += weight
             best = wp.max(best, surface_weight)
-    if best < 1.0:
+    if best < ON_SURFACE:
         # Not unrolled: few pixels come here.
         ring = int(RING)
         for i in range(-ring, 2 + ring):
@@ -134,9 +141,10 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, history: int, row: 
             for j in range(-ring, 2 + ring):
                 c = clamp_index(left + j, coarse.grid.width)
                 record = ratios.record[history, r, c]
-                if upsampling_weight(record, coarse, plane, row, column, r, c) == 1.0:
-                    result = add_ratios(result, record, 1.0)
-                    total += 1.0
+                weight = upsampling_weight(record, coarse, plane, row, column, r, c)
+                if weight > MIN_WEIGHT:
+                    result = add_ratios(result, record, weight)
+                    total += weight
     if total <= 0.0:
         # Only background around the pixel.
         return unoccluded_ratios()
