@@ -21,7 +21,7 @@ from synpick_warp.scenes.modelling import Patch, make_mesh
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 from synpick_warp.stages.arrays import allocate
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.scene import build_render_scene, with_cameras
 from synpick_warp.stages.render.view_setup import first_views
 from synpick_warp.system.hardware.device import pick_device, start_warp
 from synpick_warp.views.layers import LAYER_TABLE
@@ -29,6 +29,54 @@ from synpick_warp.views.layers import LAYER_TABLE
 GREY = Material((0.7, 0.7, 0.7), None, 0.0, 0.6)
 """Material of arrays, and of files without one."""
 Mesh = Path | str | tuple[np.ndarray, np.ndarray]
+
+
+class SceneRenderer:
+    """Renderer of meshes at poses that differ from call to call; models, textures and lights are prepared once."""
+
+    def __init__(
+        self, meshes: Sequence[Mesh], cameras: Sequence[Camera], layers: Sequence[str], unit: float, device: str, settings: Config
+    ) -> None:
+        """Prepare the scene of `meshes`; `cameras` are the first ones. Other arguments and errors: as of `synpick_warp.render`."""
+        start_warp()
+        self.layers, on = tuple(layers), pick_device(device)
+        self.settings = settings = replace(settings, render=replace(settings.render, layers=self.layers))
+        known = {_key(mesh): mesh for mesh in meshes}
+        self._rows = {key: row for row, key in enumerate(known)}
+        catalog = Catalog(tuple(_entry(index + 1, mesh, unit) for index, mesh in enumerate(known.values())))
+        fixtures = make_fixtures(make_bins(settings.cell.bins), settings.gripper)
+        lights, looks = load_lights(settings.bake.lights)[:1], load_looks(settings.randomize, lambda line: None, strict=True)
+        self.scene = build_render_scene(settings.render, 0.0, catalog, fixtures, tuple(cameras), lights, on, looks)
+
+    def render(self, worlds: Sequence[Sequence[tuple[Mesh, Any]]], cameras: Sequence[Camera]) -> dict[str, wp.array]:
+        """Render worlds of (mesh, object to world) by cameras of one resolution, as many for each world, world by world. Returns arrays of
+        `ViewBuffers` and layers, by name; a view does not depend on the other worlds, nor on meshes that are not in its own."""
+        scene, count, most = with_cameras(self.scene, tuple(cameras)), len(cameras), max(map(len, worlds))
+        sizes = view_buffer_sizes(count, *cameras[0].resolution, most)
+        images, extra = allocate(ViewBuffers, sizes, scene.device), allocate(LayerBuffers, sizes, scene.device, self.layers)
+        shown = first_views(count, count // len(worlds), most, scene.device, scene.cameras)
+        shown.slot = wp.array(np.arange(count, dtype=np.int32), dtype=wp.int32, device=scene.device)
+        renderer = make_renderer(self.settings, scene, most, count)
+        renderer.render(self._place(worlds, most), shown, images, extra if self.layers else None)
+        named = {name: getattr(extra, name) for name in self.layers}
+        return {"color": images.color, "depth": images.depth, "instance": images.instance} | named
+
+    def _place(self, worlds: Sequence[Sequence[tuple[Mesh, Any]]], most: int) -> Snapshot:
+        """Worlds of at most `most` objects, and neither bin nor gripper."""
+        sizes = {"world": len(worlds), "instance": most, "fixture": len(FIXTURES)}
+        result = allocate(Snapshot, sizes, self.scene.device)
+        rows, poses = np.full((len(worlds), most), -1, np.int32), np.tile(np.eye(4), (len(worlds), most, 1, 1))
+        for world, objects in enumerate(worlds):
+            rows[world, : len(objects)] = [self._rows[_key(mesh)] for mesh, _ in objects]
+            poses[world, : len(objects)] = [np.asarray(pose, float).reshape(4, 4) for _, pose in objects]
+        turned = Rotation.from_matrix(poses[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*rows.shape, 4)
+        placed = np.concatenate([poses[..., :3, 3], turned], axis=-1).astype(np.float32)
+        for array in (result.catalog_index, result.last_catalog_index):
+            array.assign(rows)
+        for array in (result.pose, result.last_pose):
+            array.assign(placed)
+        result.live.fill_(1)
+        return result
 
 
 def render_scene(
@@ -41,37 +89,12 @@ def render_scene(
         raise ConfigError("render needs cameras of one resolution; call it once for each resolution")
     if unknown := sorted(set(layers) - LAYER_TABLE.keys()):
         raise ConfigError(f"render has no layer {unknown[0]}; allowed: {', '.join(LAYER_TABLE)}")
-    start_warp()
-    settings, on = replace(settings, render=replace(settings.render, layers=tuple(layers))), pick_device(device)
-    meshes = {_key(mesh): mesh for mesh, _ in objects}
-    catalog = Catalog(tuple(_entry(index + 1, mesh, unit) for index, mesh in enumerate(meshes.values())))
-    fixtures = make_fixtures(make_bins(settings.cell.bins), settings.gripper)
-    lights, looks = load_lights(settings.bake.lights)[:1], load_looks(settings.randomize, lambda line: None, strict=True)
-    scene = build_render_scene(settings.render, 0.0, catalog, fixtures, tuple(cameras), lights, on, looks)
-    sizes = view_buffer_sizes(len(cameras), *cameras[0].resolution, len(objects))
-    images, extra = allocate(ViewBuffers, sizes, on), allocate(LayerBuffers, sizes, on, layers)
-    world = _world([list(meshes).index(_key(mesh)) for mesh, _ in objects], [pose for _, pose in objects], on)
-    shown = first_views(len(cameras), len(cameras), len(objects), on, scene.cameras)
-    make_renderer(settings, scene, len(objects), len(cameras)).render(world, shown, images, extra if layers else None)
-    return {"color": images.color, "depth": images.depth, "instance": images.instance} | {name: getattr(extra, name) for name in layers}
+    return SceneRenderer([mesh for mesh, _ in objects], cameras, layers, unit, device, settings).render([objects], cameras)
 
 
 def _key(mesh: Mesh) -> object:
     """What equal meshes have in common: the path, or the arrays themselves."""
     return str(mesh) if isinstance(mesh, Path | str) else id(mesh)
-
-
-def _world(rows: Sequence[int], poses: Sequence[Any], device: wp.Device) -> Snapshot:
-    """One world with these objects and neither bin nor gripper."""
-    world = allocate(Snapshot, {"world": 1, "instance": len(rows), "fixture": len(FIXTURES)}, device)
-    matrices = np.stack([np.asarray(pose, float).reshape(4, 4) for pose in poses])
-    placed = np.hstack([matrices[:, :3, 3], Rotation.from_matrix(matrices[:, :3, :3]).as_quat()]).astype(np.float32)
-    for array in (world.catalog_index, world.last_catalog_index):
-        array.assign(np.array([rows], np.int32))
-    for array in (world.pose, world.last_pose):
-        array.assign(placed[None])
-    world.live.fill_(1)
-    return world
 
 
 def _entry(obj_id: int, mesh: Mesh, unit: float) -> CatalogEntry:

@@ -11,6 +11,7 @@ import warp as wp
 import synpick_warp
 from synpick_warp.configs.calibration.lens import make_lens_map
 from synpick_warp.errors import ConfigError
+from synpick_warp.online.render import SceneRenderer, render_scene
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.arrays import allocate_struct
 from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
@@ -160,6 +161,28 @@ def test_a_lens_moves_the_edges_of_the_cube():
     slope = SIDE / 2 / (HEIGHT - SIDE / 2)
     for view, edge in enumerate((64.0 * slope, 64.0 * slope * (1 + 20.0 * slope**2))):
         assert np.array_equal(views["instance"][view][24], np.abs(np.arange(64) + 0.5 - 32) < edge)
+
+
+@pytest.mark.parametrize("mode", ["fast", "reference"])
+def test_views_of_a_shared_scene_are_those_of_scenes_of_their_own(mode):
+    """Worlds of one to three objects, before cameras of several poses, one with a lens, with noise and drawn looks: bit by bit the same
+    images alone and in a batch, among other meshes. So what is not in a view neither shows nor shades."""
+    plate = trimesh.creation.box((0.3, 0.2, 0.01))
+    other, lid = (plate.vertices, plate.faces), (BOX.vertices + np.array([0.0, 0.0, 0.15]), BOX.faces)
+    lens = make_lens_map("pinhole", (20.0, 0.0, 0.0, 0.0), (64.0, 64.0, 32.0, 24.0), (64, 48))
+    worlds = [[(CUBE, at(0.0))], [(lid, at(0.02)), (other, at(-0.05)), (CUBE, at(0.1))], [(other, at(0.0))], [(CUBE, at(0.0))]]
+    cameras = [CAMERA, Camera.at(K, (64, 48), DOWN @ at(0.03)), dataclasses.replace(CAMERA, lens=lens), CAMERA]
+    looks = {"effects.read_noise": [0.01, 0.01], "effects.blur": [0.5, 0.5], "randomize.object_hue": {"uniform": [-90.0, 90.0]}}
+    more = {"render.table": False, "render.mode": mode, "render.samples": 2}
+    config = synpick_warp.load_config(None, looks | more)
+    batch = SceneRenderer([CUBE, lid, other], cameras, ("normals",), 1.0, "cpu", config).render(worlds, cameras)
+    for view, (objects, camera) in enumerate(zip(worlds, cameras, strict=True)):
+        alone = render_scene(objects, [camera], ("normals",), 1.0, "cpu", config)
+        assert {key: array.numpy()[view].tobytes() for key, array in batch.items()} == {
+            key: array.numpy()[0].tobytes() for key, array in alone.items()
+        }
+    assert len({batch["color"].numpy()[view].tobytes() for view in range(4)}) == 3
+    assert (batch["instance"].numpy().max(axis=(1, 2)) == [1, 3, 1, 1]).all()
 
 
 @pytest.mark.parametrize(
